@@ -1,0 +1,104 @@
+"""The one place where metres, radians and wavelengths become arrays.
+
+An image has pixels of `pixel_scale` radians. Its DFT frequencies nu are in cycles/pixel, and a pupil-plane
+vector x (metres) corresponds to the frequency nu = x * pixel_scale / wavelength. One cycle per pixel is
+therefore `wavelength / pixel_scale` metres in the pupil: the period of the frequency torus.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+_ROUNDING = 1e-9  # relative slack, so that a grid made for exactly Nyquist is accepted as such
+
+
+@dataclass(frozen=True)
+class Grid:
+    """An image grid and its Fourier plane.
+
+    Parameters
+    ----------
+    n_pixels : int or (int, int)
+        Rows and columns of the image; one number means a square.
+    pixel_scale : float
+        Angle on the sky of one pixel [rad].
+    wavelength : float
+        [m].
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite and positive, or the grid has fewer than 2 pixels on a side.
+
+    Examples
+    --------
+    >>> grid = Grid.nyquist(diameter=1.0, wavelength=550e-9, n_pixels=128)
+    >>> grid.shape, round(grid.period, 12)
+    ((128, 128), 2.0)
+    """
+
+    n_pixels: int | tuple[int, int]
+    pixel_scale: float
+    wavelength: float
+
+    def __post_init__(self) -> None:
+        for side in self.shape:
+            if side != int(side) or side < 2:
+                raise ValueError(
+                    f"n_pixels is {self.n_pixels}: it must be one or two whole numbers of at least 2"
+                )
+        for name in ("pixel_scale", "wavelength"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                unit = "rad per pixel" if name == "pixel_scale" else "m"
+                raise ValueError(f"{name} is {value}: it must be finite and positive, in {unit}")
+
+    @classmethod
+    def nyquist(
+        cls, diameter: float, wavelength: float, n_pixels: int | tuple[int, int], oversampling: float = 1.0
+    ) -> Grid:
+        """The grid that samples the diffraction limit of `diameter` [m] at `oversampling` times Nyquist.
+
+        At `oversampling=1` the pixel is wavelength / (2 diameter), the largest without aliasing.
+        """
+        if not (math.isfinite(diameter) and diameter > 0):
+            raise ValueError(f"diameter is {diameter}: it must be finite and positive, in m")
+        if not (math.isfinite(oversampling) and oversampling >= 1):
+            raise ValueError(f"oversampling is {oversampling}: below 1 the image is aliased")
+        return cls(n_pixels, wavelength / (2 * diameter * oversampling), wavelength)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, columns)."""
+        return (self.n_pixels, self.n_pixels) if isinstance(self.n_pixels, int) else tuple(self.n_pixels)
+
+    @property
+    def period(self) -> float:
+        """Pupil-plane length of one cycle per pixel [m]."""
+        return self.wavelength / self.pixel_scale
+
+    def cutoff(self, diameter: float) -> float:
+        """Highest spatial frequency an aperture of `diameter` [m] transmits [cycles/pixel]."""
+        return diameter / self.period
+
+    def frequencies(
+        self, dtype: torch.dtype | None = None, device: torch.device | str | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Frequencies (nu_y (H, 1), nu_x (1, W)) in FFT order, cycles/pixel, in [-1/2, 1/2)."""
+        height, width = self.shape
+        nu_y = torch.fft.fftfreq(height, dtype=dtype, device=device)
+        nu_x = torch.fft.fftfreq(width, dtype=dtype, device=device)
+        return nu_y[:, None], nu_x[None, :]
+
+    def require_sampling(self, diameter: float) -> None:
+        """Raise ValueError unless the image of an aperture of `diameter` [m] is sampled without aliasing."""
+        if self.cutoff(diameter) > 0.5 * (1 + _ROUNDING):
+            raise ValueError(
+                f"pixel_scale {self.pixel_scale:.4g} rad undersamples an aperture of {diameter:.4g} m at "
+                f"{self.wavelength:.4g} m (cut-off {self.cutoff(diameter):.3f} cycles/pixel, above 1/2): "
+                f"pixel_scale must be at most {self.wavelength / (2 * diameter):.4g} rad"
+            )

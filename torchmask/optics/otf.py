@@ -1,0 +1,180 @@
+"""From a pupil to point-spread functions and optical transfer functions."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torchmask.grid import Grid
+from torchmask.optics.aperture import Aperture, PupilSamples
+
+
+class _DiscOTF(torch.autograd.Function):
+    """OTF of a disc with its own derivatives: those of the textbook form are NaN at 0 and at the edge."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        ctx.save_for_backward(x)
+        x = x.clamp(max=1)
+        return (2 / math.pi) * (torch.arccos(x) - x * torch.sqrt((1 - x) * (1 + x)))
+
+    @staticmethod
+    def backward(ctx: Any, *grad: Tensor) -> Tensor:
+        (x,) = ctx.saved_tensors
+        inside = x.clamp(max=1)
+        return grad[0] * (-4 / math.pi) * torch.sqrt((1 - inside) * (1 + inside))
+
+
+def disc_otf(x: Tensor) -> Tensor:
+    """OTF of a clear disc at `x` >= 0 times its cut-off: (2/pi)(acos x - x sqrt(1 - x^2)), 0 beyond 1.
+
+    Any shape; same shape, dtype and device out. The derivative is -(4/pi) sqrt(1 - x^2) (Goodman, Introduction to
+    Fourier Optics, section 6.3).
+    """
+    return _DiscOTF.apply(x)  # type: ignore[no-any-return]
+
+
+def hexagon_otf(shift: Tensor, orientation: float = 0.0) -> Tensor:
+    """OTF of a regular hexagon at `shift` (..., 2), in flat-to-flat widths: the normalised overlap area.
+
+    Two shifted copies of a hexagon meet in a hexagon with the same three edge directions and half-widths
+    (1 - |n_k . shift|) / 2. In the coordinates u = n_0 . x, v = n_2 . x its area is a rectangle less the corners
+    that |u + v| <= w_1 cuts off, which is exact.
+    """
+    angles = orientation + torch.arange(3, dtype=shift.dtype, device=shift.device) * math.pi / 3
+    normals = torch.stack([angles.cos(), angles.sin()], dim=-1)
+    w0, w1, w2 = ((1 - (shift[..., None, :] * normals).sum(-1).abs()) / 2).clamp(min=0).unbind(-1)
+
+    def square(t: Tensor) -> Tensor:
+        return t.clamp(min=0) ** 2
+
+    cut = w0 + w2 - w1
+    corners = square(cut) - square(cut - 2 * w0) - square(cut - 2 * w2) + square(cut - 2 * w0 - 2 * w2)
+    return (4 * w0 * w2 - corners) / 0.75
+
+
+def subaperture_otf(displacement: Tensor, aperture: Aperture) -> Tensor:
+    """Overlap of one sub-aperture with itself displaced by `displacement` (..., 2) [m], 1 at zero.
+
+    Discs and hexagons, without central obstruction. The gradient at zero displacement is 0.
+    """
+    if aperture.central_obstruction > 0:
+        raise ValueError("the closed-form OTF knows clear sub-apertures only: central_obstruction must be 0")
+    if aperture.shape == "hexagon":
+        return hexagon_otf(displacement / aperture.subaperture_diameter, aperture.orientation)
+    squared = (displacement**2).sum(-1)
+    distance = torch.where(squared > 0, squared, 1).sqrt() * (squared > 0)
+    return disc_otf(distance / aperture.subaperture_diameter)
+
+
+def fold(images: Tensor, shape: tuple[int, int]) -> Tensor:
+    """Fold images (..., a H, b W) into a field (..., H, W), whole a and b: light beyond a border re-enters opposite.
+
+    Raises ValueError if the size is not a whole multiple of the field.
+    """
+    rows, columns = images.shape[-2:]
+    if rows % shape[0] or columns % shape[1]:
+        raise ValueError(f"images of {rows} x {columns} pixels do not fold into {shape[0]} x {shape[1]}")
+    tiles = images.unflatten(-1, (-1, shape[1])).unflatten(-3, (-1, shape[0]))
+    return tiles.sum(dim=(-4, -2))
+
+
+def psf_from_samples(samples: PupilSamples, phase: Tensor | None = None) -> Tensor:
+    """PSF of a sampled pupil on its whole raster, unit sum, origin at [0, 0].
+
+    PSF = |FFT(P exp(i phase))|^2 with `phase` (..., N, P) [rad] on the samples; leading axes (frames, populations)
+    broadcast against those of the samples. Returns (..., rows, columns).
+    """
+    weights, index = samples.weights, samples.index
+    if phase is None:
+        field = weights.to(torch.complex64 if weights.dtype == torch.float32 else torch.complex128)
+    else:
+        field = torch.polar(
+            weights.expand(torch.broadcast_shapes(weights.shape, phase.shape)).contiguous(), phase
+        )
+    field, index = field.flatten(-2), index.expand(field.shape).flatten(-2)
+    pupil = torch.zeros(*field.shape[:-1], math.prod(samples.raster), dtype=field.dtype, device=field.device)
+    pupil = pupil.scatter_add(-1, index, field).unflatten(-1, samples.raster)
+    amplitude = torch.fft.fft2(pupil, norm="ortho")
+    psf = amplitude.real**2 + amplitude.imag**2
+    return psf / psf.sum(dim=(-2, -1), keepdim=True)
+
+
+class PSF(nn.Module):
+    """Point-spread functions of an aperture on a grid, unit sum, origin at pixel [0, 0] (FFT order).
+
+    Parameters
+    ----------
+    aperture : Aperture
+    grid : Grid
+    oversampling : int
+        The pupil is sampled for a field this many times as wide as the grid, and the PSF folded into it, so
+        light that leaves the field is kept. The error of the OTF falls as 1 / (oversampling * grid size).
+
+    Raises
+    ------
+    ValueError
+        If the grid aliases the image or a sub-aperture is narrower than two pupil samples.
+
+    Notes
+    -----
+    `forward(phase)` takes the phase [rad] on `samples()`, (..., N, P), as `ZernikePhase` and `TurbulencePhase` give
+    it, or None for a perfect wavefront, and returns (..., H, W). A phase 2 pi s x pixel_scale / wavelength moves
+    the image by +s pixels.
+    """
+
+    def __init__(self, aperture: Aperture, grid: Grid, oversampling: int = 1) -> None:
+        super().__init__()
+        self.aperture = aperture
+        self.grid = grid
+        self.oversampling = oversampling
+        self.samples()  # refuses an impossible grid now rather than at the first forward
+
+    def samples(self) -> PupilSamples:
+        """The pupil samples on which `forward` expects a phase."""
+        return self.aperture.samples(self.grid, self.oversampling)
+
+    def forward(self, phase: Tensor | None = None) -> Tensor:
+        return fold(psf_from_samples(self.samples(), phase), self.grid.shape)
+
+
+class OTF(PSF):
+    """Optical transfer functions, complex, in FFT order with value 1 at zero frequency: the DFT of `PSF`.
+
+    Same arguments as `PSF`; `forward(phase)` returns (..., H, W).
+    """
+
+    def forward(self, phase: Tensor | None = None) -> Tensor:
+        return torch.fft.fft2(super().forward(phase))
+
+
+def analytic_otf(aperture: Aperture, grid: Grid, pistons: Tensor | None = None) -> Tensor:
+    """OTF of clear sub-apertures with a piston each, in closed form: the sum of the overlaps of all pairs.
+
+    `pistons` (..., N) [rad], or None for a perfect wavefront. Returns complex (..., H, W) in FFT order, wrapped on
+    the frequency torus as a sampled PSF is. Source: DESIGN, section 2; the autocorrelation theorem.
+    """
+    grid.require_sampling(aperture.extent)
+    centers = aperture.centers
+    nu_y, nu_x = grid.frequencies(centers.dtype, centers.device)
+    n = aperture.n_subapertures
+    total = None
+    for m in range(n):
+        for k in range(n):
+            baseline = (centers[..., m, :] - centers[..., k, :])[..., None, None, :] / grid.period
+            dx = nu_x - baseline[..., 0]
+            dy = nu_y - baseline[..., 1]
+            dx, dy = dx - dx.detach().round(), dy - dy.detach().round()
+            overlap = subaperture_otf(
+                torch.stack(torch.broadcast_tensors(dx, dy), dim=-1) * grid.period, aperture
+            )
+            term = overlap / n + 0j
+            if pistons is not None:
+                delta = pistons[..., m] - pistons[..., k]
+                term = term * torch.polar(torch.ones_like(delta), delta)[..., None, None]
+            total = term if total is None else total + term
+    assert total is not None
+    return total
