@@ -48,9 +48,7 @@ class Grid:
     def __post_init__(self) -> None:
         for side in self.shape:
             if side != int(side) or side < 2:
-                raise ValueError(
-                    f"n_pixels is {self.n_pixels}: it must be one or two whole numbers of at least 2"
-                )
+                raise ValueError(f"n_pixels is {self.n_pixels}: it must be one or two whole numbers of at least 2")
         for name in ("pixel_scale", "wavelength"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):

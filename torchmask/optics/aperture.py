@@ -114,9 +114,7 @@ class Aperture(nn.Module):
         """Open fraction of the cells (size `spacing`) at `offsets` from the centre of a sub-aperture."""
         radius = self.subaperture_diameter / 2
         if self.shape == "hexagon":
-            angles = (
-                self.orientation + torch.arange(6, dtype=offsets.dtype, device=offsets.device) * math.pi / 3
-            )
+            angles = self.orientation + torch.arange(6, dtype=offsets.dtype, device=offsets.device) * math.pi / 3
             normals = torch.stack([angles.cos(), angles.sin()], dim=-1)
             distance = radius - (offsets[..., None, :] * normals).sum(-1)  # (..., P, 6), inwards
             return _half_plane_coverage(distance, normals, spacing).prod(-1)
@@ -125,9 +123,7 @@ class Aperture(nn.Module):
         normals = offsets / r[..., None]
         coverage = _half_plane_coverage(radius - r, normals, spacing)
         if self.central_obstruction > 0:
-            coverage = coverage - _half_plane_coverage(
-                radius * self.central_obstruction - r, normals, spacing
-            )
+            coverage = coverage - _half_plane_coverage(radius * self.central_obstruction - r, normals, spacing)
         return coverage
 
 
@@ -206,18 +202,14 @@ class SparseAperture(Aperture):
         if not isinstance(centers, Tensor):
             centers = torch.as_tensor(centers, dtype=torch.float64)
         if centers.ndim < 2 or centers.shape[-1] != 2 or centers.shape[-2] < 1:
-            raise ValueError(
-                f"centers has shape {tuple(centers.shape)}: it must be (..., n_subapertures, 2), (x, y)"
-            )
+            raise ValueError(f"centers has shape {tuple(centers.shape)}: it must be (..., n_subapertures, 2), (x, y)")
         if not centers.is_floating_point():
             raise TypeError(f"centers has dtype {centers.dtype}: it must be floating point, in m")
         if not bool(torch.isfinite(centers).all()):
             raise ValueError("centers holds values that are not finite")
         if isinstance(centers, nn.Parameter):
             if dtype not in (None, centers.dtype) or device not in (None, centers.device):
-                raise ValueError(
-                    "dtype and device of a Parameter are its own: move it before it is handed in"
-                )
+                raise ValueError("dtype and device of a Parameter are its own: move it before it is handed in")
             self.centers = centers
         else:
             self.register_buffer("centers", centers.to(dtype=dtype, device=device))

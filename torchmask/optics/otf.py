@@ -92,9 +92,7 @@ def psf_from_samples(samples: PupilSamples, phase: Tensor | None = None) -> Tens
     if phase is None:
         field = weights.to(torch.complex64 if weights.dtype == torch.float32 else torch.complex128)
     else:
-        field = torch.polar(
-            weights.expand(torch.broadcast_shapes(weights.shape, phase.shape)).contiguous(), phase
-        )
+        field = torch.polar(weights.expand(torch.broadcast_shapes(weights.shape, phase.shape)).contiguous(), phase)
     field, index = field.flatten(-2), index.expand(field.shape).flatten(-2)
     pupil = torch.zeros(*field.shape[:-1], math.prod(samples.raster), dtype=field.dtype, device=field.device)
     pupil = pupil.scatter_add(-1, index, field).unflatten(-1, samples.raster)
@@ -168,9 +166,7 @@ def analytic_otf(aperture: Aperture, grid: Grid, pistons: Tensor | None = None) 
             dx = nu_x - baseline[..., 0]
             dy = nu_y - baseline[..., 1]
             dx, dy = dx - dx.detach().round(), dy - dy.detach().round()
-            overlap = subaperture_otf(
-                torch.stack(torch.broadcast_tensors(dx, dy), dim=-1) * grid.period, aperture
-            )
+            overlap = subaperture_otf(torch.stack(torch.broadcast_tensors(dx, dy), dim=-1) * grid.period, aperture)
             term = overlap / n + 0j
             if pistons is not None:
                 delta = pistons[..., m] - pistons[..., k]
