@@ -72,7 +72,8 @@ class Grid:
     @property
     def shape(self) -> tuple[int, int]:
         """(rows, columns)."""
-        return (self.n_pixels, self.n_pixels) if isinstance(self.n_pixels, int) else tuple(self.n_pixels)
+        rows, columns = (self.n_pixels, self.n_pixels) if isinstance(self.n_pixels, int) else self.n_pixels
+        return rows, columns
 
     @property
     def period(self) -> float:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from torchmask.grid import Grid
+from torchmask.optics import catalog
 
 SHAPES = ("disc", "hexagon")
 
@@ -118,9 +119,12 @@ class Aperture(nn.Module):
             normals = torch.stack([angles.cos(), angles.sin()], dim=-1)
             distance = radius - (offsets[..., None, :] * normals).sum(-1)  # (..., P, 6), inwards
             return _half_plane_coverage(distance, normals, spacing).prod(-1)
-        # The sum keeps the gradient finite at a sample that lies on the centre.
-        r = torch.sqrt((offsets**2).sum(-1) + torch.finfo(offsets.dtype).tiny)
-        normals = offsets / r[..., None]
+        # A sample on the centre has no direction: any will do, and this one keeps the gradient finite.
+        central = (offsets == 0).all(-1, keepdim=True)
+        direction = torch.where(central, offsets.new_tensor([1.0, 0.0]), offsets)
+        length = torch.linalg.vector_norm(direction, dim=-1, keepdim=True)
+        normals = direction / length
+        r = torch.where(central, 0, length)[..., 0]
         coverage = _half_plane_coverage(radius - r, normals, spacing)
         if self.central_obstruction > 0:
             coverage = coverage - _half_plane_coverage(radius * self.central_obstruction - r, normals, spacing)
@@ -217,6 +221,46 @@ class SparseAperture(Aperture):
         self.mask_diameter = float(mask_diameter)
         self.shape = shape
         self.orientation = float(orientation)
+
+    @classmethod
+    def from_catalog(
+        cls,
+        name: str,
+        mask_diameter: float | None = None,
+        fill_factor: float | None = None,
+        mirrored: bool = False,
+        *,
+        dtype: torch.dtype | None = None,
+        device: torch.device | str | None = None,
+    ) -> SparseAperture:
+        """A mask of the catalogue (`torchmask.optics.catalog`), such as "golay6" or "jwst_niriss_ami_7".
+
+        Parameters
+        ----------
+        name : str
+            Any of `catalog.names()`; case and punctuation do not matter.
+        mask_diameter, fill_factor : float, optional
+            Neither: as built, in metres on the primary mirror; mask_diameter is that of the pupil.
+            Both: the pattern afresh. N d^2 / D^2 = fill_factor, the smallest circle around the holes centred on the
+            origin, the outermost holes touching mask_diameter [m] (hexagons with their corners' circle). Golay arrays
+            need this. mask_diameter alone: the mask as built, centres and holes scaled until its pupil has this
+            diameter. fill_factor alone: the centres as built, holes of another size.
+        mirrored : bool
+            Reverse x, for instruments that look from the other side.
+
+        Raises
+        ------
+        ValueError
+            For an unknown name (the known ones are listed), a size that is not positive or leaves no room, a
+            Golay array without both sizes, a mask whose hole diameter no source gives without fill_factor.
+
+        Examples
+        --------
+        >>> mask = SparseAperture.from_catalog("golay6", mask_diameter=1.0, fill_factor=0.15)
+        >>> mask.n_subapertures, round(mask.fill_factor, 12)
+        (6, 0.15)
+        """
+        return cls(**catalog.layout(name, mask_diameter, fill_factor, mirrored), dtype=dtype, device=device)
 
     @property
     def fill_factor(self) -> float:
