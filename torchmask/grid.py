@@ -46,8 +46,9 @@ class Grid:
     wavelength: float
 
     def __post_init__(self) -> None:
-        for side in self.shape:
-            if side != int(side) or side < 2:
+        sides = self.n_pixels if isinstance(self.n_pixels, tuple) else (self.n_pixels,)
+        for side in sides:
+            if not isinstance(side, int) or side < 2 or len(sides) > 2:
                 raise ValueError(f"n_pixels is {self.n_pixels}: it must be one or two whole numbers of at least 2")
         for name in ("pixel_scale", "wavelength"):
             value = getattr(self, name)

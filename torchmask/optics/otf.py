@@ -180,7 +180,8 @@ def analytic_otf(aperture: Aperture, grid: Grid, pistons: Tensor | None = None) 
             overlap = subaperture_otf(torch.stack(torch.broadcast_tensors(dx, dy), dim=-1) * grid.period, aperture)
             term = overlap / n + 0j
             if pistons is not None:
-                delta = pistons[..., m] - pistons[..., k]
+                # An image moves by +s for a phase that grows along +x: exp(-2 pi i nu s) at nu = c_m - c_k.
+                delta = pistons[..., k] - pistons[..., m]
                 term = term * torch.polar(torch.ones_like(delta), delta)[..., None, None]
             total = term if total is None else total + term
     assert total is not None

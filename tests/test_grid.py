@@ -1,0 +1,60 @@
+import math
+
+import pytest
+import torch
+
+from torchmask.grid import Grid
+
+
+def test_nyquist_places_the_cutoff_at_half_a_cycle():
+    grid = Grid.nyquist(diameter=2.0, wavelength=1e-6, n_pixels=64)
+    assert grid.cutoff(2.0) == pytest.approx(0.5, rel=1e-15)
+    assert grid.period == pytest.approx(4.0, rel=1e-15)
+    grid.require_sampling(2.0)
+
+
+def test_oversampling_divides_the_pixel():
+    coarse, fine = (Grid.nyquist(1.0, 550e-9, 64, q) for q in (1.0, 2.5))
+    assert fine.pixel_scale == pytest.approx(coarse.pixel_scale / 2.5, rel=1e-15)
+
+
+@pytest.mark.parametrize("n_pixels", [7, 8, (6, 9)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_frequencies_are_those_of_the_dft(n_pixels, dtype):
+    grid = Grid(n_pixels, 1e-7, 550e-9)
+    nu_y, nu_x = grid.frequencies(dtype)
+    assert (nu_y.shape, nu_x.shape) == ((grid.shape[0], 1), (1, grid.shape[1]))
+    assert nu_y.dtype == nu_x.dtype == dtype
+    # A plane wave at frequency (k_y, k_x) has its whole energy in that bin.
+    y, x = torch.arange(grid.shape[0])[:, None], torch.arange(grid.shape[1])
+    wave = torch.exp(2j * math.pi * (nu_y[2, 0] * y + nu_x[0, -1] * x))
+    spectrum = torch.fft.fft2(wave).abs()
+    assert int(spectrum.argmax()) == 2 * grid.shape[1] + grid.shape[1] - 1
+
+
+def test_undersampling_is_refused_with_the_pixel_scale_that_is_needed():
+    grid = Grid(64, 2.75e-7, 550e-9)
+    with pytest.raises(ValueError, match=r"pixel_scale must be at most 1\.375e-07 rad"):
+        grid.require_sampling(2.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((1, 1e-7, 1e-6), "n_pixels"),
+        ((12.5, 1e-7, 1e-6), "n_pixels"),
+        ((8, 0.0, 1e-6), "pixel_scale"),
+        ((8, math.nan, 1e-6), "pixel_scale"),
+        ((8, 1e-7, -1e-6), "wavelength"),
+        ((8, 1e-7, math.inf), "wavelength"),
+    ],
+)
+def test_impossible_numbers_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        Grid(*arguments)
+
+
+@pytest.mark.parametrize(("diameter", "oversampling"), [(0.0, 1.0), (math.nan, 1.0), (1.0, 0.9), (1.0, math.inf)])
+def test_nyquist_refuses_impossible_numbers(diameter, oversampling):
+    with pytest.raises(ValueError, match=r"diameter|oversampling"):
+        Grid.nyquist(diameter, 1e-6, 64, oversampling)
