@@ -1,0 +1,306 @@
+"""MSE_a: the error of the best linear restoration from many short exposures, in closed form and without an image.
+
+Every sub-aperture carries an independent uniform piston, so the expected squared transfer function of the mask is the
+sum over its baselines of the squared OTF of one sub-aperture. That sum has compact terms, and it is even in nu: each
+unordered pair of sub-apertures leaves one small patch of pixels on half the frequency plane.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torchmask.design.overlap import disc_patches, hexagon_patches
+from torchmask.design.psd import PSD, evaluate_psd, resample_psd
+from torchmask.grid import Grid
+from torchmask.optics.aperture import Aperture, FullAperture
+
+_CHUNK = 2**16  # pixels of patches treated at a time: what stays in a core's cache
+
+
+class _Geometry(NamedTuple):
+    """What the kernel must know of an aperture and a grid besides the centres; lengths in pixels of the grid."""
+
+    shape: tuple[int, int]  # of the frequency grid
+    period: float  # metres in the pupil of one cycle per pixel
+    subaperture: str
+    diameter: float  # [m]
+    reach: float  # radius of the support of a sub-aperture's OTF [m]
+    orientation: float
+
+
+class AsymptoticMSE(nn.Module):
+    """Mean squared error of the multi-frame Wiener restoration, in the limit of many frames.
+
+    MSE_a = mean over nu of S_o S_n / (K S_o (N^2 |h(nu)|^2 + sum_{m != n} |h(nu + nu_m - nu_n)|^2) + S_n), with h the
+    OTF of one centred sub-aperture over the number of sub-apertures N, K the number of frames, S_o and S_n the PSDs.
+    Baselines wrap around the frequency torus. No linear restoration does better, whatever the pistons (Jensen).
+
+    Parameters
+    ----------
+    grid : Grid
+        Its frequencies are where the integral is sampled. It must resolve h: at least 256 pixels for a result to quote.
+    object_psd, noise_psd : callable or Tensor
+        psd(grid, dtype, device) such as `PowerLawPSD` and `NoisePSD`, or a tensor that broadcasts to (H, W) in FFT
+        order. They need not be symmetric. The object's must be at least 0, the noise's positive.
+    n_frames : int
+        K.
+
+    Raises
+    ------
+    ValueError, TypeError
+        For PSDs of a wrong shape, sign or type, and for `n_frames` below 1.
+
+    Notes
+    -----
+    `forward(aperture)` returns (...), one value for each mask of the population `aperture.centers` (..., N, 2), in
+    the dtype of the centres and differentiable (once) in them. Cost and memory grow with the pixels of the patches,
+    N^2 c^2 G^2 / 2 per mask, c = diameter of a sub-aperture / grid.period; memory beyond that of one mask is
+    chunked away. It raises ValueError for an aperture without closed form (full or obstructed) and for c > 1/2.
+
+    Examples
+    --------
+    >>> from torchmask.design.psd import NoisePSD, PowerLawPSD
+    >>> from torchmask.optics.aperture import SparseAperture
+    >>> grid = Grid.nyquist(diameter=1.0, wavelength=550e-9, n_pixels=64)
+    >>> criterion = AsymptoticMSE(grid, PowerLawPSD(1.5, 1e7), NoisePSD(1e7), n_frames=20)
+    >>> mask = SparseAperture([[0.0, 0.4], [0.3, -0.2], [-0.3, -0.2]], 0.2, 1.0)
+    >>> round(float(criterion.relative(mask)), 2)
+    0.25
+    """
+
+    object_psd: Tensor
+    noise_psd: Tensor
+    _weight: Tensor
+    _ratio: Tensor
+
+    def __init__(self, grid: Grid, object_psd: PSD, noise_psd: PSD, n_frames: int) -> None:
+        super().__init__()
+        if n_frames != int(n_frames) or n_frames < 1:
+            raise ValueError(f"n_frames is {n_frames}: it must be a whole number of at least 1")
+        self.grid = grid
+        self.n_frames = int(n_frames)
+        self._object_model = None if isinstance(object_psd, Tensor) else object_psd
+        self.register_buffer("object_psd", evaluate_psd(object_psd, grid, "object_psd"))
+        self.register_buffer("noise_psd", evaluate_psd(noise_psd, grid, "noise_psd"))
+        if not bool((self.noise_psd > 0).all()):
+            raise ValueError("noise_psd is 0 somewhere: without noise the error is 0 wherever light comes through")
+        self._pack()
+        self.register_load_state_dict_post_hook(_pack_again)
+
+    def _pack(self) -> None:
+        """Write MSE_a as the sum of weight / (transfer + ratio) over half the frequency plane.
+
+        A frequency and its opposite see the same transfer; two layers hold them where the PSDs differ there.
+        """
+        rows, columns = self.grid.shape
+        height = rows // 2 + 1
+        double = torch.full((height, 1), 2.0, dtype=self.noise_psd.dtype, device=self.noise_psd.device)
+        double[0] = 1.0
+        if rows % 2 == 0:
+            double[-1] = 1.0
+        weight = self.noise_psd / (self.n_frames * rows * columns)
+        ratio = self.noise_psd / (self.n_frames * self.object_psd)
+        if all(bool((psd == _reflect(psd)).all()) for psd in (self.object_psd, self.noise_psd)):
+            weights, ratios = [weight[:height] * double], [ratio[:height]]
+        else:
+            weights = [weight[:height], _reflect(weight)[:height] * (double - 1)]
+            ratios = [ratio[:height], _reflect(ratio)[:height]]
+        self.register_buffer("_weight", torch.stack(weights), persistent=False)
+        self.register_buffer("_ratio", torch.stack(ratios), persistent=False)
+
+    def forward(self, aperture: Aperture) -> Tensor:
+        centers = aperture.centers
+        geometry = self._geometry(aperture)
+        flat = centers.reshape(-1, *centers.shape[-2:])
+        weight, ratio = self._weight.to(centers.dtype), self._ratio.to(centers.dtype)
+        return _BaselineMSE.apply(flat, weight, ratio, geometry).reshape(centers.shape[:-2])  # type: ignore[no-any-return]
+
+    def relative(self, aperture: Aperture) -> Tensor:
+        """MSE_a over the mean of the object's PSD, (...): 0 is a perfect restoration, 1 none at all."""
+        return self(aperture) / self.object_psd.mean().to(aperture.centers.dtype)
+
+    def floor(self, mask_diameter: float) -> Tensor:
+        """The part of MSE_a that no mask of `mask_diameter` [m] can change, a scalar: S_o beyond the mask's reach."""
+        if not (math.isfinite(mask_diameter) and mask_diameter > 0):
+            raise ValueError(f"mask_diameter is {mask_diameter}: it must be finite and positive, in m")
+        nu_y, nu_x = self.grid.frequencies(self.object_psd.dtype, self.object_psd.device)
+        beyond = torch.hypot(nu_y, nu_x) >= self.grid.cutoff(mask_diameter)
+        return (self.object_psd * beyond).mean()
+
+    def on_grid(self, n_pixels: int | tuple[int, int]) -> AsymptoticMSE:
+        """The same criterion with the integral sampled on another grid of the same pixel scale.
+
+        For searches, which a coarse grid makes fast. The image stays what it was: the noise keeps its level, also its
+        read-out part. A callable object PSD is evaluated anew; tensors are interpolated (`resample_psd`).
+        """
+        grid = replace(self.grid, n_pixels=n_pixels)
+        noise = resample_psd(self.noise_psd, grid.shape)
+        model = resample_psd(self.object_psd, grid.shape) if self._object_model is None else self._object_model
+        other = AsymptoticMSE(grid, model, noise, self.n_frames)
+        return other.to(self.object_psd.device, self.object_psd.dtype)
+
+    def _geometry(self, aperture: Aperture) -> _Geometry:
+        if isinstance(aperture, FullAperture) or aperture.central_obstruction > 0:
+            raise ValueError(
+                "MSE_a is defined for masks of clear sub-apertures (SparseAperture): a full or obstructed pupil has "
+                "aberrations that a piston per sub-aperture does not describe; take wiener_mse of drawn OTFs instead"
+            )
+        diameter = aperture.subaperture_diameter
+        reach = diameter * (1.0 if aperture.shape == "disc" else 2 / math.sqrt(3))
+        if reach > 0.5 * self.grid.period * (1 + 1e-9):
+            raise ValueError(
+                f"the OTF of a sub-aperture reaches {self.grid.cutoff(reach):.3f} cycles/pixel, above 1/2, and overlaps "
+                f"itself: pixel_scale must be at most {self.grid.wavelength / (2 * reach):.4g} rad"
+            )
+        return _Geometry(self.grid.shape, self.grid.period, aperture.shape, diameter, reach, aperture.orientation)
+
+    def extra_repr(self) -> str:
+        return f"grid={self.grid}, n_frames={self.n_frames}"
+
+
+def wiener_mse(otfs: Tensor, object_psd: PSD, noise_psd: PSD) -> Tensor:
+    """Mean squared error of the multi-frame Wiener restoration for given OTFs.
+
+    Parameters
+    ----------
+    otfs : (..., frame, H, W)
+        One OTF for each exposure, complex or real, in FFT order.
+    object_psd, noise_psd : callable or Tensor
+        As for `AsymptoticMSE`. A callable gets a grid of the OTFs' shape with pixels and wavelength of 1: it may know
+        frequencies in cycles/pixel only.
+
+    Returns
+    -------
+    (...) mean over nu of S_o S_n / (S_o sum_k |h_k|^2 + S_n). Its average over random pistons is at least MSE_a.
+
+    Raises
+    ------
+    ValueError, TypeError
+        For OTFs without a frame axis, and for PSDs of a wrong shape, sign or type.
+    """
+    if otfs.ndim < 3:
+        raise ValueError(f"otfs has shape {tuple(otfs.shape)}: it must be (..., frame, H, W)")
+    grid = Grid((otfs.shape[-2], otfs.shape[-1]), 1.0, 1.0)
+    real = otfs.real.dtype if otfs.is_complex() else otfs.dtype
+    s_o = evaluate_psd(object_psd, grid, "object_psd", real, otfs.device)
+    s_n = evaluate_psd(noise_psd, grid, "noise_psd", real, otfs.device)
+    power = (otfs.real**2 + otfs.imag**2 if otfs.is_complex() else otfs**2).sum(-3)
+    return (s_n / (power + s_n / s_o)).mean((-2, -1))
+
+
+def _reflect(image: Tensor) -> Tensor:
+    """The image (..., H, W) at the opposite frequencies."""
+    return image.flip(-2, -1).roll((1, 1), (-2, -1))
+
+
+def _pack_again(module: nn.Module, _: Any) -> None:
+    assert isinstance(module, AsymptoticMSE)
+    module._pack()
+
+
+class _BaselineMSE(torch.autograd.Function):
+    """MSE_a of masks with centres (B, N, 2). The gradient is made with the value, mask by mask: it is small, while
+    what a backward pass would need is not."""
+
+    @staticmethod
+    def forward(ctx: Any, centers: Tensor, weight: Tensor, ratio: Tensor, geometry: _Geometry) -> Tensor:
+        differentiate = ctx.needs_input_grad[0]
+        n = centers.shape[-2]
+        side = 2 * geometry.reach / geometry.period
+        pixels = (n * (n - 1) // 2 + 1) * (side * geometry.shape[0] + 1) * (side * geometry.shape[1] + 1)
+        chunks = [
+            _mse_and_gradient(chunk, weight, ratio, geometry, differentiate)
+            for chunk in centers.split(max(1, int(_CHUNK / pixels)))
+        ]
+        if differentiate:
+            ctx.save_for_backward(torch.cat([gradient for _, gradient in chunks]))
+        return torch.cat([value for value, _ in chunks])
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *grad: Tensor) -> tuple[Tensor, None, None, None]:
+        (gradient,) = ctx.saved_tensors
+        return grad[0][:, None, None] * gradient, None, None, None
+
+
+def _mse_and_gradient(
+    centers: Tensor, weight: Tensor, ratio: Tensor, geometry: _Geometry, differentiate: bool
+) -> tuple[Tensor, Tensor]:
+    """MSE_a (B,) of masks with centres (B, N, 2), and its gradient by them (zeros unless asked for)."""
+    (rows, columns), period = geometry.shape, geometry.period
+    batch, n = centers.shape[:2]
+    first, second = torch.triu_indices(n, n, 1, device=centers.device)
+    # baselines in pixels, the zero baseline before them, on the half-plane nu_y >= 0
+    size = centers.new_tensor([columns, rows])
+    baseline = (centers[:, first] - centers[:, second]) * (size / period)
+    baseline = torch.cat([baseline.new_zeros(batch, 1, 2), baseline], 1)
+    baseline = baseline - size * torch.round(baseline / size)
+    sign = torch.where(baseline[..., 1:] < 0, -1.0, 1.0).to(baseline.dtype)
+    baseline = baseline * sign
+    # a window of the pixels within reach of each; NaN (a diverged optimiser) must not become an index
+    reach_x, reach_y = geometry.reach * columns / period, geometry.reach * rows / period
+    corner = torch.ceil(baseline - centers.new_tensor([reach_x, reach_y]))
+    offset = corner - baseline
+    corner = corner.nan_to_num(0.0).long()
+    window_x = torch.arange(int(2 * reach_x) + 1, device=centers.device)
+    window_y = torch.arange(int(2 * reach_y) + 1, device=centers.device)
+    x = (offset[..., :1] + window_x)[..., None, :] * (period / (columns * geometry.diameter))
+    y = (offset[..., 1:] + window_y)[..., None] * (period / (rows * geometry.diameter))
+    if geometry.subaperture == "disc":
+        patches, pullback = disc_patches(x, y, differentiate)
+    else:
+        patches, pullback = hexagon_patches(x, y, geometry.orientation, differentiate)
+    patches[:, 0] *= n * n / 2  # each patch counts twice in the end, at nu and at -nu
+
+    # rows from -above to rows//2 + below of the plane hold every patch; columns wrap
+    height = rows // 2 + 1
+    above, below = int(reach_y), int(reach_y) + 1
+    index_x = (corner[..., :1] + window_x) % columns
+    index_y = corner[..., 1:] + (window_y + above)
+    index = (index_y * columns)[..., None] + index_x[..., None, :]
+    index = index.reshape(batch, -1)
+    plane = centers.new_zeros(batch, (above + height + below) * columns)
+    plane.scatter_add_(1, index, patches.reshape(batch, -1))
+    plane = plane.view(batch, -1, columns)
+
+    transfer = plane[:, above : above + height].clone()
+    mirror = _Mirror(rows, columns, above, below, centers.device)
+    mirror.add_reflection(transfer, plane)
+    scale = 1 / (n * n)
+    inverse = torch.add(ratio, transfer[:, None], alpha=scale).reciprocal_()
+    value = torch.matmul(inverse.view(batch, -1), weight.view(-1))
+    if not differentiate:
+        return value, torch.zeros_like(centers)
+    slope = (inverse.square_() * weight).sum(1).mul_(-scale)
+    plane.zero_()
+    plane[:, above : above + height] = slope
+    mirror.add_adjoint(plane, slope)
+    patches = torch.gather(plane.view(batch, -1), 1, index).view(patches.shape)
+    by_baseline = -pullback(patches) * sign * (size / (size * geometry.diameter))
+    gradient = torch.zeros_like(centers)
+    gradient.index_add_(1, first, by_baseline[:, 1:])
+    gradient.index_add_(1, second, by_baseline[:, 1:], alpha=-1)
+    return value, gradient
+
+
+class _Mirror:
+    """The point reflection of the rows of a plane that lie on the border of the half-plane or beyond it."""
+
+    def __init__(self, rows: int, columns: int, above: int, below: int, device: torch.device) -> None:
+        half = rows // 2
+        row = torch.arange(-above, half + below + 1, device=device)
+        outside = (row <= 0) | (2 * row >= rows)
+        self.source = outside.nonzero()[:, 0]
+        self.target = torch.where(row <= 0, -row, rows - row)[self.source].clamp(0, half)
+        self.column = -torch.arange(columns, device=device) % columns
+
+    def add_reflection(self, transfer: Tensor, plane: Tensor) -> None:
+        transfer.index_add_(1, self.target, plane[:, self.source][..., self.column])
+
+    def add_adjoint(self, plane: Tensor, slope: Tensor) -> None:
+        plane[:, self.source] += slope[:, self.target][..., self.column]

@@ -1,0 +1,145 @@
+"""Power spectral densities of the object and of the noise, in the convention of an unnormalised DFT."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchmask.grid import Grid
+
+PSD = Tensor | Callable[..., Tensor]
+"""A tensor broadcastable to (H, W) in FFT order, or a callable psd(grid, dtype, device) that returns one."""
+
+
+def _require_positive(name: str, value: float, unit: str, zero: bool = False) -> None:
+    if not (math.isfinite(value) and (value > 0 or (zero and value == 0))):
+        raise ValueError(f"{name} is {value}: it must be finite and {'not negative' if zero else 'positive'}, {unit}")
+
+
+@dataclass(frozen=True)
+class PowerLawPSD:
+    """PSD of natural scenes: S_o(nu) = n_photons^2 max(|nu| / knee, 1)^(-exponent).
+
+    Parameters
+    ----------
+    exponent : float
+        p, at least 0; between 1 and 3 for most scenes.
+    n_photons : float
+        Photons of the whole image, so that S_o(0) = n_photons^2 whatever the grid.
+    knee : float
+        One over the size of the object [cycles/pixel]; the PSD is flat below.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite or out of range.
+
+    Examples
+    --------
+    >>> from torchmask.grid import Grid
+    >>> grid = Grid.nyquist(diameter=1.0, wavelength=550e-9, n_pixels=64)
+    >>> psd = PowerLawPSD(exponent=1.5, n_photons=1e7)
+    >>> float(psd(grid)[0, 0]), float(psd(grid)[0, 4])  # |nu| = 0 and 4/64
+    (100000000000000.0, 12500000000000.0)
+    """
+
+    exponent: float
+    n_photons: float
+    knee: float = 1 / 64
+
+    def __post_init__(self) -> None:
+        _require_positive("exponent", self.exponent, "a pure number", zero=True)
+        _require_positive("n_photons", self.n_photons, "in photons per image")
+        _require_positive("knee", self.knee, "in cycles/pixel")
+
+    def __call__(
+        self, grid: Grid, dtype: torch.dtype | None = torch.float64, device: torch.device | str | None = None
+    ) -> Tensor:
+        """The PSD on the frequencies of `grid`, (H, W) in FFT order [photons^2]."""
+        nu_y, nu_x = grid.frequencies(dtype, device)
+        return self.n_photons**2 * (torch.hypot(nu_y, nu_x) / self.knee).clamp(min=1) ** -self.exponent
+
+
+@dataclass(frozen=True)
+class NoisePSD:
+    """PSD of photon and read-out noise, white: S_n = n_photons + (number of pixels) readout_noise^2.
+
+    Parameters
+    ----------
+    n_photons : float
+        Photons of one exposure, summed over its pixels.
+    readout_noise : float
+        [electrons rms per pixel].
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite or out of range.
+    """
+
+    n_photons: float
+    readout_noise: float = 0.0
+
+    def __post_init__(self) -> None:
+        _require_positive("n_photons", self.n_photons, "in photons per exposure")
+        _require_positive("readout_noise", self.readout_noise, "in electrons rms per pixel", zero=True)
+
+    def __call__(
+        self, grid: Grid, dtype: torch.dtype | None = torch.float64, device: torch.device | str | None = None
+    ) -> Tensor:
+        """The PSD on the frequencies of `grid`, (H, W) [photons]."""
+        level = self.n_photons + math.prod(grid.shape) * self.readout_noise**2
+        return torch.full(grid.shape, level, dtype=dtype, device=device)
+
+
+def evaluate_psd(
+    psd: PSD,
+    grid: Grid,
+    name: str,
+    dtype: torch.dtype | None = torch.float64,
+    device: torch.device | str | None = None,
+) -> Tensor:
+    """`psd` on the frequencies of `grid` as a tensor (H, W) of its own.
+
+    Raises
+    ------
+    TypeError
+        If it is neither a tensor nor callable, or gives something else than a real floating-point tensor.
+    ValueError
+        If it does not broadcast to the grid, or holds negative or non-finite values; `name` says which PSD.
+    """
+    value: Any = psd if isinstance(psd, Tensor) or not callable(psd) else psd(grid, dtype, device)
+    if not isinstance(value, Tensor) or not value.is_floating_point():
+        raise TypeError(f"{name} is {value!r}: it must be a real tensor (H, W), or psd(grid, dtype, device) giving one")
+    try:
+        value = value.detach().to(dtype=dtype, device=device).expand(grid.shape).clone()
+    except RuntimeError:
+        raise ValueError(
+            f"{name} has shape {tuple(value.shape)}: it must broadcast to the grid's {grid.shape[0]} x {grid.shape[1]}"
+        ) from None
+    if not bool((torch.isfinite(value) & (value >= 0)).all()):
+        raise ValueError(f"{name} holds negative or non-finite values: a PSD is finite and at least 0")
+    return value
+
+
+def resample_psd(psd: Tensor, shape: tuple[int, int]) -> Tensor:
+    """`psd` (H, W) on the frequencies of a grid of `shape` with the same pixels, bilinear on the frequency torus.
+
+    Exact for a white PSD; the frequencies common to both grids keep their values.
+    """
+    for axis, size in ((-2, shape[0]), (-1, shape[1])):
+        old = psd.shape[axis]
+        position = torch.fft.fftfreq(size, dtype=psd.dtype, device=psd.device) * old
+        lower = (position + 1e-9).floor()  # a common frequency is not to fall short of itself by rounding
+        weight = (position - lower).clamp(min=0)
+        if axis == -2:
+            weight = weight[:, None]
+        first = psd.index_select(axis, lower.long() % old)
+        second = psd.index_select(axis, (lower.long() + 1) % old)
+        psd = first + weight * (second - first)
+    return psd
