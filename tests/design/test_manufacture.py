@@ -1,0 +1,267 @@
+import json
+import math
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torchmask.design import manufacture
+from torchmask.design.manufacture import load_mask, save_dxf, save_fits, save_json, save_svg
+from torchmask.optics.aperture import FullAperture, SparseAperture
+
+SAVE = {".json": save_json, ".dxf": save_dxf, ".svg": save_svg, ".fits": save_fits}
+READABLE = [".json", ".dxf", ".fits"]
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+def masks():
+    generator = torch.Generator().manual_seed(5)
+    uneven = (torch.rand(7, 2, generator=generator, dtype=torch.float64) - 0.5) / 3
+    return {
+        "discs": SparseAperture(uneven, 0.1 / 3, 1 / 3),
+        "hexagons": SparseAperture(uneven, 0.1 / 3, 1 / 3, shape="hexagon", orientation=2.1),
+        "niriss": SparseAperture.from_catalog("niriss"),
+    }
+
+
+def same_bits(a, b):
+    return (
+        torch.equal(a.centers, b.centers)
+        and a.centers.dtype == b.centers.dtype
+        and (a.subaperture_diameter, a.mask_diameter, a.shape, a.orientation)
+        == (b.subaperture_diameter, b.mask_diameter, b.shape, b.orientation)
+    )
+
+
+@pytest.mark.parametrize("name", masks())
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("suffix", [".json", ".fits"])
+def test_json_and_fits_come_back_with_every_bit(tmp_path, name, dtype, suffix):
+    mask = masks()[name].to(dtype)
+    SAVE[suffix](tmp_path / f"mask{suffix}", mask)
+    assert same_bits(load_mask(tmp_path / f"mask{suffix}"), mask)
+
+
+number = st.floats(-10, 10, allow_nan=False)
+positive = st.floats(1e-6, 1e3, exclude_min=True)
+
+
+@given(st.lists(st.tuples(number, number), min_size=1, max_size=8), positive, positive, number)
+@settings(max_examples=60, derandomize=True, deadline=None)
+def test_json_is_exact_for_any_mask(tmp_path_factory, centers, hole, diameter, orientation):
+    mask = SparseAperture(torch.tensor(centers, dtype=torch.float64), hole, diameter, "hexagon", orientation)
+    path = tmp_path_factory.mktemp("exact") / "mask.json"
+    save_json(path, mask)
+    assert same_bits(load_mask(path), mask)
+
+
+@pytest.mark.parametrize("name", masks())
+@pytest.mark.parametrize("scale", [1000.0, 1.7])
+def test_dxf_comes_back_to_a_nanometre(tmp_path, name, scale):
+    mask = masks()[name]
+    save_dxf(tmp_path / "mask.dxf", mask, scale=scale)
+    back = load_mask(tmp_path / "mask.dxf")
+    assert back.shape == mask.shape
+    assert (back.centers - mask.centers).abs().max() * scale < 1e-6  # mm on the plate
+    assert abs(back.subaperture_diameter - mask.subaperture_diameter) * scale < 1e-6
+    assert abs(back.mask_diameter - mask.mask_diameter) * scale < 1e-6
+    assert back.orientation == pytest.approx(mask.orientation, abs=1e-9)
+
+
+@pytest.mark.parametrize("scale", [1000.0, 12.5])
+def test_dxf_circles_as_another_program_reads_them(tmp_path, scale):
+    """Millimetres on the plate, on the layers promised."""
+    import ezdxf
+    import ezdxf.units
+
+    mask = masks()["discs"]
+    save_dxf(tmp_path / "mask.dxf", mask, scale=scale)
+    drawing = ezdxf.readfile(tmp_path / "mask.dxf")
+    assert drawing.units == ezdxf.units.MM
+    assert not drawing.audit().errors
+    holes = drawing.modelspace().query('CIRCLE[layer=="HOLES"]')
+    drawn = np.array([(c.dxf.center.x, c.dxf.center.y, c.dxf.radius) for c in holes])
+    expected = np.column_stack(
+        [mask.centers.numpy() * scale, np.full(mask.n_subapertures, mask.subaperture_diameter * scale / 2)]
+    )
+    np.testing.assert_allclose(drawn, expected, rtol=0, atol=1e-6)
+
+
+def test_a_drawing_changed_in_cad_comes_back_changed(tmp_path):
+    import ezdxf
+
+    save_dxf(tmp_path / "mask.dxf", masks()["discs"])
+    drawing = ezdxf.readfile(tmp_path / "mask.dxf")
+    hole = next(iter(drawing.modelspace().query('CIRCLE[layer=="HOLES"]')))
+    hole.dxf.center = (12.0, -7.0)
+    drawing.saveas(tmp_path / "moved.dxf")
+    assert load_mask(tmp_path / "moved.dxf").centers[0].tolist() == pytest.approx([0.012, -0.007], abs=1e-15)
+
+
+def test_svg_is_in_millimetres_with_y_up(tmp_path):
+    mask = masks()["discs"]
+    save_svg(tmp_path / "mask.svg", mask, scale=30.0)
+    root = ElementTree.parse(tmp_path / "mask.svg").getroot()
+    assert root.get("width").endswith("mm")
+    assert float(root.get("width")[:-2]) == pytest.approx(float(root.get("viewBox").split()[2]))
+    circles = root.findall(f"{SVG}g[@id='holes']/{SVG}circle")
+    drawn = np.array([[float(c.get(k)) for k in ("cx", "cy", "r")] for c in circles])
+    np.testing.assert_allclose(drawn[:, :2], mask.centers.numpy() * [30, -30], rtol=1e-15)
+    np.testing.assert_allclose(drawn[:, 2], mask.subaperture_diameter * 15, rtol=1e-15)
+
+
+def test_svg_hexagons_have_the_width_and_orientation_of_the_mask(tmp_path):
+    mask = SparseAperture(torch.tensor([[0.3, 0.1]], dtype=torch.float64), 0.2, 1.0, "hexagon", 0.2)
+    save_svg(tmp_path / "mask.svg", mask, scale=1.0)
+    polygon = ElementTree.parse(tmp_path / "mask.svg").getroot().find(f"{SVG}g/{SVG}polygon")
+    corners = np.array([[float(v) for v in pair.split(",")] for pair in polygon.get("points").split()])
+    corners = corners * [1, -1] - [0.3, 0.1]
+    normals = np.array([[math.cos(0.2 + k * math.pi / 3), math.sin(0.2 + k * math.pi / 3)] for k in range(6)])
+    np.testing.assert_allclose((corners @ normals.T).max(axis=0), 0.1, rtol=1e-13)
+
+
+@pytest.mark.parametrize("name", masks())
+@pytest.mark.parametrize("n_pixels", [128, 301])
+def test_fits_map_has_the_area_and_centre_of_mass_of_the_mask(tmp_path, name, n_pixels):
+    from astropy.io import fits
+
+    mask = masks()[name]
+    save_fits(tmp_path / "map.fits", mask, n_pixels=n_pixels)
+    with fits.open(tmp_path / "map.fits") as content:
+        image, header = np.array(content[0].data), content[0].header
+    assert image.shape == (n_pixels, n_pixels)
+    assert image.min() >= 0
+    assert image.max() == pytest.approx(1, abs=1e-9)
+    step = header["CDELT1"]
+    x = (np.arange(n_pixels) + 1 - header["CRPIX1"]) * step + header["CRVAL1"]
+    moments = np.array([(image * x).sum(), (image * x[:, None]).sum()]) / image.sum()
+    if name == "niriss":  # the others overlap
+        # Only the six cells on the corners of a hexagon are not exact, by a few hundredths of a cell each.
+        corners = 6 * mask.n_subapertures
+        assert image.sum() * step**2 == pytest.approx(mask.area, abs=0.05 * corners * step**2)
+        np.testing.assert_allclose(moments, mask.centers.mean(0).numpy(), rtol=0, atol=0.01 * step)
+    # Every hole is open at its centre, in rows that go up in y.
+    nearest = np.round(mask.centers.numpy() / step).astype(int) + n_pixels // 2
+    np.testing.assert_allclose(image[nearest[:, 1], nearest[:, 0]], 1, rtol=0, atol=1e-9)
+    rim_column = image[:, [0, -1]].sum() + image[[0, -1]].sum()
+    assert rim_column == 0
+
+
+@pytest.mark.parametrize("suffix", SAVE)
+def test_nothing_is_overwritten(tmp_path, suffix):
+    path = tmp_path / f"mask{suffix}"
+    SAVE[suffix](path, masks()["discs"])
+    before = path.read_bytes()
+    with pytest.raises(ValueError, match="not overwritten"):
+        SAVE[suffix](path, masks()["niriss"])
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("suffix", SAVE)
+def test_only_one_sparse_aperture_makes_a_file(tmp_path, suffix):
+    path = tmp_path / f"mask{suffix}"
+    with pytest.raises(ValueError, match="a file holds one mask"):
+        SAVE[suffix](path, SparseAperture(torch.zeros(2, 3, 2), 0.1, 1.0))
+    with pytest.raises(TypeError, match="SparseAperture is needed, not FullAperture"):
+        SAVE[suffix](path, FullAperture(1.0))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("suffix", READABLE)
+@pytest.mark.parametrize("cut", [0, 0.3, 0.97])
+def test_a_truncated_file_is_refused(tmp_path, suffix, cut):
+    path = tmp_path / f"mask{suffix}"
+    SAVE[suffix](path, masks()["discs"])
+    content = path.read_bytes()
+    path.write_bytes(content[: int(cut * len(content))])
+    with pytest.raises(ValueError, match=f"mask{suffix} is no mask that can be read"):
+        load_mask(path)
+
+
+@pytest.mark.parametrize("suffix", READABLE)
+def test_noise_is_refused(tmp_path, suffix):
+    path = tmp_path / f"mask{suffix}"
+    path.write_bytes(np.random.default_rng(1).bytes(4000))
+    with pytest.raises(ValueError, match="no mask that can be read"):
+        load_mask(path)
+
+
+def test_missing_and_unknown_files_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"there is no mask file .*absent\.json"):
+        load_mask(tmp_path / "absent.json")
+    with pytest.raises(ValueError, match=r"none of the mask files that can be read: \.json, \.dxf, \.fits"):
+        load_mask(tmp_path / "mask.svg")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"format": "other"}, "does not say 'torchmask mask, version 1'"),
+        ({"centers": None}, "lacks centers"),
+        ({"centers": [[0, 1, 2]]}, "centers has shape"),
+        ({"centers": "none"}, "no mask that can be read"),
+        ({"subaperture_diameter": -1}, "subaperture_diameter is -1"),
+        ({"shape": "star"}, "shape is 'star'"),
+        ({"dtype": "int8"}, "int8"),
+        ({"mask_diameter": "wide"}, "no mask that can be read"),
+    ],
+)
+def test_json_with_wrong_content_is_refused(tmp_path, change, message):
+    save_json(tmp_path / "mask.json", masks()["discs"])
+    record = json.loads((tmp_path / "mask.json").read_text()) | change
+    record = {key: value for key, value in record.items() if value is not None}
+    (tmp_path / "changed.json").write_text(json.dumps(record))
+    with pytest.raises(ValueError, match=message):
+        load_mask(tmp_path / "changed.json")
+
+
+def test_drawings_that_are_no_mask_are_refused(tmp_path):
+    import ezdxf
+
+    def refuse(name, message, change):
+        save_dxf(tmp_path / f"{name}.dxf", masks()["discs"])
+        drawing = ezdxf.readfile(tmp_path / f"{name}.dxf")
+        change(drawing, drawing.modelspace())
+        drawing.saveas(tmp_path / f"{name}-changed.dxf")
+        with pytest.raises(ValueError, match=message):
+            load_mask(tmp_path / f"{name}-changed.dxf")
+
+    def widen(_, plate):
+        next(iter(plate.query('CIRCLE[layer=="HOLES"]'))).dxf.radius *= 1.01
+
+    hole = {"layer": "HOLES"}
+    refuse("unequal", "holes differ", widen)
+    corners = [(math.cos(k * math.pi / 3), math.sin(k * math.pi / 3)) for k in range(6)]
+    refuse("mixed", "one kind is needed", lambda _, plate: plate.add_lwpolyline(corners, dxfattribs=hole))
+    refuse("bent", "no regular hexagon", lambda _, plate: plate.add_lwpolyline([*corners[:5], (2, 0)], dxfattribs=hole))
+    refuse("open", "has 5 corners", lambda _, plate: plate.add_lwpolyline(corners[:5], dxfattribs=hole))
+    refuse("rims", "layer OUTLINE holds 2 circles", lambda _, plate: plate.add_circle((0, 0), 1, {"layer": "OUTLINE"}))
+    refuse("scale", "millimetres stand for a metre", lambda drawing, _: drawing.header.custom_vars.clear())
+    foreign = ezdxf.new()
+    foreign.saveas(tmp_path / "foreign.dxf")
+    with pytest.raises(ValueError, match="millimetres stand for a metre"):
+        load_mask(tmp_path / "foreign.dxf")
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, math.inf, math.nan])
+@pytest.mark.parametrize("suffix", [".dxf", ".svg"])
+def test_bad_scales_are_refused(tmp_path, suffix, scale):
+    with pytest.raises(ValueError, match=f"scale is {scale}"):
+        SAVE[suffix](tmp_path / f"mask{suffix}", masks()["discs"], scale=scale)
+
+
+def test_maps_too_coarse_for_the_holes_are_refused():
+    mask = SparseAperture.from_catalog("golay6", 1.0, 0.15)
+    with pytest.raises(ValueError, match="at least 15 are needed") as error:
+        manufacture.amplitude_map(mask, 10)
+    manufacture.amplitude_map(mask, int(str(error.value).split("at least ")[1].split()[0]))
+
+
+def test_files_of_no_folder_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="no folder"):
+        save_json(Path(tmp_path / "absent" / "mask.json"), masks()["discs"])
