@@ -1,0 +1,226 @@
+"""The image-formation model that a restoration inverts, and its misfit to the frames with an adjoint of its own.
+
+The object lives on a field somewhat wider than the frames (the margin), so that light may come from outside the
+field and leave it; only the pixels of the frames are compared. Aberrations are given in a linear parametrisation
+`z` of the phase, usually the whitened Zernike coefficients.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torchmask.grid import Grid
+from torchmask.optics.aperture import Aperture
+from torchmask.optics.zernike import zernike_basis
+
+_CHUNK = 2**17  # pixels of one complex work array: it stays in a core's cache
+
+
+class Misfit(NamedTuple):
+    """Half the weighted squared residuals, (T,), and the gradients of their sum; None where not asked for."""
+
+    value: Tensor
+    object_gradient: Tensor | None
+    aberration_gradient: Tensor | None
+
+
+class ExposureModel(nn.Module):
+    """Frames y_t = window(h_t * o), h_t = |FFT(P exp(i B z_t))|^2 with unit sum.
+
+    Parameters
+    ----------
+    aperture : Aperture
+        One aperture, centres (N, 2).
+    grid : Grid
+        Of the frames, H x W.
+    n_modes : int
+        J, Zernike modes per sub-aperture.
+    mixing : Tensor, optional
+        (N J, K): coefficients = mixing @ z, sub-aperture by sub-aperture. None means the coefficients themselves.
+    margin : float
+        The object's field is at least (1 + margin) times as wide as the frames.
+
+    Notes
+    -----
+    `forward(object, z)` takes an object (H', W') on `field` and z (T, K), and returns frames (T, H, W), differentiable by
+    autograd. `misfit` compares with given frames at the cost of six FFTs a frame and a memory that does not
+    grow with T; `weighted_misfit` is the same as a node of an autograd graph.
+    """
+
+    weights: Tensor
+    index: Tensor
+    basis: Tensor
+    mixing: Tensor
+
+    def __init__(
+        self,
+        aperture: Aperture,
+        grid: Grid,
+        n_modes: int,
+        mixing: Tensor | None = None,
+        margin: float = 0.25,
+        *,
+        dtype: torch.dtype | None = None,
+        device: torch.device | str | None = None,
+    ) -> None:
+        super().__init__()
+        self.grid = grid
+        rows, columns = (fast_size(math.ceil(side * (1 + margin))) for side in grid.shape)
+        self.field = Grid((rows, columns), grid.pixel_scale, grid.wavelength)
+        samples = aperture.samples(self.field)
+        basis = zernike_basis(samples, aperture, n_modes).detach()  # (N, P, J)
+        n_sub = basis.shape[0]
+        if mixing is None:
+            mixing = torch.eye(n_sub * n_modes, dtype=basis.dtype, device=basis.device)
+        mixing = mixing.to(basis)
+        open_cell = samples.weights > 0
+        mixed = torch.einsum("npj,njk->npk", basis, mixing.unflatten(0, (n_sub, n_modes)))[open_cell]
+        weights = samples.weights.detach()[open_cell]
+        kwargs = {"dtype": dtype or basis.dtype, "device": device}
+        # Parseval: this makes the sum of every PSF 1, whatever the phase.
+        self.register_buffer("weights", (weights / weights.norm()).to(**kwargs))
+        self.register_buffer("index", samples.index[open_cell].to(device=device))
+        self.register_buffer("basis", mixed.to(**kwargs))
+        self.register_buffer("mixing", mixing.to(**kwargs))
+
+    @property
+    def n_parameters(self) -> int:
+        """K, the number of aberrations of a frame."""
+        return self.basis.shape[1]
+
+    def chunks(self, n_frames: int) -> Iterator[slice]:
+        """Slices of the frames whose work arrays stay small."""
+        size = max(1, _CHUNK // math.prod(self.field.shape))
+        return (slice(start, min(start + size, n_frames)) for start in range(0, n_frames, size))
+
+    def _amplitude(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Pupil field (T, P) on the open samples and focal amplitude (T, H', W')."""
+        phase = z.to(self.basis.dtype) @ self.basis.T
+        field = torch.polar(self.weights.expand_as(phase).contiguous(), phase)
+        pupil = field.new_zeros(len(z), math.prod(self.field.shape)).index_add(1, self.index, field)
+        return field, torch.fft.fft2(pupil.unflatten(1, self.field.shape), norm="ortho")
+
+    def psf(self, z: Tensor) -> Tensor:
+        """PSFs (T, H', W') of unit sum, origin at [0, 0], for z (T, K)."""
+        amplitude = self._amplitude(z)[1]
+        return amplitude.real**2 + amplitude.imag**2
+
+    def forward(self, image: Tensor, z: Tensor) -> Tensor:
+        """Frames (T, H, W) of the object `image` (H', W') through the aberrations z (T, K)."""
+        spectrum = torch.fft.rfft2(image.to(self.basis.dtype))
+        frames = torch.fft.irfft2(torch.fft.rfft2(self.psf(z)) * spectrum, s=self.field.shape)
+        return frames[..., : self.grid.shape[0], : self.grid.shape[1]]
+
+    @torch.no_grad()
+    def misfit(
+        self,
+        image: Tensor,
+        z: Tensor,
+        frames: Tensor,
+        precision: Tensor,
+        *,
+        want_object: bool = True,
+        want_aberrations: bool = True,
+    ) -> Misfit:
+        """1/2 sum precision (forward - frames)^2 of every frame, and its gradients.
+
+        Parameters
+        ----------
+        image : (H', W') tensor
+        z : (T, K) tensor
+        frames : (T, H, W) tensor
+        precision : tensor that broadcasts to the frames' shape, with its first axis of length T or 1
+            Inverse noise variance of each pixel, 0 where a pixel is not valid.
+        want_object, want_aberrations : bool
+            Which gradients to compute.
+        """
+        shape = self.field.shape
+        spectrum = torch.fft.rfft2(image.to(self.basis.dtype))
+        conjugate = spectrum.conj().resolve_conj()
+        object_gradient = torch.zeros_like(spectrum)
+        values, gradients = [], []
+        for part in self.chunks(len(z)):
+            field, amplitude = self._amplitude(z[part])
+            transfer = torch.fft.rfft2(amplitude.real**2 + amplitude.imag**2)
+            model = torch.fft.irfft2(transfer * spectrum, s=shape)
+            error = model[:, : self.grid.shape[0], : self.grid.shape[1]] - frames[part]
+            residual = error * (precision[part] if len(precision) > 1 else precision)
+            values.append(0.5 * torch.linalg.vecdot(residual.flatten(1), error.flatten(1)).double())
+            if not (want_object or want_aberrations):
+                continue
+            back = torch.fft.rfft2(residual, s=shape)
+            if want_object:
+                object_gradient += (transfer.conj() * back).sum(0)
+            if want_aberrations:
+                gradients.append(self._pull_back(field, amplitude, torch.fft.irfft2(back * conjugate, s=shape)))
+        return Misfit(
+            torch.cat(values),
+            torch.fft.irfft2(object_gradient, s=shape).to(image.dtype) if want_object else None,
+            torch.cat(gradients).to(z.dtype) if want_aberrations else None,
+        )
+
+    def _pull_back(self, field: Tensor, amplitude: Tensor, psf_gradient: Tensor) -> Tensor:
+        """Gradient with respect to z (T, K) from that with respect to the PSF (T, H', W')."""
+        pupil = torch.fft.ifft2(amplitude * psf_gradient, norm="ortho").flatten(1)[:, self.index]
+        return 2 * (pupil.imag * field.real - pupil.real * field.imag) @ self.basis
+
+    @torch.no_grad()
+    def curvature(self, image: Tensor, z: Tensor, precision: Tensor, generator: torch.Generator) -> tuple[Tensor, float]:
+        """Diagonal of the Gauss-Newton Hessian of `misfit`: mean over frames for each z (K,), and for one object pixel.
+
+        J^T W J is the covariance of J^T W^(1/2) n with white noise n, so one draw of noise per frame suffices for
+        a diagonal that is averaged over frames (Bekas, Kokiopoulou & Saad, Appl. Numer. Math. 57, 1214, 2007).
+        """
+        shape = self.field.shape
+        conjugate = torch.fft.rfft2(image.to(self.basis.dtype)).conj().resolve_conj()
+        total, pixel = torch.zeros_like(z[0]), 0.0
+        for part in self.chunks(len(z)):
+            field, amplitude = self._amplitude(z[part])
+            weight = (precision[part] if len(precision) > 1 else precision).expand(len(field), *self.grid.shape)
+            for _ in range(4):
+                noise = torch.randn(weight.shape, dtype=weight.dtype, generator=generator).to(weight) * weight.sqrt()
+                back = torch.fft.irfft2(torch.fft.rfft2(noise, s=shape) * conjugate, s=shape)
+                total += (self._pull_back(field, amplitude, back) ** 2).sum(0).to(z.dtype) / 4
+            energy = ((amplitude.real**2 + amplitude.imag**2) ** 2).sum((1, 2))
+            pixel += float((energy * weight.mean((1, 2))).sum())
+        return total / len(z), pixel
+
+
+class _WeightedMisfit(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, model: ExposureModel, image: Tensor, z: Tensor, frames: Tensor, precision: Tensor) -> Tensor:
+        wanted = ctx.needs_input_grad
+        result = model.misfit(image, z, frames, precision, want_object=wanted[1], want_aberrations=wanted[2])
+        ctx.gradients = result.object_gradient, result.aberration_gradient
+        return result.value.sum().to(image.dtype)
+
+    @staticmethod
+    def backward(ctx: Any, *grad: Tensor) -> Any:
+        by_object, by_aberrations = (None if g is None else grad[0] * g for g in ctx.gradients)
+        return None, by_object, by_aberrations, None, None
+
+
+def weighted_misfit(model: ExposureModel, image: Tensor, z: Tensor, frames: Tensor, precision: Tensor) -> Tensor:
+    """The sum of `model.misfit` as a scalar that autograd differentiates in `image` and `z`, once."""
+    return _WeightedMisfit.apply(model, image, z, frames, precision)  # type: ignore[no-any-return]
+
+
+def fast_size(n: int) -> int:
+    """The least even number of at least `n` without prime factors beyond 5: a fast FFT.
+
+    >>> fast_size(128), fast_size(154)
+    (128, 160)
+    """
+    while True:
+        rest = n
+        for prime in (2, 3, 5):
+            while rest % prime == 0:
+                rest //= prime
+        if rest == 1 and n % 2 == 0:
+            return n
+        n += 1

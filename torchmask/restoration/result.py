@@ -1,0 +1,73 @@
+"""What a restoration found, how well it fits, and how it came to an end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchmask.io import load_npz, save_npz
+
+
+@dataclass(frozen=True, eq=False)
+class RestorationResult:
+    """A restored object and everything that was found with it.
+
+    object : (H, W) electrons per frame and pixel, on the pixels of the frames
+    extended_object : (H', W') the same with the margin around the field, rows and columns beyond H and W
+    coefficients : (T, N, J) Zernike coefficients [rad rms]
+    gains : (T,) transmission of each frame, 1 on average
+    model : (T, H, W) the frames that object and coefficients make [electrons]
+    residuals : (T, H, W) (frames - model) / noise, 0 where a pixel is not valid
+    chi_square : (T,) mean square of the residuals
+    tv_weight : mu, in units of frames of mean 1
+    r0 : Fried parameter of the prior on the aberrations [m], NaN without prior
+    noise : electrons rms per pixel, averaged over the stack
+    cost : (iterations,) what was minimised
+    converged, message : whether and why it stopped
+    n_evaluations : of cost and gradient
+    seconds : wall time
+    """
+
+    object: Tensor
+    extended_object: Tensor
+    coefficients: Tensor
+    gains: Tensor
+    model: Tensor
+    residuals: Tensor
+    chi_square: Tensor
+    tv_weight: float
+    r0: float
+    noise: float
+    cost: Tensor
+    converged: bool
+    message: str
+    n_evaluations: int
+    seconds: float
+
+    def save(self, path: str | Path) -> None:
+        """Write everything to a new .npz file, without pickle. Errors as in `torchmask.io.save_npz`."""
+        save_npz(path, {item.name: getattr(self, item.name) for item in fields(self)})
+
+    @classmethod
+    def load(cls, path: str | Path) -> RestorationResult:
+        """Read what `save` wrote; tensors on the CPU. Raises ValueError for a missing, damaged or foreign file."""
+        names = [item.name for item in fields(cls)]
+        stored = load_npz(path, required=names)
+        scalars = {"tv_weight", "r0", "noise", "converged", "message", "n_evaluations", "seconds"}
+        return cls(**{n: stored[n].item() if n in scalars else torch.from_numpy(stored[n]) for n in names})
+
+    def summary(self) -> str:
+        """A few lines for people."""
+        n_frames, n_sub, n_modes = self.coefficients.shape
+        chi = self.chi_square
+        lines = [
+            f"restored {self.object.shape[0]} x {self.object.shape[1]} pixels from {n_frames} frames, "
+            f"{n_sub} x {n_modes} aberrations each",
+            f"{self.message} after {len(self.cost)} iterations, {self.n_evaluations} evaluations, {self.seconds:.1f} s",
+            f"chi-square per pixel {float(chi.mean()):.3f} (worst frame {int(chi.argmax())}: {float(chi.max()):.3f})",
+            f"noise {self.noise:.3g} electrons rms, TV weight {self.tv_weight:g}, r0 {self.r0:.3g} m",
+        ]
+        return "\n".join(lines)
