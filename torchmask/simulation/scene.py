@@ -1,0 +1,177 @@
+"""What the telescope looks at: a packaged satellite, any mesh, or an image, as expected electrons per pixel."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from torchmask.io import load_npz
+from torchmask.simulation.render import load_mesh, render_mesh
+from torchmask.simulation.satellite import satellite_mesh
+
+IMAGE_SUFFIXES = (".npz", ".png", ".fits")
+OBLIQUE_VIEW = (25.0, -30.0, 15.0)
+OBLIQUE_SUN = (-0.5, 0.6, 0.7)
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """Which target, and how it is seen.
+
+    Raises ValueError if `size` lies outside (0, 1]; the rest is checked by `make_scene`.
+    """
+
+    path: Path | None = None
+    """A mesh (.obj, .stl, .ply, .glb ...) or an image (.npz with the key image, .png, .fits); without one, the packaged
+    satellite."""
+    attitude: tuple[float, float, float] | None = None
+    """Degrees by which the target is turned about the axes to the right, then up, then towards the viewer. By default
+    a mesh is seen obliquely, at 25 -30 15, and an image upright; an image turns about the last axis only."""
+    sun: tuple[float, float, float] | None = None
+    """Direction in which the sun stands: right, up, towards the viewer, of any length; by default -0.5 0.6 0.7. Images
+    bring their own light."""
+    size: float = 0.7
+    """Larger side of the target as a fraction of the field."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.size <= 1:
+            raise ValueError(f"size is {self.size}: it is a fraction of the field, above 0 and at most 1")
+
+
+def make_scene(
+    shape: tuple[int, int],
+    n_photons: float,
+    options: SceneOptions | None = None,
+    *,
+    dtype: torch.dtype | None = None,
+    device: torch.device | str | None = None,
+) -> Tensor:
+    """Expected electrons per pixel and frame of a target on a black sky, before any blur.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Rows and columns of the field (`grid.shape`).
+    n_photons : float
+        Sum of the scene: electrons per frame, counting those that blur will carry out of the field.
+    options : SceneOptions, optional
+
+    Returns
+    -------
+    (rows, columns) tensor, non-negative, background exactly 0, row 0 at the top; the target's outline is centred.
+
+    Raises
+    ------
+    ValueError
+        If `n_photons` is not finite and positive, or the file is missing, damaged, of an unknown kind, empty, negative
+        or not finite, or no light reaches the viewer, or an image is to be lit or turned out of its plane.
+
+    Examples
+    --------
+    >>> scene = make_scene((64, 64), n_photons=1e7)
+    >>> round(float(scene.sum())), bool(scene.min() == 0)
+    (10000000, True)
+    """
+    options = options or SceneOptions()
+    if not (math.isfinite(n_photons) and n_photons > 0):
+        raise ValueError(f"n_photons is {n_photons}: it must be finite and positive, electrons per frame")
+    if options.path is not None and Path(options.path).suffix.lower() in IMAGE_SUFFIXES:
+        image = _pose(load_image(options.path), shape, options)
+    else:
+        mesh = satellite_mesh() if options.path is None else load_mesh(options.path)
+        attitude, sun = options.attitude or OBLIQUE_VIEW, options.sun or OBLIQUE_SUN
+        image = render_mesh(mesh, shape, attitude=attitude, sun=sun, size=options.size)
+    return (image * (n_photons / image.sum())).to(dtype=dtype, device=device)
+
+
+def load_image(path: str | Path) -> Tensor:
+    """Read an image (rows, columns), float64, of values proportional to light.
+
+    An .npz file holds it under the key `image`; in a .fits file it is the first two-dimensional array, row 0 as stored;
+    of a .png file red, green and blue are averaged and multiplied by the opacity. No gamma is undone.
+
+    Raises
+    ------
+    ValueError
+        If the file is missing, damaged or of another kind, or the image is not two-dimensional, holds values that
+        are negative or not finite, or is black.
+    """
+    path = Path(path)
+    readers = {".npz": _read_npz, ".png": _read_png, ".fits": _read_fits}
+    if path.suffix.lower() not in readers:
+        raise ValueError(f"{path} is of an unknown kind: images end in {', '.join(readers)}")
+    if not path.is_file():
+        raise ValueError(f"there is no image file {path}")
+    image = np.asarray(readers[path.suffix.lower()](path), dtype=np.float64)
+    if image.ndim != 2:
+        raise ValueError(f"the image in {path} has shape {image.shape}: (rows, columns) are needed")
+    if not np.isfinite(image).all():
+        raise ValueError(f"the image in {path} holds values that are not finite: replace them, for instance by 0")
+    if image.min() < 0:
+        raise ValueError(
+            f"the image in {path} holds negative light ({image.min():.3g}): subtract the background and clip"
+        )
+    if not image.any():
+        raise ValueError(f"the image in {path} is black")
+    return torch.from_numpy(image)
+
+
+def _read_npz(path: Path) -> np.ndarray:
+    return load_npz(path, required=["image"])["image"]
+
+
+def _read_png(path: Path) -> np.ndarray:
+    from skimage import io
+
+    try:
+        image = np.asarray(io.imread(path), dtype=np.float64)
+    except Exception as error:  # the readers behind it fail in many ways
+        raise ValueError(f"{path} cannot be read as a PNG image: {error}") from error
+    if image.ndim == 3 and image.shape[-1] in (2, 4):
+        image = image[..., :-1] * image[..., -1:]
+    return image.mean(-1) if image.ndim == 3 else image
+
+
+def _read_fits(path: Path) -> np.ndarray:
+    from astropy.io import fits
+
+    try:
+        with fits.open(path, memmap=False) as units:
+            arrays = [
+                unit.data for unit in units if isinstance(unit, fits.PrimaryHDU | fits.ImageHDU | fits.CompImageHDU)
+            ]
+            images = [array for array in arrays if array is not None and array.ndim == 2]
+    except Exception as error:  # damaged headers fail in many ways
+        raise ValueError(f"{path} cannot be read as FITS: {error}") from error
+    if not images:
+        raise ValueError(f"{path} holds no two-dimensional image")
+    return images[0]
+
+
+def _pose(image: Tensor, shape: tuple[int, int], options: SceneOptions) -> Tensor:
+    """Turn an image, crop it to what shines, resample it to the wanted fraction of the field, centre it on black."""
+    from kornia.geometry.transform import resize, rotate
+
+    about_x, about_y, angle = options.attitude or (0.0, 0.0, 0.0)
+    if about_x or about_y or options.sun:
+        raise ValueError(
+            f"attitude {options.attitude} and sun {options.sun} do not suit the image {options.path}: it turns in its "
+            "own plane only (0 0 angle) and brings its own light; give a mesh for more"
+        )
+    image = image[None, None]
+    if angle:
+        margin = math.ceil((math.hypot(*image.shape[-2:]) - min(image.shape[-2:])) / 2)
+        image = rotate(pad(image, (margin,) * 4), image.new_tensor([angle])).clamp(min=0)
+    rows, columns = (torch.nonzero(image.sum(dim=axis).squeeze()).flatten() for axis in (-1, -2))
+    target = image[..., int(rows[0]) : int(rows[-1]) + 1, int(columns[0]) : int(columns[-1]) + 1]
+    scale = options.size * min(shape[0] / target.shape[-2], shape[1] / target.shape[-1])
+    height, width = (max(1, round(scale * length)) for length in target.shape[-2:])
+    resampled = resize(target, (height, width), antialias=scale < 1)[0, 0].clamp(min=0)
+    top, left = (shape[0] - height) // 2, (shape[1] - width) // 2
+    return pad(resampled, (left, shape[1] - width - left, top, shape[0] - height - top))
