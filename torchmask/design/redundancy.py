@@ -1,0 +1,307 @@
+"""What a mask samples: its baselines, their repetitions, the gaps between them, and the point-spread function.
+
+All lengths are metres in the pupil, where a baseline stands for the frequency it transmits. Two holes of diameter d
+transmit a patch of frequencies around their baseline, the support of the autocorrelation of a hole: a disc of radius d,
+or a hexagon twice as wide as the hole.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
+from scipy.optimize import minimize
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import ConvexHull, KDTree, Voronoi
+from scipy.special import j1
+
+from torchmask.optics.aperture import Aperture
+
+Array = NDArray[np.float64]
+
+_LINES = 4096  # across half the u-v plane
+_DIRECTIONS = 180  # in which the width of the PSF is measured
+_BLOCK = 2**20  # array elements treated at a time
+
+
+@dataclass(frozen=True)
+class RedundancyReport:
+    """How a mask samples the u-v plane; `print` shows it as a table.
+
+    n_subapertures, n_baselines : N and N (N - 1) / 2
+    n_distinct : baselines left when those closer than the tolerance count as one
+    nonredundant : whether all baselines are distinct, as points
+    strictly_nonredundant : whether not even their patches overlap, that of baseline zero included
+    strict_hole_diameter : the largest hole diameter for which that holds [m]
+    shortest_baseline, longest_baseline : [m]
+    uv_filling : area of the patches' union over that of the u-v disc of a full pupil of `mask_diameter`
+    gap_fraction : share of the disc out to the highest transmitted frequency that the union leaves out
+    largest_gap : radius of the largest circle, centred within the hull of all baselines, that no baseline enters [m];
+        frequencies are missing there if it exceeds the hole diameter
+    fwhm : full width at half maximum of the PSF [wavelength / mask_diameter], the diameter of a disc of the area where
+        the PSF exceeds 1/2 around its peak
+    fwhm_min, fwhm_max : the width in the narrowest and the widest direction, same unit
+    side_lobe : the highest maximum of the PSF besides the central one, relative to that
+    """
+
+    n_subapertures: int
+    n_baselines: int
+    n_distinct: int
+    nonredundant: bool
+    strictly_nonredundant: bool
+    strict_hole_diameter: float
+    shortest_baseline: float
+    longest_baseline: float
+    uv_filling: float
+    gap_fraction: float
+    largest_gap: float
+    fwhm: float
+    fwhm_min: float
+    fwhm_max: float
+    side_lobe: float
+
+    def __str__(self) -> str:
+        answer = {True: "yes", False: "no"}
+        rows = [
+            ("holes", f"{self.n_subapertures}"),
+            ("baselines", f"{self.n_baselines}, {self.n_distinct} distinct"),
+            ("non-redundant", answer[self.nonredundant]),
+            ("strictly, holes included", answer[self.strictly_nonredundant]),
+            ("  for holes up to", f"{self.strict_hole_diameter:.4g} m"),
+            ("shortest baseline", f"{self.shortest_baseline:.4g} m"),
+            ("longest baseline", f"{self.longest_baseline:.4g} m"),
+            ("u-v filling", f"{100 * self.uv_filling:.1f} %"),
+            ("gaps in the covered disc", f"{100 * self.gap_fraction:.1f} %"),
+            ("largest gap, radius", f"{self.largest_gap:.4g} m"),
+            ("PSF width", f"{self.fwhm:.3f} ({self.fwhm_min:.3f} to {self.fwhm_max:.3f}) wavelength / mask diameter"),
+            ("peak side lobe", f"{100 * self.side_lobe:.2f} %"),
+        ]
+        width = max(len(name) for name, _ in rows)
+        return "\n".join(f"{name:<{width}}  {value}" for name, value in rows)
+
+
+def analyse_redundancy(aperture: Aperture, tolerance: float = 0.02) -> RedundancyReport:
+    """Describe the baselines, the u-v coverage and the PSF of one mask.
+
+    Parameters
+    ----------
+    aperture : Aperture
+        One mask of at least two holes, centres (N, 2).
+    tolerance : float
+        Baselines closer than this fraction of the shortest one count as the same.
+
+    Raises
+    ------
+    ValueError
+        For a population of masks, fewer than two holes, holes at the same place, or a tolerance outside [0, 1).
+
+    Notes
+    -----
+    Areas come from the chords of all patches along 4096 lines (relative error below 1e-4), the PSF from its closed
+    form: the transform of a hole times the sum of the holes' phasors. The side lobe is the highest within 2.5
+    wavelengths over hole diameter; beyond, the transform of a hole keeps any other below 0.42 % (disc) or 0.92 %
+    (hexagon).
+
+    Examples
+    --------
+    >>> from torchmask.optics.aperture import SparseAperture
+    >>> report = analyse_redundancy(SparseAperture.from_catalog("golay6", 1.0, 0.15))
+    >>> report.n_baselines, report.n_distinct, report.strictly_nonredundant
+    (15, 15, False)
+    """
+    if aperture.centers.ndim != 2 or aperture.n_subapertures < 2:
+        raise ValueError(
+            f"centers has shape {tuple(aperture.centers.shape)}: one mask of at least two holes is needed, (N, 2)"
+        )
+    if not 0 <= tolerance < 1:
+        raise ValueError(f"tolerance is {tolerance}: it is a fraction of the shortest baseline, at least 0, below 1")
+    centers = aperture.centers.numpy(force=True).astype(np.float64)
+    first, second = np.triu_indices(len(centers), 1)
+    half = centers[first] - centers[second]
+    lengths = np.linalg.norm(half, axis=1)
+    if lengths.min() == 0:
+        raise ValueError("two holes lie at the same place: remove one")
+    baselines = np.concatenate([half, -half])
+    sites = np.concatenate([baselines, np.zeros((1, 2))])
+    strict = _smallest_separation(sites, aperture) / 2
+    distinct = _count_distinct(baselines, tolerance * lengths.min()) // 2
+    area, reach = _covered_area(sites, aperture), _reach(sites, aperture)
+    widths = aperture.mask_diameter * _psf_widths(centers, aperture)
+    return RedundancyReport(
+        n_subapertures=len(centers),
+        n_baselines=len(half),
+        n_distinct=distinct,
+        nonredundant=distinct == len(half),
+        strictly_nonredundant=strict >= aperture.subaperture_diameter * (1 - 1e-9),
+        strict_hole_diameter=strict,
+        shortest_baseline=float(lengths.min()),
+        longest_baseline=float(lengths.max()),
+        uv_filling=area / (math.pi * aperture.mask_diameter**2),
+        gap_fraction=1 - area / (math.pi * reach**2),
+        largest_gap=_largest_empty_circle(sites),
+        fwhm=float(np.sqrt(np.mean(widths**2))),
+        fwhm_min=float(widths.min()),
+        fwhm_max=float(widths.max()),
+        side_lobe=_peak_side_lobe(centers, aperture),
+    )
+
+
+def _normals(aperture: Aperture, first: float = 0.0) -> Array:
+    """Directions (3, 2) at 60 degrees from each other, from the orientation of a hexagon plus `first`."""
+    angles = aperture.orientation + first + np.arange(3) * np.pi / 3
+    return np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+
+
+def _smallest_separation(sites: Array, aperture: Aperture) -> float:
+    """Smallest distance of two sites: Euclidean for discs; across the sides for hexagons, whose patches part there."""
+    if aperture.shape == "hexagon":
+        distances, _ = KDTree(sites @ _normals(aperture).T).query(sites @ _normals(aperture).T, k=2, p=np.inf)
+    else:
+        distances, _ = KDTree(sites).query(sites, k=2)
+    return float(distances[:, 1].min())
+
+
+def _count_distinct(baselines: Array, distance: float) -> int:
+    """Number of groups of baselines, of both signs, linked by steps of at most `distance`."""
+    pairs = KDTree(baselines).query_pairs(distance, output_type="ndarray")
+    links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(baselines),) * 2)
+    return int(connected_components(links, directed=False)[0])
+
+
+def _reach(sites: Array, aperture: Aperture) -> float:
+    """Radius of the disc that just holds every patch [m]."""
+    if aperture.shape == "disc":
+        return float(np.linalg.norm(sites, axis=1).max()) + aperture.subaperture_diameter
+    corners = _normals(aperture, math.pi / 6) * (2 / math.sqrt(3)) * aperture.subaperture_diameter
+    return float(np.linalg.norm(sites[:, None] + corners, axis=-1).max())  # sites come with both signs
+
+
+def _covered_area(sites: Array, aperture: Aperture) -> float:
+    """Area of the union of all patches [m^2]: on each of many lines, the length of a union of intervals."""
+    top = _reach(sites, aperture)
+    if aperture.shape == "hexagon":  # lines along no side keep the chords continuous
+        turn = math.pi / 12 - aperture.orientation
+        sites = sites @ np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
+    step = top / _LINES
+    lines = (np.arange(_LINES) + 0.5) * step  # the other half of the plane is its point reflection
+    length = 0.0  # of the union, summed over lines
+    for y in np.array_split(lines, math.ceil(_LINES * len(sites) / _BLOCK)):
+        left, right = _chords(y[:, None] - sites[:, 1], aperture)
+        left, right = left + sites[:, 0], right + sites[:, 0]
+        order = np.argsort(left, axis=1)
+        left, right = np.take_along_axis(left, order, 1), np.take_along_axis(right, order, 1)
+        before = np.maximum.accumulate(right, axis=1)[:, :-1]
+        new = right[:, 1:] - np.maximum(left[:, 1:], before)
+        length += float((right[:, 0] - left[:, 0]).sum() + np.clip(new, 0, None).sum())
+    return 2 * length * step
+
+
+def _chords(height: Array, aperture: Aperture) -> tuple[Array, Array]:
+    """Where a horizontal line at `height` above the centre of a patch enters and leaves it; both 0 if it does not.
+
+    Hexagons are turned to an orientation of 15 degrees.
+    """
+    d = aperture.subaperture_diameter
+    if aperture.shape == "disc":
+        half = np.sqrt(np.clip(d**2 - height**2, 0, None))
+        return -half, half
+    left, right = np.full_like(height, -np.inf), np.full_like(height, np.inf)
+    for angle in np.radians([15, 75, 135]):
+        middle, half = -np.tan(angle) * height, d / abs(np.cos(angle))
+        left, right = np.maximum(left, middle - half), np.minimum(right, middle + half)
+    empty = left >= right
+    return np.where(empty, 0, left), np.where(empty, 0, right)
+
+
+def _largest_empty_circle(sites: Array) -> float:
+    """Radius of the largest circle that no site enters, with its centre in the convex hull of the sites.
+
+    Its centre is a vertex of the Voronoi diagram, or lies where an edge of the diagram crosses the hull.
+    """
+    singular, axes = np.linalg.svd(sites)[1:]
+    if singular[1] < 1e-9 * singular[0]:  # all sites in line
+        return float(np.diff(np.sort(sites @ axes[0])).max()) / 2
+    voronoi, hull = Voronoi(sites), ConvexHull(sites)
+    inside = (voronoi.vertices @ hull.equations[:, :2].T + hull.equations[:, 2]).max(axis=1) <= 0
+    p, q = sites[voronoi.ridge_points[:, 0], None], sites[voronoi.ridge_points[:, 1], None]  # (ridge, 1, 2)
+    start, end = sites[hull.simplices[:, 0]], sites[hull.simplices[:, 1]]  # (edge, 2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = (((p + q) / 2 - start) * (q - p)).sum(-1) / ((end - start) * (q - p)).sum(-1)
+    ridge, edge = np.nonzero((t >= 0) & (t <= 1))
+    crossings = start[edge] + t[ridge, edge, None] * (end - start)[edge]
+    distances, _ = KDTree(sites).query(np.concatenate([voronoi.vertices[inside], crossings]))
+    return float(distances.max())
+
+
+def _hole_amplitude(frequency: Array, aperture: Aperture) -> Array:
+    """Transform of a hole, 1 at 0, at `frequency` (..., 2) [1/m]: the angle on the sky over the wavelength."""
+    d = aperture.subaperture_diameter
+    if aperture.shape == "disc":
+        x = np.pi * d * np.linalg.norm(frequency, axis=-1)
+        return np.where(x > 1e-6, 2 * j1(x) / np.where(x > 1e-6, x, 1), 1)
+    # Green's theorem gives one term for each pair of opposite sides; the weights cos^2 add up to 3/2.
+    across, along = frequency @ _normals(aperture).T, frequency @ _normals(aperture, math.pi / 2).T
+    squared = (frequency**2).sum(-1)[..., None]
+    weight = np.where(squared > 0, across**2 / np.where(squared > 0, squared, 1), 0.5)
+    product = weight * np.sinc(d * across) * np.sinc(d / math.sqrt(3) * along)
+    return product.sum(-1) / 1.5
+
+
+def _psf(frequency: Array, centers: Array, aperture: Aperture) -> Array:
+    """PSF relative to its peak at `frequency` (..., 2) [1/m]."""
+    phasors = np.exp(-2j * np.pi * (frequency @ centers.T)).mean(-1)
+    intensity: Array = phasors.real**2 + phasors.imag**2
+    return _hole_amplitude(frequency, aperture) ** 2 * intensity
+
+
+def _psf_widths(centers: Array, aperture: Aperture) -> Array:
+    """Full width at half maximum in directions all around [1/m]."""
+    angles = np.arange(_DIRECTIONS) * np.pi / _DIRECTIONS
+    directions = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    # A hole alone drops to one half within 0.52 / d. Steps small against the finest fringe find the first crossing.
+    limit, step = 0.6 / aperture.subaperture_diameter, 0.02 / aperture.extent
+    radii = np.arange(1, math.ceil(limit / step) + 1) * step
+    below = np.stack([_psf(radii[:, None] * e, centers, aperture) for e in directions]) < 0.5
+    high = radii[below.argmax(axis=1)]
+    low = high - step
+    for _ in range(40):
+        middle = (low + high) / 2
+        above = _psf(middle[:, None] * directions, centers, aperture) >= 0.5
+        low, high = np.where(above, middle, low), np.where(above, high, middle)
+    return np.asarray(low + high, dtype=np.float64)
+
+
+def _peak_side_lobe(centers: Array, aperture: Aperture) -> float:
+    """Highest local maximum of the PSF besides the one at 0."""
+    scale = aperture.extent
+    highest = 0.0
+    for start, value in _grid_maxima(centers, aperture, 1 / (6 * scale)):
+        if value < 0.8 * highest:
+            break  # a maximum is at most so much higher than the best of six samples a fringe
+        result = minimize(lambda f: -float(_psf(f / scale, centers, aperture)), start * scale, method="BFGS")
+        if np.abs(result.x - start * scale).max() < 0.25:  # else it climbed a ridge, to another maximum
+            highest = max(highest, -float(result.fun))
+    return highest
+
+
+def _grid_maxima(centers: Array, aperture: Aperture, step: float) -> Iterator[tuple[Array, float]]:
+    """Local maxima of the PSF on a grid, but for the origin, from the highest down: (frequency [1/m], value)."""
+    n = math.ceil(2.5 / aperture.subaperture_diameter / step)
+    x = np.arange(-n, n + 1) * step
+    found = []
+    rows = max(1, _BLOCK // len(x))
+    for bottom in range(0, n + 1, rows):
+        y = np.arange(bottom - 1, min(bottom + rows, n + 1) + 1) * step  # with one row more on either side
+        columns = np.exp(-2j * np.pi * x[:, None] * centers[:, 0])
+        phasors = (np.exp(-2j * np.pi * y[:, None] * centers[:, 1]) @ columns.T) / len(centers)
+        plane = np.stack(np.broadcast_arrays(x, y[:, None]), axis=-1)
+        psf = np.abs(phasors) ** 2 * _hole_amplitude(plane, aperture) ** 2
+        peak = (psf == maximum_filter(psf, size=3)) & (np.abs(plane) > step / 2).any(-1)
+        peak[[0, -1]] = False
+        found += zip(plane[peak], psf[peak].tolist(), strict=True)
+    return iter(sorted(found, key=lambda maximum: -maximum[1]))
