@@ -1,0 +1,50 @@
+"""CMA-ES over the positions of the holes: the search of the published method."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchmask.design.merit import Criterion, Holes, Merit
+from torchmask.design.refine import PENALTY, Monitor
+
+
+def evolve(
+    criterion: Criterion, holes: Holes, budget: int, population: int, rng: np.random.Generator, monitor: Monitor
+) -> tuple[Tensor, int]:
+    """The best point x (F,) of CMA-ES with a quadratic penalty for broken rules, and the evaluations used.
+
+    Starts from a random mask with steps of a fifth of the mask diameter, each generation in one batched call, and
+    begins anew from another one when it has come to rest and there is budget left. N. Hansen, The CMA evolution
+    strategy: a tutorial, arXiv:1604.00772; package `cma`.
+    """
+    import cma
+
+    merit = Merit(criterion, holes, PENALTY)
+    generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+    best, best_value = holes.random(1, generator)[0], np.inf
+    while merit.evaluations + population <= budget:
+        start = holes.random(1, generator)[0].double().cpu().numpy()
+        options = {
+            "popsize": population,
+            "randn": lambda *shape: rng.standard_normal(shape),
+            # pycma would seed NumPy's global state, log to outcmaes/ and obey cma_signals.in
+            "seed": np.nan,
+            "verbose": -9,
+            "verb_log": 0,
+            "verb_disp": 0,
+            "signals_filename": "",
+            "tolfun": 1e-7,
+        }
+        strategy = cma.CMAEvolutionStrategy(start, 0.2, options)
+        while not strategy.stop() and merit.evaluations + population <= budget:
+            points = np.asarray(strategy.ask())
+            x = torch.as_tensor(points).to(best)
+            values = merit.value(x)
+            strategy.tell(list(points), values.double().cpu().tolist())
+            index = int(values.argmin())
+            if float(values[index]) < best_value:
+                best, best_value = x[index], float(values[index])
+            monitor.update(merit.evaluations, values, values.exp(), x)
+    return best, merit.evaluations

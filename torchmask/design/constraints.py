@@ -1,0 +1,267 @@
+"""What a mask must obey: small objects, each with a penalty, a violation and a projection.
+
+Every search obeys `InsideDisc` and `NoOverlap` without being told; the others are handed to it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchmask.design.feasibility import Constraint, Inequality, LinearEquality
+from torchmask.optics.aperture import SparseAperture
+
+
+def _length(vector: Tensor, fallback: Tensor) -> Tensor:
+    """Length along the last axis; at zero, where any direction would do, the gradient is along `fallback`."""
+    zero = (vector == 0).all(-1, keepdim=True)
+    tiny = math.sqrt(torch.finfo(vector.dtype).tiny)
+    return torch.linalg.vector_norm(vector + zero * tiny * fallback, dim=-1)
+
+
+def _outer_radius(aperture: SparseAperture) -> float:
+    return aperture.subaperture_diameter / (2 if aperture.shape == "disc" else math.sqrt(3))
+
+
+def _directions(aperture: SparseAperture, count: int, first: float) -> Tensor:
+    """Unit vectors (count, 2), every 60 degrees from the angle `first` [rad]."""
+    angles = aperture.orientation + first + torch.arange(count, dtype=torch.float64) * math.pi / 3
+    return torch.stack([angles.cos(), angles.sin()], dim=-1).to(aperture.centers)
+
+
+@dataclass(frozen=True)
+class InsideDisc(Inequality):
+    """Every hole lies wholly inside the disc of diameter `mask_diameter`. N margins, one a hole."""
+
+    def margins(self, aperture: SparseAperture) -> Tensor:
+        centers = aperture.centers
+        if aperture.shape == "disc":
+            radius = (aperture.mask_diameter - aperture.subaperture_diameter) / 2
+            return radius - torch.linalg.vector_norm(centers, dim=-1)
+        corners = centers[..., None, :] + _outer_radius(aperture) * _directions(aperture, 6, math.pi / 6)
+        return aperture.mask_diameter / 2 - torch.linalg.vector_norm(corners, dim=-1).amax(-1)
+
+
+@dataclass(frozen=True)
+class MinimumGap(Inequality):
+    """Between any two holes at least `gap` [m] of solid material. N(N-1)/2 margins, one a pair.
+
+    For hexagons the gap is measured along the normal of a side, which is exact for sides that face each other and
+    never more than the true distance.
+    """
+
+    gap: float
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.gap) and self.gap >= 0):
+            raise ValueError(f"gap is {self.gap}: it must be finite and not negative, in m")
+
+    def margins(self, aperture: SparseAperture) -> Tensor:
+        first, second = torch.triu_indices(aperture.n_subapertures, aperture.n_subapertures, 1).to(
+            aperture.centers.device
+        )
+        difference = aperture.centers[..., first, :] - aperture.centers[..., second, :]
+        if aperture.shape == "disc":
+            distance = _length(difference, difference.new_tensor([1.0, 0.0]))
+        else:
+            distance = (difference @ _directions(aperture, 3, 0.0).T).abs().amax(-1)
+        return distance - (aperture.subaperture_diameter + self.gap)
+
+
+class NoOverlap(MinimumGap):
+    """No two holes overlap: the minimum gap is 0."""
+
+    def __init__(self) -> None:
+        super().__init__(0.0)
+
+
+@dataclass(frozen=True)
+class KeepOutDisc(Inequality):
+    """No hole reaches into a disc, such as a central obstruction. N margins.
+
+    Hexagons count as their circumscribed discs.
+
+    Parameters
+    ----------
+    diameter : float
+        [m].
+    center : (float, float)
+        (x, y) [m].
+    """
+
+    diameter: float
+    center: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.diameter) and self.diameter > 0):
+            raise ValueError(f"diameter is {self.diameter}: it must be finite and positive, in m")
+        _require_point("center", self.center)
+
+    def margins(self, aperture: SparseAperture) -> Tensor:
+        difference = aperture.centers - aperture.centers.new_tensor(self.center)
+        return _length(difference, difference.new_tensor([1.0, 0.0])) - self.diameter / 2 - _outer_radius(aperture)
+
+
+@dataclass(frozen=True)
+class KeepOutSegment(Inequality):
+    """No hole reaches into a thick segment, such as a spider or the gap between two mirror segments. N margins.
+
+    The segment has round ends. Hexagons count as their circumscribed discs.
+
+    Parameters
+    ----------
+    start, end : (float, float)
+        (x, y) [m].
+    width : float
+        Full width [m]; 0 for a line.
+    """
+
+    start: tuple[float, float]
+    end: tuple[float, float]
+    width: float
+
+    def __post_init__(self) -> None:
+        _require_point("start", self.start)
+        _require_point("end", self.end)
+        if math.dist(self.start, self.end) == 0:
+            raise ValueError(f"start and end are both {self.start}: for a round zone use KeepOutDisc")
+        if not (math.isfinite(self.width) and self.width >= 0):
+            raise ValueError(f"width is {self.width}: it must be finite and not negative, in m")
+
+    def margins(self, aperture: SparseAperture) -> Tensor:
+        start = aperture.centers.new_tensor(self.start)
+        along = aperture.centers.new_tensor(self.end) - start
+        offset = aperture.centers - start
+        fraction = ((offset * along).sum(-1) / (along * along).sum()).clamp(0, 1)
+        difference = offset - fraction[..., None] * along
+        across = torch.stack([-along[1], along[0]]) / torch.linalg.vector_norm(along)
+        return _length(difference, across) - self.width / 2 - _outer_radius(aperture)
+
+
+@dataclass(frozen=True)
+class NonRedundancy(Inequality):
+    """All N(N-1) baselines of the mask lie at least `distance` [m] apart, and from zero.
+
+    With `distance` twice the hole diameter no two pairs of holes share a spatial frequency.
+    (N(N-1)/2)^2 margins.
+    """
+
+    distance: float
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.distance) and self.distance > 0):
+            raise ValueError(f"distance is {self.distance}: it must be finite and positive, in m")
+
+    def margins(self, aperture: SparseAperture) -> Tensor:
+        device = aperture.centers.device
+        first, second = torch.triu_indices(aperture.n_subapertures, aperture.n_subapertures, 1).to(device)
+        baselines = aperture.centers[..., first, :] - aperture.centers[..., second, :]
+        one, other = torch.triu_indices(len(first), len(first), 1).to(device)
+        pairs = torch.cat(
+            [
+                baselines,
+                baselines[..., one, :] - baselines[..., other, :],
+                baselines[..., one, :] + baselines[..., other, :],
+            ],
+            dim=-2,
+        )
+        return _length(pairs, pairs.new_tensor([1.0, 0.0])) - self.distance
+
+
+@dataclass(frozen=True)
+class FixedHoles(LinearEquality):
+    """Some holes stay where they are.
+
+    Parameters
+    ----------
+    positions : sequence of (float, float)
+        (x, y) [m].
+    indices : sequence of int, optional
+        Which holes of the mask these are; the first ones if left out.
+    """
+
+    positions: Sequence[tuple[float, float]]
+    indices: Sequence[int] | None = None
+
+    def __post_init__(self) -> None:
+        for position in self.positions:
+            _require_point("each position", position)
+        if self.indices is not None:
+            if len(self.indices) != len(self.positions) or len(set(self.indices)) != len(self.indices):
+                raise ValueError(f"indices is {self.indices}: it must name {len(self.positions)} different holes")
+            if min(self.indices, default=0) < 0:
+                raise ValueError(f"indices is {self.indices}: holes are counted from 0")
+
+    def equations(self, n_subapertures: int) -> tuple[np.ndarray, np.ndarray]:
+        indices = list(range(len(self.positions)) if self.indices is None else self.indices)
+        if max(indices, default=-1) >= n_subapertures:
+            raise ValueError(f"hole {max(indices)} is to be fixed in a mask of {n_subapertures}, counted from 0")
+        matrix = np.eye(2 * n_subapertures).reshape(n_subapertures, 2, -1)[indices].reshape(-1, 2 * n_subapertures)
+        return matrix, np.asarray(self.positions, dtype=float).reshape(-1)
+
+
+@dataclass(frozen=True)
+class NFoldSymmetry(LinearEquality):
+    """The mask looks the same after a turn by 1/n_fold about the centre.
+
+    Holes n_fold k, ..., n_fold k + n_fold - 1 are the turns of one of them, counterclockwise; if one hole is left
+    over, it is the last and sits at the centre.
+    """
+
+    n_fold: int
+
+    def __post_init__(self) -> None:
+        if self.n_fold != int(self.n_fold) or self.n_fold < 2:
+            raise ValueError(f"n_fold is {self.n_fold}: it must be a whole number of at least 2")
+
+    def equations(self, n_subapertures: int) -> tuple[np.ndarray, np.ndarray]:
+        n, left = self.n_fold, n_subapertures % self.n_fold
+        if left > 1:
+            near = sorted({n_subapertures - left, n_subapertures - left + 1, n_subapertures - left + n} - {0})
+            raise ValueError(
+                f"{n_subapertures} holes cannot be {n}-fold symmetric: take a multiple of {n}, or one more "
+                f"(a hole at the centre), such as {', '.join(map(str, near))}"
+            )
+        turn = 2 * math.pi / n
+        rotation = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
+        matrix = np.zeros((n_subapertures, 2, n_subapertures, 2))
+        for hole in range(n_subapertures):
+            matrix[hole, :, hole, :] += np.eye(2)
+            if hole < n_subapertures - left:  # r_next = rotation r_hole around the orbit
+                start = hole - hole % n
+                matrix[hole, :, start + (hole - start - 1) % n, :] -= rotation
+        matrix = matrix.reshape(2 * n_subapertures, 2 * n_subapertures)
+        return matrix, np.zeros(2 * n_subapertures)
+
+
+def check(aperture: SparseAperture, tolerance: float = 1e-9, constraints: Sequence[Constraint] = ()) -> None:
+    """Raise ValueError unless the holes lie in the mask disc, do not overlap and obey `constraints`.
+
+    Parameters
+    ----------
+    aperture : SparseAperture
+        One mask or a population: every one is checked.
+    tolerance : float
+        Largest shortfall that passes, as a fraction of the mask diameter.
+
+    Examples
+    --------
+    >>> check(SparseAperture([[-0.4, 0.0], [0.4, 0.0]], subaperture_diameter=0.2, mask_diameter=1.0))
+    """
+    for constraint in (InsideDisc(), NoOverlap(), *constraints):
+        worst = float(constraint.violation(aperture).max())
+        if worst > tolerance * aperture.mask_diameter:
+            raise ValueError(
+                f"{constraint} is broken by {worst:.3g} m ({worst / aperture.mask_diameter:.3g} of the mask "
+                f"diameter; the tolerance is {tolerance:.3g})"
+            )
+
+
+def _require_point(name: str, point: tuple[float, float]) -> None:
+    if len(point) != 2 or not all(math.isfinite(value) for value in point):
+        raise ValueError(f"{name} is {point}: it must be a finite (x, y) in m")

@@ -1,0 +1,111 @@
+"""Quasi-Newton descents of many masks at once: every evaluation is one batched call, and none waits for another."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+Function = Callable[[Tensor], Tensor]
+
+_ARMIJO = 1e-4  # share of the predicted decrease that a step must reach
+_SHORTEST = 1e-10  # steps below this fraction of the first one end a descent
+
+
+class BatchedBFGS:
+    """BFGS with a backtracking line search on P independent problems of F variables, by ask and tell.
+
+    Each round evaluates one point a problem: `ask()` gives the points (P, F), `tell(values, gradients)` takes what
+    was found there. A problem whose step was good enough turns to a new direction, one whose step was too long
+    shortens it; `finished` (P,) marks those that came to rest, which `restart` sets to work from another point.
+
+    Parameters
+    ----------
+    start : (P, F)
+    first_step : float
+        Length of the first step of a descent, and longest of any, in the units of the variables.
+    tolerance : float
+        A descent rests when the decrease that its next step promises falls below this, in the units of the function.
+    patience : int
+        Accepted steps after which a descent ends in any case.
+
+    Notes
+    -----
+    The inverse Hessian approximation is kept in full: at 2N variables it costs less than a history of pairs.
+    The first update scales it (Nocedal & Wright, Numerical Optimization, eq. 6.20); pairs without positive curvature
+    are skipped.
+    """
+
+    def __init__(self, start: Tensor, first_step: float, tolerance: float, patience: int = 1000) -> None:
+        self.first_step, self.tolerance, self.patience = first_step, tolerance, patience
+        n, size = start.shape
+        self.points = start.clone()
+        self.values = start.new_full((n,), torch.inf)
+        self.gradients = torch.zeros_like(start)
+        self.finished = torch.zeros(n, dtype=torch.bool, device=start.device)
+        self._identity = torch.eye(size, dtype=start.dtype, device=start.device)
+        self._inverse = self._identity.repeat(n, 1, 1)
+        self._direction = torch.zeros_like(start)
+        self._slope = start.new_zeros(n)
+        self._step = start.new_ones(n)
+        self._accepted = start.new_zeros(n, dtype=torch.long)
+
+    def restart(self, members: Tensor, points: Tensor) -> None:
+        """Let the problems `members` (indices or mask) begin anew at `points`."""
+        self.points[members] = points
+        self.values[members] = torch.inf
+        self._direction[members] = 0.0
+        self._step[members] = 1.0
+        self._inverse[members] = self._identity
+        self._accepted[members] = 0
+        self.finished[members] = False
+
+    def ask(self) -> Tensor:
+        """Points to evaluate (P, F); those of finished problems are where they rest."""
+        return self.points + (self._step * ~self.finished)[:, None] * self._direction
+
+    def tell(self, values: Tensor, gradients: Tensor) -> None:
+        """Values (P,) and gradients (P, F) at the points of the last `ask`."""
+        good = torch.isfinite(values) & torch.isfinite(gradients).all(-1)
+        good &= ~self.finished & ((values <= self.values + _ARMIJO * self._step * self._slope) | self.values.isinf())
+        if bool(good.any()):
+            self._accept(good, values, gradients)
+        shorter = ~good & ~self.finished
+        # The minimum of the parabola through both values and the slope, kept within a tenth and a half.
+        rise = values - self.values - self._step * self._slope
+        step = -0.5 * self._slope * self._step**2 / rise
+        step = torch.where(torch.isfinite(step), step, 0.1 * self._step)
+        step = torch.minimum(torch.maximum(step, 0.1 * self._step), 0.5 * self._step)
+        self._step = torch.where(shorter, step, self._step)
+        self.finished |= shorter & (self._step < _SHORTEST)
+
+    def _accept(self, good: Tensor, values: Tensor, gradients: Tensor) -> None:
+        moved = self._step[good, None] * self._direction[good]
+        change = gradients[good] - self.gradients[good]
+        inverse = _updated(self._inverse[good], moved, change, self._accepted[good] == 1)
+        self.points[good] += moved
+        self.values[good], self.gradients[good] = values[good], gradients[good]
+        direction = -(inverse @ gradients[good, :, None])[..., 0]
+        slope = (direction * gradients[good]).sum(-1)
+        # No step goes farther than the first one, which alone has no curvature to be measured by.
+        length = torch.linalg.vector_norm(direction, dim=-1).clamp(min=torch.finfo(direction.dtype).tiny)
+        first = self._accepted[good] == 0
+        scale = torch.where(first, self.first_step / length, (self.first_step / length).clamp(max=1))
+        self._inverse[good], self._direction[good], self._slope[good] = inverse, direction, slope
+        self._step[good] = scale
+        self._accepted[good] += 1
+        self.finished[good] = (-slope * scale < self.tolerance) | (self._accepted[good] > self.patience)
+
+
+def _updated(inverse: Tensor, s: Tensor, y: Tensor, first: Tensor) -> Tensor:
+    """BFGS update of inverse Hessians (P, F, F) by steps s and gradient changes y (P, F)."""
+    sy, yy = (s * y).sum(-1), (y * y).sum(-1)
+    curved = sy > 1e-10 * torch.sqrt((s * s).sum(-1) * yy)
+    rho = torch.where(curved, 1 / sy, 0)
+    gamma = torch.where(first & curved, sy / yy, 1)
+    inverse = inverse * gamma[:, None, None]
+    hy = (inverse @ y[..., None])[..., 0]
+    factor = rho + rho**2 * (y * hy).sum(-1)
+    cross = (rho[:, None, None] * hy[..., None]) * s[:, None, :]
+    return inverse - cross - cross.mT + factor[:, None, None] * (s[..., None] * s[:, None, :])

@@ -1,0 +1,213 @@
+"""Rules on the positions of holes, the subspace they leave free, and the way back to a mask that obeys them.
+
+An inequality is a set of margins: signed clearances in metres, at least 0 where it holds. An equality is linear in
+the centres, so that a search moves in the subspace it leaves and obeys it at every step. All functions take an
+aperture whose `centers` (..., N, 2) may carry leading population axes, and follow its dtype, device and gradient.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from scipy.optimize import minimize
+from torch import Tensor
+
+from torchmask.optics.aperture import SparseAperture
+
+Array = np.ndarray
+
+
+class Infeasible(ValueError):
+    """No mask obeys the rules, or none was found."""
+
+
+def with_centers(aperture: SparseAperture, centers: Tensor) -> SparseAperture:
+    """The same holes elsewhere."""
+    return SparseAperture(
+        centers, aperture.subaperture_diameter, aperture.mask_diameter, aperture.shape, aperture.orientation
+    )
+
+
+class Constraint(ABC):
+    """A rule on the positions of the holes."""
+
+    @abstractmethod
+    def residuals(self, aperture: SparseAperture) -> Tensor:
+        """Shortfalls (..., M) [m], 0 where the rule holds."""
+
+    def penalty(self, aperture: SparseAperture) -> Tensor:
+        """Sum of the squared shortfalls (...) [m^2]: smooth, and 0 exactly where the rule holds."""
+        return (self.residuals(aperture) ** 2).sum(-1)
+
+    def violation(self, aperture: SparseAperture) -> Tensor:
+        """Largest shortfall (...) [m]."""
+        shortfalls = self.residuals(aperture).detach().abs()
+        return shortfalls.amax(-1) if shortfalls.shape[-1] else shortfalls.sum(-1)
+
+    def project(self, aperture: SparseAperture) -> SparseAperture:
+        """The mask nearest to `aperture` that obeys this rule. Raises `Infeasible` if none is found."""
+        return project(aperture, [self])
+
+
+class Inequality(Constraint):
+    """A rule `margins >= 0`."""
+
+    @abstractmethod
+    def margins(self, aperture: SparseAperture) -> Tensor:
+        """Signed clearances (..., M) [m]."""
+
+    def residuals(self, aperture: SparseAperture) -> Tensor:
+        return (-self.margins(aperture)).clamp(min=0)
+
+
+class LinearEquality(Constraint):
+    """A rule `matrix @ centers.flatten() = values`."""
+
+    @abstractmethod
+    def equations(self, n_subapertures: int) -> tuple[Array, Array]:
+        """(matrix (M, 2N), values (M) [m]) for the flattened centres x_0, y_0, x_1, ..."""
+
+    def residuals(self, aperture: SparseAperture) -> Tensor:
+        matrix, values = (torch.as_tensor(a).to(aperture.centers) for a in self.equations(aperture.n_subapertures))
+        return aperture.centers.flatten(-2) @ matrix.T - values
+
+
+class Subspace:
+    """The masks of N holes that obey all linear equalities: centers = origin + basis z, z (..., F) [m].
+
+    The columns of `basis` are orthonormal, so lengths in z are lengths in the flattened centres.
+
+    Raises
+    ------
+    Infeasible
+        If the equalities contradict each other.
+    """
+
+    def __init__(self, n_subapertures: int, constraints: Sequence[Constraint] = (), like: Tensor | None = None) -> None:
+        size = 2 * n_subapertures
+        equations = [c.equations(n_subapertures) for c in constraints if isinstance(c, LinearEquality)]
+        matrix = np.concatenate([np.zeros((0, size)), *(m for m, _ in equations)])
+        values = np.concatenate([np.zeros(0), *(v for _, v in equations)])
+        left, singular, right = np.linalg.svd(matrix)
+        rank = int((singular > 1e-9).sum())
+        origin = right[:rank].T @ ((left[:, :rank].T @ values) / singular[:rank])
+        if np.abs(matrix @ origin - values).max(initial=0.0) > 1e-12 * max(1.0, np.abs(values).max(initial=0.0)):
+            names = " and ".join(str(c) for c in constraints if isinstance(c, LinearEquality))
+            raise Infeasible(f"no mask of {n_subapertures} holes obeys {names} together")
+        like = torch.zeros((), dtype=torch.float64) if like is None else like
+        self.origin = torch.as_tensor(origin).to(like)
+        self.basis = torch.as_tensor(right[rank:].T.copy()).to(like)
+        # What z must change by so that one hole moves by a given step, with the smallest change elsewhere.
+        rows = right[rank:].T.reshape(n_subapertures, 2, -1)
+        self.lift = torch.as_tensor(np.linalg.pinv(rows, rcond=1e-9)).to(like)  # (N, F, 2)
+
+    @property
+    def size(self) -> int:
+        """Number of free coordinates, F."""
+        return self.basis.shape[1]
+
+    def centers(self, z: Tensor) -> Tensor:
+        """(..., F) -> (..., N, 2)."""
+        return (self.origin + z @ self.basis.T).unflatten(-1, (-1, 2))
+
+    def coordinates(self, centers: Tensor) -> Tensor:
+        """(..., N, 2) -> (..., F), of the nearest point of the subspace."""
+        return (centers.flatten(-2) - self.origin) @ self.basis
+
+    def place(self, z: Tensor, hole: int, position: Tensor) -> Tensor:
+        """Move one hole to `position` (..., 2) as far as the equalities let it, and all that is tied to it."""
+        return z + (position - self.centers(z)[..., hole, :]) @ self.lift[hole].T
+
+
+def all_margins(aperture: SparseAperture, constraints: Sequence[Constraint]) -> Tensor:
+    """Margins of all inequalities side by side (..., M) [m]."""
+    margins = [c.margins(aperture) for c in constraints if isinstance(c, Inequality)]
+    return torch.cat(margins, dim=-1) if margins else aperture.centers.flatten(-2)[..., :0]
+
+
+def project(aperture: SparseAperture, constraints: Sequence[Constraint]) -> SparseAperture:
+    """The mask nearest to `aperture` that obeys all `constraints`, to rounding.
+
+    Nearest in the sum of squared shifts, by sequential quadratic programming; each mask of a population by itself.
+    The result carries no gradient.
+
+    Raises
+    ------
+    Infeasible
+        If no such mask is found.
+    """
+    centers = aperture.centers.detach()
+    double = with_centers(aperture, centers.double().cpu())
+    subspace = Subspace(aperture.n_subapertures, constraints)
+    # What is returned is rounded to the dtype of the aperture, and must still hold.
+    slack = aperture.mask_diameter * (1e-12 if centers.dtype == torch.float64 else 8 * torch.finfo(centers.dtype).eps)
+    masks = [
+        _project_one(with_centers(double, one), subspace, constraints, slack)
+        for one in double.centers.reshape(-1, *centers.shape[-2:])
+    ]
+    return with_centers(aperture, torch.stack(masks).reshape(centers.shape).to(centers))
+
+
+def _project_one(
+    aperture: SparseAperture, subspace: Subspace, constraints: Sequence[Constraint], slack: float
+) -> Tensor:
+    scale = aperture.mask_diameter
+    start = subspace.coordinates(aperture.centers)
+    margins = margin_function(aperture, subspace, constraints)
+    z = start.numpy() / scale
+    nearest = z
+    relevant = np.zeros(len(margins(z)[0]), dtype=bool)
+    for _ in range(8):
+        values, _ = margins(z)
+        if values.min(initial=np.inf) * scale >= slack / 2:
+            return subspace.centers(torch.as_tensor(z * scale))
+        # Only the margins near zero matter; others may come near as the holes move, so look again.
+        relevant |= values < 0.05 + max(0.0, -values.min())
+        rows = np.flatnonzero(relevant)
+        z = _nearest_point(nearest, z, lambda z, rows=rows: margins(z, rows), slack / scale)
+    raise Infeasible(
+        f"no mask near the given one obeys {', '.join(map(str, constraints))}: "
+        f"{-margins(z)[0].min() * scale:.3g} m are missing"
+    )
+
+
+def _nearest_point(target: Array, start: Array, margins: Callable, slack: float) -> Array:
+    """argmin |z - target|^2 subject to margins >= slack, in units of the mask diameter."""
+    result = minimize(
+        lambda z: (0.5 * ((z - target) ** 2).sum(), z - target),
+        start,
+        jac=True,
+        method="SLSQP",
+        constraints={"type": "ineq", "fun": lambda z: margins(z)[0] - slack, "jac": lambda z: margins(z)[1]},
+        options={"maxiter": 100, "ftol": 1e-14},
+    )
+    z = result.x
+    # The last digits: smallest steps onto the margins that are still short (Newton, quadratic).
+    for _ in range(20):
+        values, jacobian = margins(z)
+        short = values < slack
+        if not short.any() or not np.isfinite(values).all():
+            break
+        z = z + np.linalg.lstsq(jacobian[short], slack - values[short], rcond=1e-9)[0]
+    return z
+
+
+def margin_function(aperture: SparseAperture, subspace: Subspace, constraints: Sequence[Constraint]) -> Callable:
+    """margins(z, rows=None) -> (values (M), jacobian (M, F)), all lengths in units of the mask diameter."""
+    scale = aperture.mask_diameter
+
+    def margins(z: Array, rows: Array | None = None) -> tuple[Array, Array]:
+        with torch.no_grad():
+            values = all_margins(with_centers(aperture, subspace.centers(torch.as_tensor(z * scale))), constraints)
+        rows = np.flatnonzero(np.ones(len(values), dtype=bool)) if rows is None else rows
+        # One copy of the mask a row: the gradient of the sum of the rows' own margins is the Jacobian.
+        copies = torch.as_tensor(z * scale).expand(len(rows), -1).clone().requires_grad_()
+        own = all_margins(with_centers(aperture, subspace.centers(copies)), constraints)
+        own = own[torch.arange(len(rows)), torch.as_tensor(rows)]
+        (jacobian,) = torch.autograd.grad(own.sum(), copies)
+        return values.numpy()[rows] / scale, jacobian.numpy()
+
+    return margins

@@ -1,0 +1,169 @@
+"""The gradient stage: quasi-Newton descents from given masks to feasible local optima."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from torchmask.design.constraints import InsideDisc, NoOverlap, check
+from torchmask.design.descent import BatchedBFGS
+from torchmask.design.feasibility import Constraint, Infeasible
+from torchmask.design.merit import Criterion, Holes, Merit
+from torchmask.optics.aperture import SparseAperture
+from torchmask.record import Callback, Record
+
+PENALTY = 3e3  # weight of the squared shortfalls against log MSE, lengths in mask diameters
+TOLERANCE = 1e-9  # feasibility that results are held to, in mask diameters
+
+
+@dataclass(frozen=True)
+class SearchResult:
+    """A mask, and how it was found.
+
+    aperture : the mask, feasible to 1e-9 of its diameter
+    mse, relative_mse : the criterion at this very mask
+    evaluations : masks whose error was computed
+    history : for each stage (evaluations so far, best relative MSE so far) (n, 2); a stage that works on a coarse grid
+        or with penalties reports the values it sees there
+    """
+
+    aperture: SparseAperture
+    mse: float
+    relative_mse: float
+    evaluations: int
+    history: dict[str, Tensor] = field(repr=False)
+
+
+class Monitor:
+    """Keeps the history of a stage and tells the callback, about a hundred times."""
+
+    def __init__(self, stage: str, budget: int, holes: Holes, callback: Callback | None) -> None:
+        self.stage, self.budget, self.holes, self.callback = stage, budget, holes, callback
+        self.best = float("inf")
+        self.rows: list[tuple[float, float]] = []
+        self._centers: Tensor | None = None
+        self._due = 0
+
+    def update(self, evaluations: int, merits: Tensor, relative_mse: Tensor, x: Tensor, last: bool = False) -> None:
+        """Tell what was found at x (P, F): the best merit so far is the best mask."""
+        index = int(merits.nan_to_num(torch.inf).argmin())
+        if float(merits[index]) < self.best:
+            self.best = float(merits[index])
+            self._relative = float(relative_mse[index])
+            self._centers = self.holes.aperture(x[index]).centers.detach().clone()
+        if self._centers is None or (evaluations < self._due and not last):
+            return
+        self._due = evaluations + self.budget / 100
+        self.rows.append((evaluations, self._relative))
+        if self.callback is not None:
+            scalars = {"relative_mse": self._relative}
+            self.callback(Record(self.stage, evaluations, self.budget, scalars, {"centers": self._centers}))
+
+    @property
+    def history(self) -> dict[str, Tensor]:
+        """The stage's entry in `SearchResult.history`."""
+        return {self.stage: torch.tensor(self.rows, dtype=torch.float64).reshape(-1, 2)}
+
+
+def refine_mask(
+    criterion: Criterion,
+    aperture: SparseAperture,
+    *,
+    constraints: Sequence[Constraint] = (),
+    budget: int = 1000,
+    callback: Callback | None = None,
+) -> SearchResult:
+    """Descend from a mask to the feasible local optimum of `criterion` beside it.
+
+    Parameters
+    ----------
+    criterion : AsymptoticMSE, or any differentiable error of masks like it
+    aperture : SparseAperture
+        One mask; it need not be feasible.
+    constraints : sequence of Constraint
+        Rules beside the mask disc and the overlap, which always hold.
+    budget : int
+        Evaluations of the criterion, each with its gradient.
+    callback : callable, optional
+        Gets a `Record` now and then; its centres may still break a rule by a little.
+
+    Raises
+    ------
+    ValueError
+        For a population, or if no feasible mask is found near the given one.
+    """
+    if aperture.centers.ndim != 2:
+        raise ValueError(f"centers has shape {tuple(aperture.centers.shape)}: refine_mask takes one mask, (N, 2)")
+    holes = Holes(detached(aperture), (InsideDisc(), NoOverlap(), *constraints))
+    start = holes.coordinates(aperture.centers.detach())
+    monitor = Monitor("design/refine", budget, holes, callback)
+    best, evaluations = polish(criterion, holes, start[None], budget, monitor)
+    return conclude(criterion, best, constraints, evaluations, monitor.history)
+
+
+def polish(criterion: Criterion, holes: Holes, x: Tensor, budget: int, monitor: Monitor) -> tuple[SparseAperture, int]:
+    """The best feasible mask reached from x (P, F) within `budget` evaluations of `criterion`, and their number.
+
+    The multipliers of the augmented Lagrangian let the descents come to rest on the rules, not beyond them; the
+    last step projects what is left. Raises `Infeasible` if no projection succeeds.
+    """
+    merit = Merit(criterion, holes, PENALTY)
+    multipliers: Tensor | float = 0.0
+    n_rounds = max(1, (budget - len(x)) // len(x))
+    descent = BatchedBFGS(x, first_step=0.003, tolerance=1e-8)
+    found = merit(descent.ask())
+    for _ in range(n_rounds):
+        descent.tell(found.merit, found.gradient)
+        if bool(descent.finished.all()):
+            rest = merit(descent.points, multipliers)
+            update = (torch.as_tensor(multipliers) - merit.weight * rest.margins).clamp(min=0)
+            if float((update - multipliers).abs().max()) < 1e-4 * float(update.max()):
+                break
+            multipliers = update
+            descent.restart(slice(None), descent.points.clone())
+        points = descent.ask()
+        found = merit(points, multipliers)
+        monitor.update(merit.evaluations, found.merit, found.relative_mse, points)
+    candidates = []
+    for point in descent.points:
+        try:
+            candidates.append(holes.feasible(point))
+        except Infeasible as error:
+            failure = error
+    if not candidates:
+        raise failure
+    with torch.no_grad():
+        values = torch.stack([criterion.relative(candidate) for candidate in candidates])
+    best = int(values.argmin())
+    x = holes.coordinates(candidates[best].centers)[None]
+    monitor.update(merit.evaluations, values[best : best + 1].log() - 1e6, values[best : best + 1], x, last=True)
+    return candidates[best], merit.evaluations + len(candidates)
+
+
+def detached(aperture: SparseAperture) -> SparseAperture:
+    """A mask that shares no gradient with `aperture`."""
+    return SparseAperture(
+        aperture.centers.detach().clone(),
+        aperture.subaperture_diameter,
+        aperture.mask_diameter,
+        aperture.shape,
+        aperture.orientation,
+    )
+
+
+def conclude(
+    criterion: Criterion,
+    aperture: SparseAperture,
+    constraints: Sequence[Constraint],
+    evaluations: int,
+    history: dict[str, Tensor],
+) -> SearchResult:
+    """Check the mask and measure it."""
+    tolerance = TOLERANCE if aperture.centers.dtype == torch.float64 else 1e-6
+    check(aperture, tolerance, constraints)
+    with torch.no_grad():
+        mse, relative = float(criterion(aperture)), float(criterion.relative(aperture))
+    return SearchResult(aperture, mse, relative, evaluations, history)
