@@ -19,6 +19,8 @@ IMAGE_SUFFIXES = (".npz", ".png", ".fits")
 OBLIQUE_VIEW = (25.0, -30.0, 15.0)
 OBLIQUE_SUN = (-0.5, 0.6, 0.7)
 
+_ROUNDING = 1e-9  # of the interpolation weights of an image that is turned
+
 
 @dataclass(frozen=True)
 class SceneOptions:
@@ -127,10 +129,10 @@ def _read_npz(path: Path) -> np.ndarray:
 
 
 def _read_png(path: Path) -> np.ndarray:
-    from skimage import io
+    import imageio.v3 as imageio  # comes with scikit-image
 
     try:
-        image = np.asarray(io.imread(path), dtype=np.float64)
+        image = np.asarray(imageio.imread(path.read_bytes(), plugin="pillow", extension=".png"), dtype=np.float64)
     except Exception as error:  # the readers behind it fail in many ways
         raise ValueError(f"{path} cannot be read as a PNG image: {error}") from error
     if image.ndim == 3 and image.shape[-1] in (2, 4):
@@ -142,7 +144,7 @@ def _read_fits(path: Path) -> np.ndarray:
     from astropy.io import fits
 
     try:
-        with fits.open(path, memmap=False) as units:
+        with path.open("rb") as file, fits.open(file, memmap=False) as units:
             arrays = [
                 unit.data for unit in units if isinstance(unit, fits.PrimaryHDU | fits.ImageHDU | fits.CompImageHDU)
             ]
@@ -167,7 +169,8 @@ def _pose(image: Tensor, shape: tuple[int, int], options: SceneOptions) -> Tenso
     image = image[None, None]
     if angle:
         margin = math.ceil((math.hypot(*image.shape[-2:]) - min(image.shape[-2:])) / 2)
-        image = rotate(pad(image, (margin,) * 4), image.new_tensor([angle])).clamp(min=0)
+        image = rotate(pad(image, (margin,) * 4), image.new_tensor([angle]))
+        image = image * (image > _ROUNDING * image.max())  # black stays black
     rows, columns = (torch.nonzero(image.sum(dim=axis).squeeze()).flatten() for axis in (-1, -2))
     target = image[..., int(rows[0]) : int(rows[-1]) + 1, int(columns[0]) : int(columns[-1]) + 1]
     scale = options.size * min(shape[0] / target.shape[-2], shape[1] / target.shape[-1])

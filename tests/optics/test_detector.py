@@ -1,0 +1,111 @@
+"""Linear convolution against SciPy, and the statistics of noise."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.signal import fftconvolve
+from torch.autograd import gradcheck
+
+from torchmask.optics.detector import Detector, image_formation
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+@settings(max_examples=25, derandomize=True, deadline=None)
+@given(height=st.integers(1, 9), width=st.integers(1, 9), rows=st.integers(0, 8), columns=st.integers(0, 8))
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_agrees_with_linear_convolution_by_scipy(dtype, height, width, rows, columns):
+    rows, columns = 2 * height - 1 + rows, 2 * width - 1 + columns
+    draw = generator(height + 10 * width + 100 * rows + columns)
+    scene = torch.rand(height, width, generator=draw, dtype=dtype)
+    psf = torch.rand(rows, columns, generator=draw, dtype=dtype)
+    centred = torch.roll(psf, (rows // 2, columns // 2), (0, 1))
+    full = fftconvolve(scene.double(), centred.double())
+    expected = full[rows // 2 : rows // 2 + height, columns // 2 : columns // 2 + width]
+    image = image_formation(scene, psf)
+    assert image.dtype == dtype
+    # sums of at most 81 products below 1, through FFTs: a few roundings of the sum
+    torch.testing.assert_close(image.double(), torch.from_numpy(expected), rtol=0, atol=200 * torch.finfo(dtype).eps)
+
+
+def test_light_that_leaves_the_field_does_not_come_back():
+    scene = torch.zeros(8, 8, dtype=torch.float64)
+    scene[0, 7] = 1.0
+    psf = torch.zeros(32, 32, dtype=torch.float64)
+    psf[-1, 0] = psf[0, 1] = psf[3, 0] = psf[0, -2] = 0.25
+    image = image_formation(scene, psf)
+    expected = torch.zeros(8, 8, dtype=torch.float64)
+    expected[3, 7] = expected[0, 5] = 0.25
+    torch.testing.assert_close(image, expected, rtol=0, atol=1e-15)
+
+
+def test_leading_axes_broadcast():
+    scenes, psfs = torch.rand(2, 1, 4, 5, generator=generator()), torch.rand(3, 8, 10, generator=generator())
+    images = image_formation(scenes, psfs)
+    assert images.shape == (2, 3, 4, 5)
+    torch.testing.assert_close(images[1, 2], image_formation(scenes[1, 0], psfs[2]))
+
+
+def test_gradients():
+    scene = torch.rand(3, 4, generator=generator(), dtype=torch.float64, requires_grad=True)
+    psfs = torch.rand(2, 6, 7, generator=generator(), dtype=torch.float64, requires_grad=True)
+    dark = torch.zeros(3, 4, dtype=torch.float64, requires_grad=True)
+    assert gradcheck(image_formation, (scene, psfs))
+    assert gradcheck(image_formation, (dark, psfs))
+
+
+def test_narrow_psfs_are_refused():
+    scene = torch.ones(8, 8)
+    image_formation(scene, torch.ones(15, 15))
+    for shape in ((14, 15), (15, 14), (8, 8)):
+        with pytest.raises(ValueError, match="15 x 15"):
+            image_formation(scene, torch.ones(shape))
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize(("mean", "readout_noise"), [(0.0, 2.0), (0.3, 0.0), (7.0, 1.5), (1e4, 30.0)])
+def test_mean_and_variance_of_frames(dtype, mean, readout_noise):
+    n = 200_000
+    frames = Detector(readout_noise)(torch.full((n,), mean, dtype=dtype), generator(3)).double()
+    variance = mean + readout_noise**2
+    # fourth central moment: Poisson 3 m^2 + m, Gaussian 3 s^4, cross 6 m s^2
+    fourth = 3 * mean**2 + mean + 3 * readout_noise**4 + 6 * mean * readout_noise**2
+    assert abs(float(frames.mean()) - mean) < 4 * math.sqrt(variance / n)
+    assert abs(float(frames.var()) - variance) < 4 * math.sqrt((fourth - variance**2) / n)
+    assert frames.numel() == n
+
+
+def test_a_perfect_detector_counts_photons():
+    frames = Detector()(torch.full((100, 100), 3.5, dtype=torch.float64), generator())
+    assert bool((frames == frames.round()).all())
+    assert bool((frames >= 0).all())
+    assert not Detector()(torch.zeros(10, 10), generator()).any()
+
+
+def test_read_noise_does_not_change_the_photons_drawn():
+    expected = torch.full((50, 50), 20.0, dtype=torch.float64)
+    quiet, noisy, loud = (Detector(noise)(expected, generator(5)) for noise in (0.0, 1.0, 3.0))
+    torch.testing.assert_close(loud - quiet, 3 * (noisy - quiet), rtol=0, atol=1e-10)
+    assert not torch.equal(Detector(1.0)(expected, generator(6)), noisy)
+    assert torch.equal(Detector(1.0)(expected, generator(5)), noisy)
+
+
+def test_rounding_below_zero_is_forgiven_and_negative_light_is_not():
+    expected = torch.tensor([100.0, -1e-12], dtype=torch.float64)
+    assert bool((Detector()(expected, generator()) >= 0).all())
+    with pytest.raises(ValueError, match="negative"):
+        Detector()(torch.tensor([100.0, -1e-3], dtype=torch.float64))
+    for bad in (math.nan, math.inf):
+        with pytest.raises(ValueError, match="not finite"):
+            Detector()(torch.tensor([1.0, bad]))
+
+
+@pytest.mark.parametrize("readout_noise", [-1.0, math.nan, math.inf])
+def test_bad_read_noise_is_refused(readout_noise):
+    with pytest.raises(ValueError, match="readout_noise"):
+        Detector(readout_noise)
