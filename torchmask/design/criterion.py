@@ -9,28 +9,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from torchmask.design.overlap import disc_patches, hexagon_patches
+from torchmask.design.overlap import BaselineMSE, Geometry
 from torchmask.design.psd import PSD, evaluate_psd, resample_psd
 from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture, FullAperture
-
-_CHUNK = 2**16  # pixels of patches treated at a time: what stays in a core's cache
-
-
-class _Geometry(NamedTuple):
-    """What the kernel must know of an aperture and a grid besides the centres; lengths in pixels of the grid."""
-
-    shape: tuple[int, int]  # of the frequency grid
-    period: float  # metres in the pupil of one cycle per pixel
-    subaperture: str
-    diameter: float  # [m]
-    reach: float  # radius of the support of a sub-aperture's OTF [m]
-    orientation: float
 
 
 class AsymptoticMSE(nn.Module):
@@ -118,7 +105,7 @@ class AsymptoticMSE(nn.Module):
         geometry = self._geometry(aperture)
         flat = centers.reshape(-1, *centers.shape[-2:])
         weight, ratio = self._weight.to(centers.dtype), self._ratio.to(centers.dtype)
-        return _BaselineMSE.apply(flat, weight, ratio, geometry).reshape(centers.shape[:-2])  # type: ignore[no-any-return]
+        return BaselineMSE.apply(flat, weight, ratio, geometry).reshape(centers.shape[:-2])  # type: ignore[no-any-return]
 
     def relative(self, aperture: Aperture) -> Tensor:
         """MSE_a over the mean of the object's PSD, (...): 0 is a perfect restoration, 1 none at all."""
@@ -144,7 +131,7 @@ class AsymptoticMSE(nn.Module):
         other = AsymptoticMSE(grid, model, noise, self.n_frames)
         return other.to(self.object_psd.device, self.object_psd.dtype)
 
-    def _geometry(self, aperture: Aperture) -> _Geometry:
+    def _geometry(self, aperture: Aperture) -> Geometry:
         if isinstance(aperture, FullAperture) or aperture.central_obstruction > 0:
             raise ValueError(
                 "MSE_a is defined for masks of clear sub-apertures (SparseAperture): a full or obstructed pupil has "
@@ -154,10 +141,10 @@ class AsymptoticMSE(nn.Module):
         reach = diameter * (1.0 if aperture.shape == "disc" else 2 / math.sqrt(3))
         if reach > 0.5 * self.grid.period * (1 + 1e-9):
             raise ValueError(
-                f"the OTF of a sub-aperture reaches {self.grid.cutoff(reach):.3f} cycles/pixel, above 1/2, and overlaps "
-                f"itself: pixel_scale must be at most {self.grid.wavelength / (2 * reach):.4g} rad"
+                f"the OTF of a sub-aperture reaches {self.grid.cutoff(reach):.3f} cycles/pixel, above 1/2, and "
+                f"overlaps itself: pixel_scale must be at most {self.grid.wavelength / (2 * reach):.4g} rad"
             )
-        return _Geometry(self.grid.shape, self.grid.period, aperture.shape, diameter, reach, aperture.orientation)
+        return Geometry(self.grid.shape, self.grid.period, aperture.shape, diameter, aperture.orientation, reach)
 
     def extra_repr(self) -> str:
         return f"grid={self.grid}, n_frames={self.n_frames}"
@@ -201,106 +188,3 @@ def _reflect(image: Tensor) -> Tensor:
 def _pack_again(module: nn.Module, _: Any) -> None:
     assert isinstance(module, AsymptoticMSE)
     module._pack()
-
-
-class _BaselineMSE(torch.autograd.Function):
-    """MSE_a of masks with centres (B, N, 2). The gradient is made with the value, mask by mask: it is small, while
-    what a backward pass would need is not."""
-
-    @staticmethod
-    def forward(ctx: Any, centers: Tensor, weight: Tensor, ratio: Tensor, geometry: _Geometry) -> Tensor:
-        differentiate = ctx.needs_input_grad[0]
-        n = centers.shape[-2]
-        side = 2 * geometry.reach / geometry.period
-        pixels = (n * (n - 1) // 2 + 1) * (side * geometry.shape[0] + 1) * (side * geometry.shape[1] + 1)
-        chunks = [
-            _mse_and_gradient(chunk, weight, ratio, geometry, differentiate)
-            for chunk in centers.split(max(1, int(_CHUNK / pixels)))
-        ]
-        if differentiate:
-            ctx.save_for_backward(torch.cat([gradient for _, gradient in chunks]))
-        return torch.cat([value for value, _ in chunks])
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *grad: Tensor) -> tuple[Tensor, None, None, None]:
-        (gradient,) = ctx.saved_tensors
-        return grad[0][:, None, None] * gradient, None, None, None
-
-
-def _mse_and_gradient(
-    centers: Tensor, weight: Tensor, ratio: Tensor, geometry: _Geometry, differentiate: bool
-) -> tuple[Tensor, Tensor]:
-    """MSE_a (B,) of masks with centres (B, N, 2), and its gradient by them (zeros unless asked for)."""
-    (rows, columns), period = geometry.shape, geometry.period
-    batch, n = centers.shape[:2]
-    first, second = torch.triu_indices(n, n, 1, device=centers.device)
-    # baselines in pixels, the zero baseline before them, on the half-plane nu_y >= 0
-    size = centers.new_tensor([columns, rows])
-    baseline = (centers[:, first] - centers[:, second]) * (size / period)
-    baseline = torch.cat([baseline.new_zeros(batch, 1, 2), baseline], 1)
-    baseline = baseline - size * torch.round(baseline / size)
-    sign = torch.where(baseline[..., 1:] < 0, -1.0, 1.0).to(baseline.dtype)
-    baseline = baseline * sign
-    # a window of the pixels within reach of each; NaN (a diverged optimiser) must not become an index
-    reach_x, reach_y = geometry.reach * columns / period, geometry.reach * rows / period
-    corner = torch.ceil(baseline - centers.new_tensor([reach_x, reach_y]))
-    offset = corner - baseline
-    corner = corner.nan_to_num(0.0).long()
-    window_x = torch.arange(int(2 * reach_x) + 1, device=centers.device)
-    window_y = torch.arange(int(2 * reach_y) + 1, device=centers.device)
-    x = (offset[..., :1] + window_x)[..., None, :] * (period / (columns * geometry.diameter))
-    y = (offset[..., 1:] + window_y)[..., None] * (period / (rows * geometry.diameter))
-    if geometry.subaperture == "disc":
-        patches, pullback = disc_patches(x, y, differentiate)
-    else:
-        patches, pullback = hexagon_patches(x, y, geometry.orientation, differentiate)
-    patches[:, 0] *= n * n / 2  # each patch counts twice in the end, at nu and at -nu
-
-    # rows from -above to rows//2 + below of the plane hold every patch; columns wrap
-    height = rows // 2 + 1
-    above, below = int(reach_y), int(reach_y) + 1
-    index_x = (corner[..., :1] + window_x) % columns
-    index_y = corner[..., 1:] + (window_y + above)
-    index = (index_y * columns)[..., None] + index_x[..., None, :]
-    index = index.reshape(batch, -1)
-    plane = centers.new_zeros(batch, (above + height + below) * columns)
-    plane.scatter_add_(1, index, patches.reshape(batch, -1))
-    plane = plane.view(batch, -1, columns)
-
-    transfer = plane[:, above : above + height].clone()
-    mirror = _Mirror(rows, columns, above, below, centers.device)
-    mirror.add_reflection(transfer, plane)
-    scale = 1 / (n * n)
-    inverse = torch.add(ratio, transfer[:, None], alpha=scale).reciprocal_()
-    value = torch.matmul(inverse.view(batch, -1), weight.view(-1))
-    if not differentiate:
-        return value, torch.zeros_like(centers)
-    slope = (inverse.square_() * weight).sum(1).mul_(-scale)
-    plane.zero_()
-    plane[:, above : above + height] = slope
-    mirror.add_adjoint(plane, slope)
-    patches = torch.gather(plane.view(batch, -1), 1, index).view(patches.shape)
-    by_baseline = -pullback(patches) * sign * (size / (size * geometry.diameter))
-    gradient = torch.zeros_like(centers)
-    gradient.index_add_(1, first, by_baseline[:, 1:])
-    gradient.index_add_(1, second, by_baseline[:, 1:], alpha=-1)
-    return value, gradient
-
-
-class _Mirror:
-    """The point reflection of the rows of a plane that lie on the border of the half-plane or beyond it."""
-
-    def __init__(self, rows: int, columns: int, above: int, below: int, device: torch.device) -> None:
-        half = rows // 2
-        row = torch.arange(-above, half + below + 1, device=device)
-        outside = (row <= 0) | (2 * row >= rows)
-        self.source = outside.nonzero()[:, 0]
-        self.target = torch.where(row <= 0, -row, rows - row)[self.source].clamp(0, half)
-        self.column = -torch.arange(columns, device=device) % columns
-
-    def add_reflection(self, transfer: Tensor, plane: Tensor) -> None:
-        transfer.index_add_(1, self.target, plane[:, self.source][..., self.column])
-
-    def add_adjoint(self, plane: Tensor, slope: Tensor) -> None:
-        plane[:, self.source] += slope[:, self.target][..., self.column]
