@@ -1,0 +1,193 @@
+"""The common look of the figures in `viz`: style, units, axes and patches."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+
+import numpy as np
+
+from torchmask.grid import Grid
+from torchmask.optics.aperture import Aperture
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+# Okabe and Ito's colours: told apart by colour-blind readers.
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
+INK, FAINT, PALE = "#222222", "#8A8A8A", "#EFEFEF"
+_STYLE: dict[Any, Any] = {
+    "font.size": 9.0,
+    "axes.titlesize": 9.5,
+    "axes.titlelocation": "left",
+    "axes.labelsize": 9.0,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": FAINT,
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "xtick.color": FAINT,
+    "ytick.color": FAINT,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "xtick.labelsize": 8.0,
+    "ytick.labelsize": 8.0,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    "lines.linewidth": 1.6,
+    "figure.dpi": 110.0,
+}
+_ARCSEC = math.degrees(1) * 3600
+
+
+def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
+    """Draw with this module's style, without changing that of the caller."""
+
+    @functools.wraps(draw)
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> Figure:
+        import matplotlib
+
+        with matplotlib.rc_context(_STYLE):
+            return draw(*args, **kwargs)
+
+    return wrapped
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """An empty figure of `width` x `height` inches, known to no pyplot."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def row_of_axes(widths: Sequence[float], height: float) -> tuple[Figure, list[Axes]]:
+    """Axes side by side in `height` inches, of which labels take about 0.6; `widths` are relative to the rest."""
+    figure = new_figure((height - 0.6) * sum(widths) + 1.3, height)
+    return figure, list(figure.subplots(1, len(widths), squeeze=False, width_ratios=list(widths))[0])
+
+
+def colors() -> Iterator[str]:
+    """The colours of successive curves, for ever."""
+    return itertools.cycle(COLORS)
+
+
+def not_empty(things: Mapping[str, T]) -> Mapping[str, T]:
+    """Raise ValueError if there is nothing to draw."""
+    if not things:
+        raise ValueError("there is nothing to draw: the mapping from names is empty")
+    return things
+
+
+def length_unit(length: float) -> tuple[str, float]:
+    """Metres or millimetres for `length` [m], and how many of them make a metre."""
+    return ("m", 1.0) if length >= 0.1 else ("mm", 1e3)
+
+
+def angle_unit(angle: float) -> tuple[str, float]:
+    """Arcseconds or milliarcseconds for `angle` [rad], and how many of them make a radian."""
+    return ("arcsec", _ARCSEC) if angle * _ARCSEC >= 0.5 else ("mas", 1e3 * _ARCSEC)
+
+
+def round_below(value: float) -> float:
+    """The largest of 1, 2, 5 times a power of ten that is not above `value` > 0."""
+    power = 10.0 ** math.floor(math.log10(value))
+    return max(step for step in (power, 2 * power, 5 * power) if step <= value * (1 + 1e-9))
+
+
+def sky_extent(
+    shape: tuple[int, int], pixel_scale: float | None, centred: bool = False
+) -> tuple[str, tuple[float, float, float, float]]:
+    """Unit and extent of an image with row 0 at the top, pixel [0, 0] or (after fftshift) the middle one at zero."""
+    rows, columns = shape
+    unit, step = ("pixels", 1.0)
+    if pixel_scale is not None:
+        unit, scale = angle_unit(pixel_scale * min(shape) / 2)
+        step = pixel_scale * scale
+    y0, x0 = (rows // 2, columns // 2) if centred else (0, 0)
+    left, top = -x0 - 0.5, -y0 - 0.5
+    return unit, (left * step, (left + columns) * step, (top + rows) * step, top * step)
+
+
+def frequency_extent(grid: Grid) -> tuple[float, float, float, float]:
+    """Extent of an fftshifted Fourier plane with y upwards [cycles/pixel]."""
+    rows, columns = grid.shape
+    left, bottom = (-columns // 2 + columns % 2 - 0.5) / columns, (-rows // 2 + rows % 2 - 0.5) / rows
+    return left, left + 1, bottom, bottom + 1
+
+
+def one_mask(aperture: Aperture) -> np.ndarray:
+    """Centres (N, 2) of an aperture [m]; ValueError for a population."""
+    centers = aperture.centers.numpy(force=True)
+    if centers.ndim != 2:
+        raise ValueError(f"centers has shape {centers.shape}: one mask, (n_subapertures, 2), is drawn at a time")
+    return centers
+
+
+def reach(aperture: Aperture) -> float:
+    """Distance of the outermost edge from the origin, at most [m]."""
+    edge = aperture.subaperture_diameter / (2 if aperture.shape == "disc" else math.sqrt(3))
+    return float(np.linalg.norm(one_mask(aperture), axis=-1).max()) + edge
+
+
+def hole(aperture: Aperture, center: Iterable[float], scale: float, **style: Any) -> Patch:
+    """One sub-aperture, `scale` times as large, around `center` (x, y), already scaled."""
+    from matplotlib.patches import Circle, RegularPolygon
+
+    x, y = center
+    radius = scale * aperture.subaperture_diameter / 2
+    if aperture.shape == "disc":
+        return Circle((x, y), radius, **style)
+    # matplotlib turns a hexagon that has a corner on +y: its sides face the same way as ours for equal angles
+    return RegularPolygon((x, y), 6, radius=radius * 2 / math.sqrt(3), orientation=aperture.orientation, **style)
+
+
+def plane_axes(ax: Axes, half: float, x_label: str, y_label: str) -> None:
+    """A square plane around the origin, y upwards, with the same ticks on both axes."""
+    ax.set(xlim=(-half, half), ylim=(-half, half), aspect="equal", xlabel=x_label, ylabel=y_label)
+    ax.set_yticks(ax.get_xticks())
+    ax.set(xlim=(-half, half), ylim=(-half, half))
+
+
+def image_axes(ax: Axes, title: str, x_label: str, y_label: str) -> None:
+    """Title and labels of an image; without a label on y (a neighbour has it) there are no tick labels either."""
+    ax.set(title=title, xlabel=x_label, ylabel=y_label)
+    ax.locator_params(nbins=5)
+    ax.tick_params(labelleft=bool(y_label))
+
+
+def second_scale(ax: Axes, factor: float, label: str) -> None:
+    """A second horizontal axis on top: `factor` times the first."""
+    top = ax.secondary_xaxis("top", functions=(lambda x: np.multiply(x, factor), lambda x: np.divide(x, factor)))
+    top.set_xlabel(label)
+
+
+def colorbar(figure: Figure, axes: list[Axes], label: str = "", **options: Any) -> None:
+    """A slim bar to the right of `axes` for the colours of their images, which share one scale."""
+    bar = figure.colorbar(axes[0].images[0], ax=axes, shrink=0.9, pad=0.015, aspect=28, label=label, **options)
+    bar.outline.set_visible(False)  # type: ignore[operator]
+
+
+def scale_bar(ax: Axes, columns: int, pixel_scale: float) -> None:
+    """A white bar with its angle, about a quarter of the image wide, in the lower left corner."""
+    unit, scale = angle_unit(pixel_scale * columns / 4)
+    angle = round_below(pixel_scale * columns / 3 * scale)
+    length = angle / scale / pixel_scale / columns
+    ax.plot([0.05, 0.05 + length], [0.06, 0.06], transform=ax.transAxes, color="white", linewidth=2)
+    ax.text(0.05, 0.085, f"{angle:g} {unit}", transform=ax.transAxes, color="white", fontsize=8.5)
+
+
+def radial_mean(plane: np.ndarray) -> np.ndarray:
+    """Mean of a Fourier plane in FFT order over rings one frequency step wide, from 0 to 1/2 cycles/pixel."""
+    rows, columns = plane.shape
+    nu = np.hypot(np.fft.fftfreq(rows)[:, None], np.fft.fftfreq(columns))
+    ring = np.rint(nu * min(plane.shape)).astype(int).ravel()
+    mean = np.bincount(ring, plane.ravel()) / np.maximum(np.bincount(ring), 1)
+    return mean[: min(plane.shape) // 2 + 1]

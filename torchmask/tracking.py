@@ -1,0 +1,324 @@
+"""The log of a run: TensorBoard events, and the same in plain files that outlive it.
+
+A run folder holds
+
+    events.out.tfevents...   scalars, images, figures, text and hyperparameters for TensorBoard
+    metrics.jsonl            one JSON object per line: stage, step, n_steps, seconds, scalars
+    config.json              what was asked for
+    environment.json         command, seed, versions
+    status.json              running, finished, interrupted or failed
+    checkpoints/STAGE.npz    the last state of each stage
+    NAME.png                 figures
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import platform
+import re
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from torchmask.io import as_array, atomic_write, save_npz, to_json, write_json
+from torchmask.record import Callback, Record
+from torchmask.viz import stretch
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_IMAGES_PER_STAGE = 8  # of each array, and the last: TensorBoard shows 10 of a tag
+_SMALLEST_IMAGE = 16  # pixels on a side; smaller arrays are tables of numbers
+_CHECKPOINT_INTERVAL = 5.0  # s
+_FLUSH_INTERVAL = 10  # s, of TensorBoard's events
+_PACKAGES = ("torchmask", "torch", "numpy", "scipy", "cma", "scikit-image", "kornia", "astropy", "trimesh")
+
+
+def fan_out(*callbacks: Callback) -> Callback:
+    """One callback that hands each record to several, such as a `RunLogger` and a `Progress`."""
+
+    def call_all(record: Record) -> None:
+        for callback in callbacks:
+            callback(record)
+
+    return call_all
+
+
+def free_name(directory: str | Path) -> Path:
+    """`directory` if nothing is there yet, or else the first of directory-2, directory-3, ... that is free."""
+    path = candidate = Path(directory)
+    number = 1
+    while candidate.exists():
+        number += 1
+        candidate = path.with_name(f"{path.name}-{number}")
+    return candidate
+
+
+class RunLogger:
+    """Log a run to a folder of its own; a callback for every algorithm of torchmask, and for any training loop.
+
+    Used as a context manager, it closes the log properly whatever happens, and writes how the run ended.
+
+    Parameters
+    ----------
+    directory : str or Path
+        The run folder, which must not exist yet.
+    seed : int, optional
+        Written beside the versions.
+
+    Raises
+    ------
+    ValueError
+        If `directory` exists (the message names a free one) or cannot be made.
+
+    Notes
+    -----
+    `logger(record)` writes the scalars of a `Record` at every step. Two-dimensional arrays of at least 16 x 16 among
+    its arrays become images up to 8 times in a stage and at its end, and all of its arrays a checkpoint every
+    5 seconds and at the end. `writer` is the SummaryWriter, for whatever else TensorBoard can show.
+
+    Examples
+    --------
+    >>> import tempfile, torch
+    >>> x = torch.ones(3, requires_grad=True)
+    >>> optimizer = torch.optim.SGD([x], lr=0.1)
+    >>> with RunLogger(tempfile.mkdtemp() + "/mine", seed=0) as log:
+    ...     for step in range(5):
+    ...         loss = (x**2).sum()
+    ...         optimizer.zero_grad(); loss.backward(); optimizer.step()
+    ...         log(Record("fit", step + 1, 5, {"loss": loss.item()}, {"x": x.detach()}))
+    """
+
+    def __init__(self, directory: str | Path, *, seed: int | None = None) -> None:
+        from torch.utils.tensorboard import SummaryWriter  # before the folder is made: it may not be installed
+
+        self.directory = _claim(Path(directory))
+        self._start = time.monotonic()
+        self._charts: dict[str, dict[str, list[str]]] = {}  # category -> title -> tags
+        self._charted: set[tuple[str, str]] = set()
+        self._last: dict[str, Record] = {}
+        self._unsaved: set[str] = set()
+        self._last_checkpoint = self._start
+        self._image_steps: dict[str, int] = {}
+        self._session_end: Any = None
+        self._closed = False
+        self.writer = SummaryWriter(str(self.directory), flush_secs=_FLUSH_INTERVAL)
+        self._metrics = open(self.directory / "metrics.jsonl", "x", encoding="utf-8", buffering=1)  # noqa: SIM115
+        self._write_status("running")
+        environment = _environment(seed)
+        write_json(self.directory / "environment.json", environment)
+        self.text("run/environment", _code_block(environment))
+
+    def __call__(self, record: Record) -> None:
+        """Log one step of an algorithm."""
+        self._write_scalars(record.stage, record.step, record.scalars, n_steps=record.n_steps)
+        if not record.arrays:
+            return
+        arrays = {name: values.detach().clone() for name, values in record.arrays.items()}  # the algorithm goes on
+        self._last[record.stage] = Record(record.stage, record.step, record.n_steps, record.scalars, arrays)
+        self._unsaved.add(record.stage)
+        self._log_images(self._last[record.stage], every=math.ceil(record.n_steps / _IMAGES_PER_STAGE))
+        if time.monotonic() - self._last_checkpoint >= _CHECKPOINT_INTERVAL:
+            self._checkpoint()
+
+    def log_config(self, config: Any) -> None:
+        """Write a dataclass or mapping to config.json, as text, and as the hyperparameters of TensorBoard's HPARAMS.
+
+        There the run stands with all its scalars, those of an interrupted run too. Once per run. Raises TypeError
+        for values that JSON cannot hold, and ValueError at the second call; then nothing is written.
+        """
+        from torch.utils.tensorboard.summary import hparams
+
+        values = to_json(config)
+        write_json(self.directory / "config.json", values)
+        self.text("run/config", _code_block(values))
+        # SummaryWriter.add_hparams would write a second run, and a list of hyperparameters and metrics that hides those
+        # of all later runs. Without that list TensorBoard gathers the hyperparameters and scalars of every run.
+        _, start, self._session_end = hparams(_flatten(values), {})
+        self.writer._get_file_writer().add_summary(start)
+
+    def scalar(self, tag: str, value: float, step: int = 0) -> None:
+        """Log one number under "group/name", such as a final score."""
+        stage, _, name = tag.rpartition("/")
+        self._write_scalars(stage or "scalars", step, {name: value})
+
+    def image(self, tag: str, image: Any, step: int = 0) -> None:
+        """Log an image (H, W), stretched by `viz.stretch`. Raises ValueError for another shape."""
+        values = as_array(image)
+        if values.ndim != 2:
+            raise ValueError(f"image {tag} has shape {values.shape}: it must be (rows, columns)")
+        self.writer.add_image(tag, (255 * stretch(values) + 0.5).astype(np.uint8), step, dataformats="HW")
+
+    def figure(self, name: str, figure: Figure, step: int = 0) -> None:
+        """Log a figure, and write it to NAME.png in the run folder; a later one of that name replaces it."""
+        import matplotlib.image
+
+        picture = io.BytesIO()
+        figure.savefig(picture, format="png", dpi=160)
+        with atomic_write(self.directory / f"{_file_name(name)}.png", replace=True) as file:
+            file.write(picture.getvalue())
+        picture.seek(0)
+        pixels = matplotlib.image.imread(picture)[..., :3]
+        self.writer.add_image(f"figures/{name}", (255 * pixels + 0.5).astype(np.uint8), step, dataformats="HWC")
+
+    def text(self, tag: str, markdown: str, step: int = 0) -> None:
+        """Log a text, formatted as Markdown."""
+        self.writer.add_text(tag, markdown, step)
+
+    def table(self, tag: str, rows: Sequence[Mapping[str, Any]], step: int = 0) -> None:
+        """Log rows, whose keys are the columns, as a table. Raises ValueError for none or for rows of other columns."""
+        columns = list(rows[0]) if rows else []
+        if not columns or any(list(row) != columns for row in rows):
+            raise ValueError(f"table {tag} needs rows that all have the same columns; the first has {columns}")
+        lines = [columns, ["---"] * len(columns), *([_cell(value) for value in row.values()] for row in rows)]
+        self.text(tag, "\n".join(f"| {' | '.join(line)} |" for line in lines), step)
+
+    def close(self, status: str = "finished", error: str | None = None) -> None:
+        """Write the last states and images, and how the run ended. A second call does nothing."""
+        if self._closed:
+            return
+        self._closed = True
+        try:
+            for record in self._last.values():
+                self._log_images(record, every=1)
+            self._checkpoint()
+            if status == "finished" and self._session_end is not None:
+                self.writer._get_file_writer().add_summary(self._session_end)
+        finally:
+            self._metrics.close()
+            self.writer.close()
+            self._write_status(status, error)
+
+    def __enter__(self) -> RunLogger:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is None:
+            self.close()
+        elif isinstance(error, KeyboardInterrupt):
+            self.close("interrupted")
+        else:
+            self.close("failed", f"{type(error).__name__}: {error}")
+
+    def _write_scalars(self, stage: str, step: int, scalars: Mapping[str, float], **more: int) -> None:
+        values = {name: float(as_array(value)) for name, value in scalars.items()}
+        seconds = round(time.monotonic() - self._start, 3)
+        row = to_json({"stage": stage, "step": step, **more, "seconds": seconds, "scalars": values})
+        self._metrics.write(json.dumps(row, allow_nan=False) + "\n")  # line-buffered: on disk at once
+        for name, value in values.items():
+            self.writer.add_scalar(f"{stage}/{name}", value, step)
+        self._add_charts(stage, values)
+
+    def _add_charts(self, stage: str, names: Mapping[str, float]) -> None:
+        """Group the curves: a category per kind of stage, in it a chart per scalar with that of all its stages."""
+        new = [name for name in names if (stage, name) not in self._charted]
+        for name in new:
+            self._charted.add((stage, name))
+            self._charts.setdefault(stage.split("/")[0], {}).setdefault(name, []).append(f"{stage}/{name}")
+        if new:  # TensorBoard shows the last layout of a run
+            self.writer.add_custom_scalars(
+                {
+                    title: {
+                        name: ["Multiline", [f"^{re.escape(tag)}$" for tag in tags]] for name, tags in charts.items()
+                    }
+                    for title, charts in self._charts.items()
+                }
+            )
+
+    def _log_images(self, record: Record, every: int) -> None:
+        for name, values in record.arrays.items():
+            if values.ndim != 2 or min(values.shape) < _SMALLEST_IMAGE or values.is_complex():
+                continue
+            tag = f"{record.stage}/{name}"
+            if tag not in self._image_steps or record.step - self._image_steps[tag] >= every:
+                self._image_steps[tag] = record.step
+                self.image(tag, values, record.step)
+
+    def _checkpoint(self) -> None:
+        for stage in sorted(self._unsaved):
+            record = self._last[stage]
+            folder = self.directory / "checkpoints"
+            folder.mkdir(exist_ok=True)
+            save_npz(folder / f"{_file_name(stage)}.npz", {**record.arrays, "step": record.step}, replace=True)
+        self._unsaved.clear()
+        self._last_checkpoint = time.monotonic()
+
+    def _write_status(self, status: str, error: str | None = None) -> None:
+        seconds = round(time.monotonic() - self._start, 3)
+        state = {"status": status, "seconds": seconds, "error": error}
+        write_json(self.directory / "status.json", state, replace=True)
+
+
+def read_metrics(directory: str | Path) -> list[dict[str, Any]]:
+    """The rows of a run's metrics.jsonl; a last line that a killed run left unfinished is dropped.
+
+    Raises ValueError if the file is missing, or another line is damaged.
+    """
+    path = Path(directory) / "metrics.jsonl"
+    if not path.is_file():
+        raise ValueError(f"there is no file {path}: {directory} is no run folder")
+    *lines, rest = path.read_text(encoding="utf-8").split("\n")
+    del rest  # empty, or cut off before its end
+    try:
+        return [json.loads(line) for line in lines]
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+
+
+def _claim(directory: Path) -> Path:
+    try:
+        directory.mkdir(parents=True)
+    except FileExistsError:
+        free = free_name(directory)
+        raise ValueError(f"{directory} exists and is not overwritten: choose another, such as {free}") from None
+    except OSError as error:
+        raise ValueError(f"{directory} cannot be made: {error}") from error
+    return directory
+
+
+def _environment(seed: int | None) -> dict[str, Any]:
+    versions = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            versions[package] = "not installed"
+    return {
+        "command": sys.argv,
+        "seed": seed,
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "platform": platform.platform(),
+        "versions": versions,
+    }
+
+
+def _flatten(value: Any, prefix: str = "") -> dict[str, float | str]:
+    """Leaves of nested mappings under dotted names, as hyperparameters know them: numbers and text."""
+    if isinstance(value, dict):
+        return {name: leaf for key, item in value.items() for name, leaf in _flatten(item, f"{prefix}{key}.").items()}
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
+        value = json.dumps(value)
+    return {prefix.rstrip(".") or "config": value}
+
+
+def _code_block(value: Any) -> str:
+    return f"```json\n{json.dumps(value, indent=2)}\n```"
+
+
+def _cell(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _file_name(name: str) -> str:
+    return re.sub(r"[^\w.+-]+", "_", name)

@@ -1,0 +1,283 @@
+"""Figures: masks, frequency coverage, transfer functions, images and curves.
+
+Every function returns a matplotlib Figure that belongs to no pyplot state, so it works without a display and leaves
+nothing open. Images keep the order of their array, row 0 at the top; planes of the pupil and of frequencies have y
+upwards, as drawings of masks do. PSFs and OTFs come in FFT order: only this module moves their origin to the middle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from torchmask import _drawing as drawing
+from torchmask.grid import Grid
+from torchmask.io import as_array
+from torchmask.metrics import align, lowpass, score
+from torchmask.optics.aperture import Aperture
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def stretch(image: Any, percentile: float = 99.5, gamma: float = 0.5) -> np.ndarray:
+    """Map an image to [0, 1] for display: 0 stays 0, `percentile` becomes 1, the power `gamma` lifts the faint parts.
+
+    Values below 0 and NaN are shown as 0. An image that is nowhere positive becomes 0 everywhere.
+
+    Examples
+    --------
+    >>> stretch([[-1.0, 0.0], [1.0, 4.0]], percentile=100).tolist()
+    [[0.0, 0.0], [0.5, 1.0]]
+    """
+    values = as_array(image).astype(float)
+    values = np.where(values > 0, values, 0.0)
+    peak = _peak(values, percentile)
+    return (np.minimum(values, peak) / peak) ** gamma if peak > 0 else values
+
+
+def _peak(values: np.ndarray, percentile: float = 99.5) -> float:
+    """The value shown as white: `percentile`, or the largest where fewer pixels than that shine."""
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return 0.0
+    peak = float(np.percentile(finite, percentile))
+    return peak if peak > 0 else float(finite.max())
+
+
+def _on_grid(name: str, values: Any, grid: Grid) -> np.ndarray:
+    """Arrays (..., H, W) of a grid, with leading axes flattened to one."""
+    array = as_array(values)
+    if array.shape[-2:] != grid.shape or 0 in array.shape:
+        raise ValueError(f"{name} has shape {array.shape}: it must end in that of the grid, {grid.shape}")
+    return array.reshape(-1, *grid.shape)
+
+
+@drawing.styled
+def mask_figure(aperture: Aperture, title: str | None = None) -> Figure:
+    """The holes of one aperture, to scale, inside the disc they are cut from. Axes in metres (or mm).
+
+    Raises ValueError for a population of masks.
+    """
+    from matplotlib.patches import Circle
+
+    centers, unit, scale = drawing.one_mask(aperture), *drawing.length_unit(aperture.mask_diameter)
+    figure = drawing.new_figure(4.0, 4.1)
+    ax = figure.subplots()
+    radius = aperture.mask_diameter / 2 * scale
+    ax.add_patch(Circle((0, 0), radius, facecolor=drawing.PALE, edgecolor=drawing.FAINT, linewidth=0.8))
+    for center in centers * scale:
+        ax.add_patch(drawing.hole(aperture, center, scale, facecolor=drawing.COLORS[0], edgecolor="none"))
+        if aperture.central_obstruction > 0:
+            ax.add_patch(Circle(tuple(center), radius * aperture.central_obstruction, facecolor=drawing.PALE))
+    drawing.plane_axes(ax, 1.06 * max(radius, drawing.reach(aperture) * scale), f"x [{unit}]", f"y [{unit}]")
+    what = "disc" if aperture.shape == "disc" else "hexagon"
+    size = f"{aperture.subaperture_diameter * scale:.3g} {unit}"
+    n = aperture.n_subapertures
+    ax.set_title(title or (f"{n} {what}s of {size}" if n > 1 else f"{what} of {size}"))
+    return figure
+
+
+@drawing.styled
+def uv_coverage_figure(aperture: Aperture, grid: Grid | None = None, title: str | None = None) -> Figure:
+    """The spatial frequencies an aperture transmits: one disc (or hexagon) around the baseline of each pair of holes.
+
+    Darker where pairs overlap. Axes are baselines in metres; with a `grid` also frequencies in cycles/pixel, and the
+    square that the grid samples, beyond which frequencies wrap around. Raises ValueError for a population of masks.
+    """
+    from matplotlib.patches import Circle, Rectangle
+
+    centers, unit, scale = drawing.one_mask(aperture), *drawing.length_unit(aperture.mask_diameter)
+    baselines = (centers[:, None] - centers[None]).reshape(-1, 2)
+    pairs = baselines[~np.eye(len(centers), dtype=bool).ravel()]
+    figure = drawing.new_figure(4.6, 4.9)
+    ax = figure.subplots()
+    for baseline in np.concatenate([np.zeros((1, 2)), pairs]) * scale:
+        ax.add_patch(
+            drawing.hole(aperture, baseline, 2 * scale, facecolor=drawing.COLORS[0], edgecolor="none", alpha=0.35)
+        )
+    ax.plot(*(pairs.T * scale), ".", color=drawing.INK, markersize=2.5, linestyle="none")
+    reach = aperture.mask_diameter * scale
+    ax.add_patch(
+        Circle((0, 0), reach, fill=False, color=drawing.FAINT, linewidth=0.9, label="cut-off of the whole disc")
+    )
+    half = max(reach, 2 * drawing.reach(aperture) * scale)
+    if grid is not None:
+        nyquist = grid.period / 2 * scale
+        half = max(half, nyquist)
+        square = Rectangle((-nyquist, -nyquist), 2 * nyquist, 2 * nyquist, fill=False, color=drawing.COLORS[1])
+        square.set(linestyle="--", linewidth=0.9, label="sampled by the grid")
+        ax.add_patch(square)
+        drawing.second_scale(ax, 1 / (grid.period * scale), "frequency [cycles/pixel]")
+    drawing.plane_axes(ax, 1.06 * half, f"baseline x [{unit}]", f"baseline y [{unit}]")
+    figure.legend(loc="outside lower center", ncols=2)
+    ax.set_title(title or (f"{len(pairs) // 2} baselines" if len(pairs) else "a single aperture"))
+    return figure
+
+
+@drawing.styled
+def mtf_figure(otfs: Mapping[str, Any], grid: Grid) -> Figure:
+    """Modulation transfer functions: each in two dimensions, and the radial means of all.
+
+    Parameters
+    ----------
+    otfs : mapping of name to (..., H, W) tensor or array
+        Optical transfer functions in FFT order. Of several frames the mean modulus is shown, and the band between the
+        10th and the 90th percentile of the frames' radial means.
+    grid : Grid
+
+    Raises
+    ------
+    ValueError
+        If an OTF does not have the shape of the grid, or there is none.
+    """
+    from matplotlib.colors import PowerNorm
+
+    moduli = {name: np.abs(_on_grid(name, values, grid)) for name, values in drawing.not_empty(otfs).items()}
+    figure, axes = drawing.row_of_axes([1.0] * len(moduli) + [1.35], height=2.9)
+    for ax, (name, modulus) in zip(axes, moduli.items(), strict=False):
+        mean = np.fft.fftshift(modulus.mean(0))
+        ax.imshow(mean, cmap="magma", norm=PowerNorm(0.5, 0, 1), origin="lower", extent=drawing.frequency_extent(grid))
+        drawing.image_axes(
+            ax, f"{name}: MTF", r"$\nu_x$ [cycles/pixel]", r"$\nu_y$ [cycles/pixel]" if ax is axes[0] else ""
+        )
+    drawing.colorbar(figure, axes[:-1], ticks=[0, 0.01, 0.05, 0.2, 0.5, 1], format="%g")
+    ax = axes[-1]
+    for color, (name, modulus) in zip(drawing.colors(), moduli.items(), strict=False):
+        profiles = np.stack([drawing.radial_mean(frame) for frame in modulus])
+        frequency = np.arange(profiles.shape[1]) / min(grid.shape)
+        ax.plot(frequency, profiles.mean(0), color=color, label=name)
+        if len(profiles) > 1:
+            ax.fill_between(frequency, *np.percentile(profiles, [10, 90], axis=0), color=color, alpha=0.2, linewidth=0)
+    ax.set(xlim=(0, 0.5), ylim=(1e-3, 1.05), yscale="log", xlabel="frequency [cycles/pixel]", title="radial mean")
+    unit, scale = drawing.length_unit(grid.period / 2)
+    drawing.second_scale(ax, grid.period * scale, f"baseline [{unit}]")
+    ax.legend()
+    return figure
+
+
+@drawing.styled
+def psf_figure(psfs: Mapping[str, Any], grid: Grid) -> Figure:
+    """Point-spread functions (H, W), given in FFT order, each as a fraction of its peak, on four decades.
+
+    Raises ValueError if one does not have the shape of the grid, or there is none.
+    """
+    from matplotlib.colors import LogNorm
+
+    figure, axes = drawing.row_of_axes([1.0] * len(drawing.not_empty(psfs)), height=3.1)
+    unit, extent = drawing.sky_extent(grid.shape, grid.pixel_scale, centred=True)
+    for ax, (name, values) in zip(axes, psfs.items(), strict=True):
+        psf = np.fft.fftshift(_on_grid(name, values, grid).mean(0))
+        ax.imshow(np.maximum(psf / psf.max(), 1e-4), cmap="magma", norm=LogNorm(1e-4, 1), extent=extent)
+        drawing.image_axes(ax, name, f"x [{unit}]", f"y [{unit}]" if ax is axes[0] else "")
+    drawing.colorbar(figure, axes, "fraction of the peak")
+    return figure
+
+
+@drawing.styled
+def frames_figure(frames: Any, count: int = 4, pixel_scale: float | None = None) -> Figure:
+    """The first `count` of a stack (T, H, W) of exposures and the mean of all, on one scale [electrons per pixel].
+
+    `pixel_scale` [rad] labels the axes with angles instead of pixels. Raises ValueError for another shape.
+    """
+    from matplotlib.colors import PowerNorm
+
+    stack = as_array(frames).astype(float)
+    if stack.ndim != 3 or 0 in stack.shape:
+        raise ValueError(f"frames have shape {stack.shape}: a stack (frames, rows, columns) is needed")
+    images = {f"frame {k + 1}": frame for k, frame in enumerate(stack[:count])}
+    images[f"mean of {len(stack)}"] = stack.mean(0)
+    figure, axes = drawing.row_of_axes([1.0] * len(images), height=2.5)
+    unit, extent = drawing.sky_extent(stack.shape[1:], pixel_scale)
+    norm = PowerNorm(0.5, 0, _peak(stack[:count], 99.9) or 1, clip=True)
+    for ax, (name, values) in zip(axes, images.items(), strict=True):
+        ax.imshow(values, cmap="gray", norm=norm, extent=extent)
+        drawing.image_axes(ax, name, f"x [{unit}]", f"y [{unit}]" if ax is axes[0] else "")
+    drawing.colorbar(figure, axes, "electrons")
+    return figure
+
+
+@drawing.styled
+def history_figure(curves: Mapping[str, Sequence[float]], label: str, x_label: str = "iteration") -> Figure:
+    """What is being minimised against the iteration, one curve per stage or run; `label` names it.
+
+    The vertical axis is logarithmic where all values are positive and span more than a factor of 5. Values that are
+    not finite leave gaps. Raises ValueError if there is no curve.
+    """
+    from matplotlib.ticker import MaxNLocator
+
+    figure = drawing.new_figure(5.2, 3.2)
+    ax = figure.subplots()
+    series = {name: as_array(values).astype(float).ravel() for name, values in drawing.not_empty(curves).items()}
+    for color, (name, values) in zip(drawing.colors(), series.items(), strict=False):
+        shown = np.where(np.isfinite(values), values, np.nan)
+        ax.plot(np.arange(1, len(shown) + 1), shown, color=color, label=name)
+    finite = np.concatenate([values[np.isfinite(values)] for values in series.values()])
+    if finite.size and finite.min() > 0 and finite.max() > 5 * finite.min():
+        ax.set_yscale("log")
+    ax.set(xlabel=x_label, ylabel=label)
+    ax.grid(axis="y", color="#E4E4E4", linewidth=0.6)
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.margins(x=0.01)
+    ax.legend()
+    return figure
+
+
+@drawing.styled
+def comparison_figure(
+    truth: Any, results: Mapping[str, tuple[Any, Any]], cutoff: float, pixel_scale: float | None = None
+) -> Figure:
+    """The truth, its diffraction limit, and for each instrument one exposure and the restoration, with their scores.
+
+    Parameters
+    ----------
+    truth : (H, W) tensor or array
+    results : mapping of name to (frame (H, W), restoration (H, W))
+    cutoff : float
+        Of the scores and of the diffraction limit [cycles/pixel].
+    pixel_scale : float, optional
+        [rad]; adds a scale bar.
+
+    Notes
+    -----
+    All images share one grey scale, that of the diffraction-limited truth up to its 99.5th percentile, with a square
+    root to show faint parts. Restorations are registered and scaled as for their score (`torchmask.metrics.align`);
+    frames are as they came, with the flux of the truth. Errors as in `torchmask.metrics.score`.
+    """
+    images = _comparison_images(truth, drawing.not_empty(results), cutoff)
+    n = len(results)
+    if n == 1:
+        layout: list[Any] = [["truth", "limit", "frame 0", "restored 0"]]
+    else:
+        first = ["truth", "limit"] + ["."] * (n - 2)
+        layout = [[first[k], f"frame {k}", f"restored {k}"] for k in range(n)]
+    figure = drawing.new_figure(2.6 * len(layout[0]), 3.1 * len(layout))
+    peak = _peak(images["limit"][1])
+    for key, ax in figure.subplot_mosaic(layout).items():
+        title, image = images[key]
+        ax.imshow(np.clip(image / peak, 0, 1) ** 0.5, cmap="gray", vmin=0, vmax=1)
+        ax.set(title=title, xticks=[], yticks=[])
+        if key == "truth" and pixel_scale is not None:
+            drawing.scale_bar(ax, image.shape[1], pixel_scale)
+    return figure
+
+
+def _comparison_images(
+    truth: Any, results: Mapping[str, tuple[Any, Any]], cutoff: float
+) -> dict[str, tuple[str, np.ndarray]]:
+    reference = as_array(truth).astype(float)
+    limit = lowpass(reference, cutoff).numpy()
+    images = {"truth": ("truth", reference), "limit": ("truth at the diffraction limit", limit)}
+    for k, (name, (frame, restored)) in enumerate(results.items()):
+        raw = as_array(frame).astype(float)
+        images[f"frame {k}"] = (
+            f"{name}, one exposure\nscore {score(raw, reference, cutoff):.3f}",
+            raw * (reference.sum() / raw.sum()),
+        )
+        images[f"restored {k}"] = (
+            f"{name}, restored\nscore {score(restored, reference, cutoff):.3f}",
+            align(restored, reference, cutoff).numpy(),
+        )
+    return images
