@@ -69,10 +69,11 @@ class Aperture(nn.Module):
         """
         centers = self.centers.detach()
         separation = torch.linalg.vector_norm(centers[..., :, None, :] - centers[..., None, :, :], dim=-1)
-        return float(separation.max()) + self._outer_diameter
+        return float(separation.max()) + self.outer_diameter
 
     @property
-    def _outer_diameter(self) -> float:
+    def outer_diameter(self) -> float:
+        """Diameter of the circle around one sub-aperture [m]: that of a disc, corner to corner for a hexagon."""
         return self.subaperture_diameter * (1.0 if self.shape == "disc" else 2 / math.sqrt(3))
 
     def samples(self, grid: Grid, oversampling: int = 1) -> PupilSamples:
@@ -100,7 +101,7 @@ class Aperture(nn.Module):
             )
         centers = self.centers
         spacing = centers.new_tensor([step[1], step[0]])
-        half = [math.ceil(self._outer_diameter / (2 * s)) + 1 for s in (step[1], step[0])]
+        half = [math.ceil(self.outer_diameter / (2 * s)) + 1 for s in (step[1], step[0])]
         patch = torch.cartesian_prod(
             *(torch.arange(-h, h + 1, device=centers.device) for h in half)
         )  # (P, 2) whole samples, (x, y)

@@ -8,6 +8,7 @@ orthonormal over that area, in Noll order (Mahajan & Dai, J. Opt. Soc. Am. A 24,
 from __future__ import annotations
 
 import math
+from numbers import Integral
 
 import numpy as np
 import torch
@@ -15,6 +16,8 @@ from torch import Tensor, nn
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture, PupilSamples
+
+_INDEPENDENT = 1e-9  # rms of a mode, of unit rms over the disc, that the modes before it do not explain
 
 
 def noll(j: int) -> tuple[int, int]:
@@ -91,24 +94,28 @@ def quadrature(aperture: Aperture, degree: int) -> tuple[Tensor, Tensor]:
         angle = 2 * math.pi / (degree + 1) * np.arange(degree + 1)
         points = radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         weight = np.broadcast_to(weights[:, None] / (degree + 1), points.shape[:-1])
-    return torch.from_numpy(points.reshape(-1, 2) * outer_radius(aperture)), torch.from_numpy(weight.reshape(-1).copy())
-
-
-def outer_radius(aperture: Aperture) -> float:
-    """Radius of the circle around one sub-aperture [m], the unit of length of its modes."""
-    return aperture.subaperture_diameter / (2.0 if aperture.shape == "disc" else math.sqrt(3))
+    points = points.reshape(-1, 2) * (aperture.outer_diameter / 2)
+    return torch.from_numpy(points), torch.from_numpy(weight.reshape(-1).copy())
 
 
 def aperture_modes(aperture: Aperture, points: Tensor, n_modes: int) -> Tensor:
-    """The first `n_modes` modes of a sub-aperture at `points` (..., 2) [m] from its centre: (..., J), unit rms."""
-    modes = zernike(points / outer_radius(aperture), n_modes)
+    """Modes of one sub-aperture at `points` (..., 2) [m] from its centre: (..., J), unit rms over its open area.
+
+    Raises ValueError if `n_modes` is not a whole number of at least 1, or a ring is too thin to tell so many apart.
+    """
+    radius = aperture.outer_diameter / 2
+    modes = zernike(points / radius, n_modes)
     if aperture.shape == "disc" and aperture.central_obstruction == 0:
         return modes
     nodes, weights = quadrature(aperture, 2 * noll(n_modes)[0])
-    sampled = weights.sqrt()[:, None] * zernike(nodes / outer_radius(aperture), n_modes)
-    triangle = torch.linalg.qr(sampled).R
-    triangle = triangle * triangle.diagonal().sign()[:, None]
-    combine = torch.linalg.inv(triangle)
+    triangle = torch.linalg.qr(weights.sqrt()[:, None] * zernike(nodes / radius, n_modes)).R
+    diagonal = triangle.diagonal()
+    if float(diagonal.abs().min()) < _INDEPENDENT:
+        raise ValueError(
+            f"{n_modes} modes are not independent on a ring with central_obstruction "
+            f"{aperture.central_obstruction:.4g}: fewer modes are needed"
+        )
+    combine = torch.linalg.inv(triangle * diagonal.sign()[:, None])
     return modes @ combine.to(modes)
 
 
@@ -186,5 +193,5 @@ class ZernikePhase(nn.Module):
 
 
 def _require_modes(n_modes: int) -> None:
-    if n_modes != int(n_modes) or n_modes < 1:
+    if not isinstance(n_modes, Integral) or n_modes < 1:
         raise ValueError(f"mode number or count is {n_modes}: it must be a whole number of at least 1 (1 is piston)")
