@@ -197,7 +197,12 @@ def log_design(design: SearchResult, grid: Grid, logger: RunLogger) -> None:
     """The mask, the frequencies it passes, and how the search went."""
     logger.figure("design/mask", viz.mask_figure(design.aperture))
     logger.figure("design/uv_coverage", viz.uv_coverage_figure(design.aperture, grid))
-    logger.figure("design/history", viz.history_figure(design.history, "relative MSE", "report"))
+    logger.figure(
+        "design/history",
+        viz.history_figure(
+            {stage: best[:, 1].tolist() for stage, best in design.history.items()}, "relative MSE", "report"
+        ),
+    )
     logger.scalar("design/relative_mse", design.relative_mse)
 
 
@@ -235,7 +240,7 @@ def metrics(observation: Observation, result: RestorationResult, cutoff: float) 
     }
 
 
-def run(config: Config, logger: RunLogger, callback: Callback) -> dict[str, dict[str, float]]:
+def run(config: Config, scene: torch.Tensor, logger: RunLogger, callback: Callback) -> dict[str, dict[str, float]]:
     """Design, observe, restore and compare; returns the metrics of each instrument."""
     design = design_mask(config, callback)
     log_design(design, image_grid(config), logger)
@@ -249,7 +254,6 @@ def run(config: Config, logger: RunLogger, callback: Callback) -> dict[str, dict
         "relative_mse": design.relative_mse,
     }
     pictures = {}
-    scene = make_scene(image_grid(config).shape, config.imaging.n_photons, config.scene)
     for name, aperture in (("mask", mask), ("full", full)):
         light = scene * (aperture.area / mask.area)
         observation = observe(config, light, aperture, under(f"observation/{name}", callback))
@@ -284,9 +288,10 @@ def main(config: Config) -> int:
     directory = config.runs / (config.name or datetime.now().strftime("codesign-%Y%m%d-%H%M%S"))
     config = with_presets(config)
     try:
+        scene = make_scene(image_grid(config).shape, config.imaging.n_photons, config.scene)
         with RunLogger(directory, seed=config.seed) as logger, Progress() as progress:
             logger.log_config(config)
-            table = run(config, logger, fan_out(logger, progress))
+            table = run(config, scene, logger, fan_out(logger, progress))
     except KeyboardInterrupt:
         print(f"\ninterrupted: what was reached is in {directory}", file=sys.stderr)
         return 130

@@ -1,0 +1,128 @@
+"""The whole loop, tiny: that every part reaches the run folder, and that nothing is lost or overwritten."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import codesign
+import numpy as np
+import pytest
+
+from torchmask.io import load_npz
+from torchmask.record import Record
+from torchmask.simulation.scene import SceneOptions
+from torchmask.tracking import RunLogger, read_metrics
+
+FIGURES = [
+    "comparison.png",
+    "design_history.png",
+    "design_mask.png",
+    "design_uv_coverage.png",
+    *(f"observation_{name}_{what}.png" for name in ("full", "mask") for what in ("frames", "mtf", "psf")),
+    "restoration_full_cost.png",
+    "restoration_mask_cost.png",
+]
+
+
+def tiny(runs: Path, name: str, **changes):
+    return codesign.Config(smoke=True, runs=runs, name=name, **changes)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    runs = tmp_path_factory.mktemp("runs")
+    assert codesign.main(tiny(runs, "first")) == 0
+    return runs / "first"
+
+
+def test_every_result_is_in_the_folder(finished):
+    assert sorted(path.name for path in finished.glob("*.png")) == sorted(FIGURES)
+    assert json.loads((finished / "status.json").read_text())["status"] == "finished"
+    assert json.loads((finished / "config.json").read_text())["design"]["n_subapertures"] == 5
+    result = load_npz(finished / "result.npz")
+    assert result["centers"].shape == (5, 2)
+    for name in ("mask", "full"):
+        assert result[f"{name}_frames"].shape == (3, 64, 64)
+        assert result[f"{name}_object"].min() >= 0
+    stages = {row["stage"] for row in read_metrics(finished)}
+    assert {"design/cma", "design/refine", "restoration/mask", "restoration/full", "comparison"} <= stages
+
+
+def test_tensorboard_finds_scalars_and_images(finished):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(finished), size_guidance={"images": 0, "scalars": 0})
+    events.Reload()
+    tags = events.Tags()
+    assert {"restoration/mask/cost", "restoration/full/cost", "comparison/mask_score"} <= set(tags["scalars"])
+    images = {"restoration/mask/object", "figures/design/mask", "figures/design/uv_coverage", "figures/comparison"}
+    assert images | {"observation/mask/first_frame", "figures/observation/full/mtf"} <= set(tags["images"])
+
+
+def test_the_full_pupil_gets_photons_by_its_area_and_reaches_as_far(finished):
+    result = load_npz(finished / "result.npz")
+    rows = {row["stage"] + "/" + key: value for row in read_metrics(finished) for key, value in row["scalars"].items()}
+    separation = np.linalg.norm(result["centers"][:, None] - result["centers"][None], axis=-1).max()
+    diameter = float(result["subaperture_diameter"])
+    expected = (separation + diameter) ** 2 / (5 * diameter**2)
+    ratio = rows["comparison/full_photons_per_frame"] / rows["comparison/mask_photons_per_frame"]
+    assert ratio == pytest.approx(expected, rel=1e-12)
+
+
+def test_same_seed_same_numbers_and_another_seed_others(finished, tmp_path):
+    assert codesign.main(tiny(tmp_path, "again")) == 0
+    assert codesign.main(tiny(tmp_path, "other", seed=1)) == 0
+    first, again, other = (load_npz(path / "result.npz") for path in (finished, tmp_path / "again", tmp_path / "other"))
+    for name in first:
+        np.testing.assert_array_equal(first[name], again[name])
+    for name in ("centers", "mask_frames", "mask_object"):
+        assert np.abs(first[name] - other[name]).max() > 0
+
+
+def test_an_existing_folder_is_never_touched(finished, capsys):
+    before = {path: path.stat().st_mtime_ns for path in finished.rglob("*")}
+    assert codesign.main(tiny(finished.parent, "first")) == 2
+    assert "first-2" in capsys.readouterr().err
+    assert {path: path.stat().st_mtime_ns for path in finished.rglob("*")} == before
+
+
+def test_a_missing_scene_is_one_line_before_any_work(tmp_path, capsys):
+    assert codesign.main(tiny(tmp_path, "no-scene", scene=SceneOptions(path=tmp_path / "none.obj"))) == 2
+    error = capsys.readouterr().err
+    assert "none.obj" in error
+    assert "Traceback" not in error
+    assert not (tmp_path / "no-scene").exists()
+
+
+def test_an_interrupted_restoration_leaves_what_it_reached(tmp_path, monkeypatch, capsys):
+    seen = []
+    original = RunLogger.__call__
+
+    def interrupting(self, record: Record):
+        original(self, record)
+        seen.append(record.stage)
+        if seen.count("restoration/mask") == 12:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(RunLogger, "__call__", interrupting)
+    assert codesign.main(tiny(tmp_path, "stopped")) == 130
+    assert "stopped" in capsys.readouterr().err
+    folder = tmp_path / "stopped"
+    assert json.loads((folder / "status.json").read_text())["status"] == "interrupted"
+    checkpoint = load_npz(folder / "checkpoints" / "restoration_mask.npz")
+    assert checkpoint["object"].shape == (64, 64)
+    assert np.isfinite(checkpoint["object"]).all()
+    assert len([row for row in read_metrics(folder) if row["stage"] == "restoration/mask"]) == 12
+    assert load_npz(folder / "checkpoints" / "design_refine.npz")["centers"].shape == (5, 2)
+
+
+def test_the_paper_preset_is_the_published_method():
+    config = codesign.with_presets(codesign.Config(preset="paper"))
+    assert (config.design.method, config.design.refine) == ("cma", False)
+    assert (config.restoration.n_modes, config.restoration.prior) == (3, False)
+    assert codesign.with_presets(codesign.Config()) == codesign.Config()
+
+
+def test_configurations_are_frozen():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        codesign.Config().seed = 3
