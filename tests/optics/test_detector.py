@@ -96,10 +96,10 @@ def test_read_noise_does_not_change_the_photons_drawn():
 
 
 def test_rounding_below_zero_is_forgiven_and_negative_light_is_not():
-    expected = torch.tensor([100.0, -1e-12], dtype=torch.float64)
+    expected = torch.tensor([100.0, -1e-13], dtype=torch.float64)
     assert bool((Detector()(expected, generator()) >= 0).all())
     with pytest.raises(ValueError, match="negative"):
-        Detector()(torch.tensor([100.0, -1e-3], dtype=torch.float64))
+        Detector()(torch.tensor([100.0, -1e-11], dtype=torch.float64))
     for bad in (math.nan, math.inf):
         with pytest.raises(ValueError, match="not finite"):
             Detector()(torch.tensor([1.0, bad]))

@@ -27,7 +27,8 @@ from torchmask.record import Callback, Record
 _OVERSAMPLING = 4  # of the pupil: the field of the PSFs beside that of the image
 _CHUNK = 2**21  # pixels of unfolded PSFs held at once
 
-_REQUIRED = ("frames", "centers", "subaperture_diameter", "mask_diameter", "pixel_scale", "wavelength", "readout_noise")
+_NEEDED_NUMBERS = ("subaperture_diameter", "mask_diameter", "pixel_scale", "wavelength", "readout_noise")
+_NUMBERS = (*_NEEDED_NUMBERS, "orientation", "central_obstruction", "r0", "outer_scale", "n_photons")
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +103,7 @@ class Observation:
         ValueError
             If the file is missing, damaged, holds pickled objects, lacks a key or holds arrays that disagree.
         """
-        stored = load_npz(path, required=_REQUIRED)
+        stored = load_npz(path, required=("frames", "centers", *_NEEDED_NUMBERS))
         try:
             return cls._from_arrays(stored)
         except (ValueError, TypeError) as error:
@@ -110,7 +111,7 @@ class Observation:
 
     @classmethod
     def _from_arrays(cls, stored: dict) -> Observation:
-        number = {name: float(value) for name, value in stored.items() if value.ndim == 0 and name != "shape"}
+        number = {name: float(stored[name].item()) for name in _NUMBERS if name in stored}
         centers, diameter = torch.from_numpy(stored["centers"]), number["subaperture_diameter"]
         shape, orientation = str(stored.get("shape", "disc")), number.get("orientation", 0.0)
         if len(centers) == 1 and not centers.any() and shape == "disc":
@@ -177,6 +178,7 @@ def simulate_observation(
     >>> observation.frames.shape
     torch.Size([4, 32, 32])
     """
+    scene = scene.detach()
     _check(scene, aperture, grid, n_frames)
     device = None if generator is None else generator.device
     screens_seed, noise_seed = torch.randint(2**62, (2,), generator=generator, device=device).tolist()
@@ -202,7 +204,7 @@ def simulate_observation(
         aperture=copy.deepcopy(aperture).requires_grad_(False),  # a mask that trains on does not change the past
         grid=grid,
         readout_noise=detector.readout_noise,
-        object=scene.detach(),
+        object=scene,
         psfs=torch.cat(psfs),
         r0=None if turbulence is None else float(turbulence.r0),
         outer_scale=None if turbulence is None else float(turbulence.outer_scale),
