@@ -77,6 +77,9 @@ def test_lowpass_keeps_the_rim_and_nothing_beyond():
     assert lowpass(wave, 0.499).abs().max() < 1e-12
     stack = torch.stack([wave, 2 * wave + 1]).requires_grad_()
     torch.testing.assert_close(lowpass(stack, 0.499)[1], torch.ones(n, n, dtype=torch.float64))
+    low = lowpass(stack.detach().float(), 0.499)
+    assert low.dtype == torch.float32
+    torch.testing.assert_close(low[1], torch.ones(n, n))
     assert torch.autograd.gradcheck(lambda image: lowpass(image, 0.3), (stack[:, :6, :7],))
 
 

@@ -127,6 +127,7 @@ def test_psf_and_otf_have_their_origin_in_the_middle():
         (shown,), left_bottom = images(figure), figure.axes[0].images[0].get_extent()
         row, column = np.unravel_index(shown.argmax(), shown.shape)
         assert shown.max() == pytest.approx(1)
+        assert figure.axes[0].images[0].origin == "lower"
         assert left_bottom[0] + (column + 0.5) / n == pytest.approx(0, abs=1e-12)
         assert left_bottom[2] + (row + 0.5) / n == pytest.approx(0, abs=1e-12)
 
@@ -281,9 +282,10 @@ def test_units():
 
 
 def test_the_callers_style_and_pyplot_are_left_alone(tmp_path):
-    before = dict(matplotlib.rcParams)
-    viz.mask_figure(mask())
-    assert dict(matplotlib.rcParams) == before
+    with matplotlib.rc_context({"font.size": 33.0, "axes.spines.top": True}):
+        before = dict(matplotlib.rcParams)
+        viz.mask_figure(mask())
+        assert dict(matplotlib.rcParams) == before
     code = (
         "import sys, torch, torchmask.viz as viz, torchmask.tracking, torchmask.metrics\n"
         "assert not {'matplotlib', 'tensorboard', 'skimage', 'rich', 'kornia'} & set(sys.modules)\n"
