@@ -44,9 +44,9 @@ def run_tasks(
     tasks : sequence of mappings
         Equal tasks are computed once.
     folder : path
-        Made if needed. One file per finished task, "<stage>-<digest>.json", each whole or absent.
+        Made if needed. One file per finished task, "<stage>-<digest>.json", whole or absent.
     stage : str
-        Names the kind of task, in the files' names and in the records.
+        The kind of task, such as "design/table/search"; names the files and the records.
     backend : {"loky", "ray"}
         Processes on this machine, or a Ray cluster: the one `ray.init` or RAY_ADDRESS says, or else a local one.
     n_workers : int, optional
@@ -81,7 +81,7 @@ def run_tasks(
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder} is a file: a sweep needs a folder")
     folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"{stage}-{_digest(task)}.json" for task in tasks]
+    paths = [folder / f"{stage.replace('/', '-')}-{_digest(task)}.json" for task in tasks]
     pending = dict(zip(paths, map(to_json, tasks), strict=True))
     results = {path: result for path, task in pending.items() if (result := _load(path, task)) is not None}
     n_tasks = len(pending)
@@ -148,13 +148,10 @@ def _compute(
     if not pending:
         return
     with _registered(backend) as cores:
-        parallel = joblib.Parallel(
-            n_jobs=min(n_workers or cores, len(pending)),
-            backend=backend,
-            batch_size=1,  # a batch would come back as a whole
-            pre_dispatch="n_jobs",
-            return_as="generator_unordered",
-        )
+        n_jobs = min(n_workers or cores, len(pending))
+        # one task at a time: a batch would come back as a whole
+        options: dict[str, Any] = {"batch_size": 1, "pre_dispatch": "n_jobs", "return_as": "generator_unordered"}
+        parallel: Any = joblib.Parallel(n_jobs, backend=backend, **options)
         yield from parallel(joblib.delayed(_guarded)(function, path, task) for path, task in pending.items())
 
 

@@ -1,0 +1,150 @@
+"""What a design table varies and what it holds fixed, as the rows of the table before anything is computed."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from typing import Any
+
+from torchmask.design.search import METHODS
+from torchmask.grid import Grid
+
+_AXES = ("n_subapertures", "fill_factor", "n_photons", "n_frames", "diameter_over_r0", "seed")
+_WHOLE = ("n_subapertures", "n_frames", "seed", "n_pixels", "n_draws")
+_SAMPLES = 512  # across the pupil raster for turbulence, at least: there the sampled OTF biases the error by 0.1 %
+_MAY_BE_ZERO = ("seed", "exponent", "readout_noise")
+
+
+@dataclass(frozen=True)
+class DesignSpace:
+    """What a design table varies, and what it holds fixed. Every combination of the first six is a row.
+
+    n_subapertures : numbers of holes N
+    fill_factor : collecting areas N d^2 / D^2
+    n_photons : photons per frame collected at `reference_fill_factor`; at other areas in proportion to N d^2
+    n_frames : numbers of exposures K
+    diameter_over_r0 : strengths of turbulence D / r0; none for MSE_a alone, without limit on d / r0
+    seed : seeds of the search
+    reference_fill_factor : where `n_photons` is quoted
+    max_hole_over_r0 : largest d / r0 that is designed for
+    mask_diameter, wavelength : [m]
+    n_pixels : of the image, sampled at Nyquist for D
+    exponent, knee : of the object's `PowerLawPSD`
+    readout_noise : [electrons rms per pixel]
+    outer_scale : of the turbulence [m]
+    n_draws : stacks of K exposures drawn, for the mean of `wiener_mse` and its standard error
+    method, budget : of `search_mask`
+
+    Raises ValueError for an axis that is empty or repeats a value, and for values out of range.
+    """
+
+    n_subapertures: tuple[int, ...] = (6, 9, 11, 13, 16)
+    fill_factor: tuple[float, ...] = (0.15,)
+    n_photons: tuple[float, ...] = (1e7,)
+    n_frames: tuple[int, ...] = (20,)
+    diameter_over_r0: tuple[float, ...] = (7.0,)
+    seed: tuple[int, ...] = (0,)
+    reference_fill_factor: float = 0.15
+    max_hole_over_r0: float = 1.5
+    mask_diameter: float = 1.0
+    wavelength: float = 550e-9
+    n_pixels: int = 256
+    exponent: float = 1.5
+    knee: float = 1 / 64
+    readout_noise: float = 0.0
+    outer_scale: float = 20.0
+    n_draws: int = 16
+    method: str = "hybrid"
+    budget: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise ValueError(f"method is {self.method!r}: known methods are {', '.join(METHODS)}")
+        if self.budget is not None:
+            _number("budget", self.budget, whole=True)
+        for name in (field.name for field in fields(self) if field.name not in ("method", "budget")):
+            given = getattr(self, name)
+            values = tuple(_number(name, v, name in _WHOLE) for v in (given if name in _AXES else (given,)))
+            if len(set(values)) < len(values) or not (values or name == "diameter_over_r0"):
+                raise ValueError(f"{name} is {given}: it must hold at least one value, and none twice")
+            object.__setattr__(self, name, values if name in _AXES else values[0])
+        if self.n_draws < 2:
+            raise ValueError(f"n_draws is {self.n_draws}: a standard error needs at least 2")
+        Grid.nyquist(self.mask_diameter, self.wavelength, self.n_pixels)
+
+    @property
+    def oversampling(self) -> int:
+        """Of the pupil under turbulence: beyond the edge of a hole's OTF, where its tail is tiny, samples leak."""
+        return math.ceil(_SAMPLES / self.n_pixels)
+
+    def designs(self) -> Iterator[Design]:
+        """The rows of the table before anything is computed; those that cannot be built say why."""
+        axes = [getattr(self, name) for name in _AXES if name != "diameter_over_r0"]
+        for (n, fill, photons, frames, seed), strength in itertools.product(
+            itertools.product(*axes), self.diameter_over_r0 or (None,)
+        ):
+            yield Design(
+                n,
+                fill,
+                photons,
+                frames,
+                strength,
+                seed,
+                subaperture_diameter=self.mask_diameter * math.sqrt(fill / n),
+                photons_per_frame=photons * fill / self.reference_fill_factor,
+                infeasible=self._obstacle(n, fill, strength),
+            )
+
+    def _obstacle(self, n: int, fill_factor: float, strength: float | None) -> str | None:
+        if strength is None:
+            return None
+        largest = n * (self.max_hole_over_r0 / strength) ** 2
+        if fill_factor > largest * (1 + 1e-9):
+            over = strength * math.sqrt(fill_factor / n)
+            return f"d/r0 is {over:.3g}, above {self.max_hole_over_r0:g}: fill_factor must be at most {largest:.4g}"
+        relative = math.sqrt(fill_factor / n)
+        if relative * self.n_pixels * self.oversampling < 4:  # the raster is two mask diameters wide
+            need = math.ceil(4 / relative)
+            return f"a hole spans less than 2 samples of the pupil: n_pixels must be at least {need}"
+        return None
+
+
+@dataclass(frozen=True)
+class Design:
+    """One row of a design table: a combination, the mask found for it, and its errors.
+
+    hole diameter and mask diameter in metres; the errors are relative, over the mean of the object's PSD.
+
+    relative_mse : MSE_a
+    above_floor : the same without the part that no mask of this diameter can change
+    wiener_mse, wiener_error : mean of `wiener_mse` under von Karman screens, and its standard error
+    centers : (N, 2) [m]
+    infeasible : why there is no mask, or None
+    """
+
+    n_subapertures: int
+    fill_factor: float
+    n_photons: float
+    n_frames: int
+    diameter_over_r0: float | None
+    seed: int
+    subaperture_diameter: float
+    photons_per_frame: float
+    relative_mse: float | None = None
+    above_floor: float | None = None
+    wiener_mse: float | None = None
+    wiener_error: float | None = None
+    centers: tuple[tuple[float, float], ...] = ()
+    infeasible: str | None = None
+
+
+def _number(name: str, value: Any, whole: bool) -> int | float:
+    """`value` as int or float, so that equal tasks are equal files."""
+    unit = {"mask_diameter": ", in m", "wavelength": ", in m", "outer_scale": ", in m"}.get(name, "")
+    least = "not negative" if name in _MAY_BE_ZERO else "positive"
+    fits = math.isfinite(value) and (value > 0 or (value == 0 and name in _MAY_BE_ZERO))
+    if not fits or (whole and value != int(value)):
+        raise ValueError(f"{name} is {value}: it must be {'whole' if whole else 'finite'} and {least}{unit}")
+    return int(value) if whole else float(value)

@@ -1,0 +1,193 @@
+"""Choosing the number of holes, their size and the flux: one search for each combination, and what turbulence leaves.
+
+MSE_a knows no turbulence inside a hole: by it alone, one hole that fills the pupil would win. So the table lets the
+photons grow with the collecting area, refuses holes larger than `max_hole_over_r0` times r0, and gives beside MSE_a the
+mean of `wiener_mse` under full von Karman screens: the error of a linear restoration that knows every OTF.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torchmask.design.criterion import AsymptoticMSE, wiener_mse
+from torchmask.design.feasibility import Infeasible
+from torchmask.design.psd import NoisePSD, PowerLawPSD
+from torchmask.design.search import search_mask
+from torchmask.design.space import Design, DesignSpace
+from torchmask.design.sweep import require_backend, run_tasks
+from torchmask.grid import Grid
+from torchmask.io import atomic_write, write_json
+from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.otf import OTF
+from torchmask.optics.turbulence import TurbulencePhase
+from torchmask.record import Callback
+
+_FRAMES_AT_ONCE = 20  # OTFs held in memory
+_COLUMNS = tuple(field.name for field in fields(Design) if field.name != "centers")
+
+
+@dataclass(frozen=True)
+class DesignTable:
+    """The rows of a design table, in the order of the axes; `print` shows them as Markdown."""
+
+    space: DesignSpace
+    rows: tuple[Design, ...]
+
+    def aperture(self, row: Design) -> SparseAperture:
+        """The mask of a row. Raises ValueError if it is infeasible."""
+        if row.infeasible is not None:
+            raise ValueError(f"there is no mask in this row: {row.infeasible}")
+        return SparseAperture(torch.tensor(row.centers).double(), row.subaperture_diameter, self.space.mask_diameter)
+
+    def csv(self) -> str:
+        """All but the centres, one line a row under a line of names; what is missing is left empty."""
+        text = io.StringIO()
+        writer = csv.DictWriter(text, _COLUMNS, extrasaction="ignore", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(asdict(row) for row in self.rows)
+        return text.getvalue()
+
+    def __str__(self) -> str:
+        names = [name for name in _COLUMNS if any(getattr(row, name) is not None for row in self.rows)]
+        lines = [names, ["---"] * len(names)]
+        lines += [[_cell(getattr(row, name)) for name in names] for row in self.rows]
+        return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def design_table(
+    space: DesignSpace,
+    folder: str | Path,
+    *,
+    backend: str = "loky",
+    n_workers: int | None = None,
+    callback: Callback | None = None,
+) -> DesignTable:
+    """Search a mask for every combination of a design space, and measure it under turbulence.
+
+    Every search, and every measurement, is a task of its own, on disk as soon as it is done: call again with the same
+    folder to go on after an interruption, or to widen an axis. See `torchmask.design.sweep.run_tasks`, also for
+    the backends. A combination that cannot be built is a row that says why.
+
+    Parameters
+    ----------
+    space : DesignSpace
+    folder : path
+        For the tasks, one file each, and for the table: table.csv and table.json (with the centres), which are
+        written last, whole, and replace those of an earlier call.
+    backend : {"loky", "ray"}
+    n_workers : int, optional
+        Tasks at a time, each on one torch thread; by default one per core.
+    callback : callable, optional
+        Gets a Record after each task, of the stages "design/table/search" and "design/table/turbulence".
+
+    Raises
+    ------
+    ValueError
+        Before any work: as `run_tasks`; or if no combination keeps d / r0 below the limit.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> space = DesignSpace(n_subapertures=(3, 6), fill_factor=(0.1,), n_pixels=64, n_draws=2, budget=500)
+    >>> table = design_table(space, tempfile.mkdtemp(), n_workers=1)
+    >>> [row.n_subapertures for row in table.rows if row.relative_mse < 0.3]
+    [6]
+    """
+    require_backend(backend, n_workers)
+    rows = list(space.designs())
+    if all(row.infeasible for row in rows):
+        raise ValueError(f"no combination can be designed; the first: {rows[0].infeasible}")
+    options: dict[str, Any] = {"backend": backend, "n_workers": n_workers, "callback": callback}
+
+    feasible = [k for k, row in enumerate(rows) if not row.infeasible]
+    searches = [_search_task(space, rows[k]) for k in feasible]
+    found = run_tasks(search, searches, Path(folder) / "tasks", stage="design/table/search", **options)
+    for k, result in zip(feasible, found, strict=True):
+        rows[k] = replace(rows[k], **{**result, "centers": tuple(map(tuple, result["centers"]))})
+
+    built = [k for k in feasible if not rows[k].infeasible and rows[k].diameter_over_r0 is not None]
+    trials = [_turbulence_task(space, rows[k]) for k in built]
+    measured = run_tasks(measure, trials, Path(folder) / "tasks", stage="design/table/turbulence", **options)
+    for k, result in zip(built, measured, strict=True):
+        rows[k] = replace(rows[k], **result)
+
+    table = DesignTable(space, tuple(rows))
+    write_json(Path(folder) / "table.json", table, replace=True)
+    with atomic_write(Path(folder) / "table.csv", replace=True) as file:
+        file.write(table.csv().encode())
+    return table
+
+
+def _scene(space: DesignSpace, row: Design) -> dict[str, Any]:
+    """What searches and measurements depend on besides the mask."""
+    names = ("mask_diameter", "wavelength", "n_pixels", "exponent", "knee", "readout_noise")
+    return {name: getattr(space, name) for name in names} | {
+        "photons_per_frame": row.photons_per_frame,
+        "n_frames": row.n_frames,
+        "seed": row.seed,
+    }
+
+
+def _search_task(space: DesignSpace, row: Design) -> dict[str, Any]:
+    own = {"n_subapertures": row.n_subapertures, "fill_factor": row.fill_factor}
+    return _scene(space, row) | own | {"method": space.method, "budget": space.budget}
+
+
+def _turbulence_task(space: DesignSpace, row: Design) -> dict[str, Any]:
+    own = {name: getattr(row, name) for name in ("centers", "subaperture_diameter", "diameter_over_r0")}
+    return (
+        _scene(space, row) | own | {name: getattr(space, name) for name in ("outer_scale", "n_draws", "oversampling")}
+    )
+
+
+def _criterion(task: dict[str, Any]) -> AsymptoticMSE:
+    grid = Grid.nyquist(task["mask_diameter"], task["wavelength"], task["n_pixels"])
+    photons = task["photons_per_frame"]
+    object_psd = PowerLawPSD(task["exponent"], photons, task["knee"])
+    return AsymptoticMSE(grid, object_psd, NoisePSD(photons, task["readout_noise"]), task["n_frames"])
+
+
+def search(task: dict[str, Any]) -> dict[str, Any]:
+    """The task of a search: the best mask for one combination, or why there is none."""
+    criterion = _criterion(task)
+    names = ("n_subapertures", "mask_diameter", "fill_factor", "method", "seed", "budget")
+    try:
+        result = search_mask(criterion, **{name: task[name] for name in names})
+    except Infeasible as error:
+        return {"centers": [], "infeasible": str(error)}
+    floor = criterion.floor(task["mask_diameter"]) / criterion.object_psd.mean()
+    return {
+        "centers": result.aperture.centers,
+        "relative_mse": result.relative_mse,
+        "above_floor": result.relative_mse - float(floor),
+    }
+
+
+def measure(task: dict[str, Any]) -> dict[str, Any]:
+    """The task of a measurement: mean and standard error of the relative `wiener_mse` of a mask under turbulence."""
+    criterion = _criterion(task)
+    mask = SparseAperture(torch.tensor(task["centers"]).double(), task["subaperture_diameter"], task["mask_diameter"])
+    otf = OTF(mask, criterion.grid, task["oversampling"])
+    samples = otf.samples()
+    turbulence = TurbulencePhase(task["mask_diameter"] / task["diameter_over_r0"], task["outer_scale"])
+    generator = torch.Generator().manual_seed(task["seed"])
+    values = []
+    for _ in range(task["n_draws"]):
+        power = torch.zeros(criterion.grid.shape, dtype=torch.float64)
+        for first in range(0, task["n_frames"], _FRAMES_AT_ONCE):
+            phase = turbulence(samples, min(_FRAMES_AT_ONCE, task["n_frames"] - first), generator)
+            power += (otf(phase).abs() ** 2).sum(0)
+        values.append(wiener_mse(power.sqrt()[None], criterion.object_psd, criterion.noise_psd))
+    relative = torch.stack(values) / criterion.object_psd.mean()
+    return {"wiener_mse": relative.mean(), "wiener_error": relative.std() / math.sqrt(len(values))}
+
+
+def _cell(value: Any) -> str:
+    return "" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
