@@ -1,119 +1,18 @@
-"""Random phase screens of von Karman turbulence, and the phase they lay on a pupil.
-
-The spectrum is split by smooth windows into bands, each sampled on a frequency lattice of its own: the first by FFT,
-the lower ones, the sub-harmonics, as explicit sums of waves on lattices three times finer from one to the next. A band
-has a finite correlation length; its lattice makes it periodic, with a period that exceeds the screen by at least that
-length. So the periodicity is not seen inside the screen, and covariance at the screen's own lags is that of the
-spectrum (Poisson's summation formula) - to about 0.2 % in the structure function at all separations within it.
-"""
+"""Random phase screens of von Karman turbulence, and the phase they lay on a pupil."""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from numbers import Integral
 
 import torch
-from scipy.fft import next_fast_len
 from torch import Tensor, nn
 
 from torchmask.optics.aperture import PupilSamples
-from torchmask.optics.von_karman import (
-    modal_covariance,
-    require_turbulence,
-    von_karman_covariance,
-    von_karman_psd,
-    von_karman_structure_function,
-)
+from torchmask.optics.random_field import COMPLEX, RandomField, split_spectrum
+from torchmask.optics.von_karman import require_turbulence
 
-__all__ = [
-    "TurbulencePhase",
-    "frozen_flow",
-    "modal_covariance",
-    "phase_screens",
-    "von_karman_covariance",
-    "von_karman_structure_function",
-]
-
-_RATIO = 3.0  # of the frequencies of successive bands
-_CUTOFF = 2.0  # of the first band, in units of 1 / margin
-_STEEPNESS = 6
-_REACH = 1.55  # a window exp(-x^6) is negligible beyond this x
-_MAX_SAMPLES = 2**25  # of the FFT band: half a gigabyte in complex128
-
-
-class _Band(NamedTuple):
-    """Waves on a rectangular lattice: frequencies [cycles/m] of rows and columns, rms amplitudes [rad]."""
-
-    frequency_y: Tensor
-    frequency_x: Tensor
-    amplitude: Tensor
-
-
-def _bands(
-    extent: tuple[float, float], margin: float, step: tuple[float, float], r0: float, outer_scale: float
-) -> list[_Band]:
-    """Bands for a field over `extent` (y, x) [m] in steps of `step`; the first is the FFT's. float64, on the CPU."""
-    cutoff = _CUTOFF / margin
-
-    def window(frequency: Tensor, level: int) -> Tensor:
-        return torch.exp(-((frequency * _RATIO**level / cutoff) ** _STEEPNESS))
-
-    sizes = [next_fast_len(math.ceil((e + margin) / s)) for e, s in zip(extent, step, strict=True)]
-    fy, fx = (torch.fft.fftfreq(n, s, dtype=torch.float64) for n, s in zip(sizes, step, strict=True))
-    power = torch.zeros(sizes[0], sizes[1], dtype=torch.float64)
-    for alias_y in range(-2, 3):  # the samples also hold what lies beyond the Nyquist frequency
-        for alias_x in range(-2, 3):
-            f = torch.hypot(fy[:, None] + alias_y / step[0], fx + alias_x / step[1])
-            power += von_karman_psd(f, r0, outer_scale) * (1 - window(f, 0))
-    cell = 1 / (sizes[0] * step[0] * sizes[1] * step[1])
-    bands = [_Band(fy, fx, (power * cell).sqrt())]
-    levels = max(1, math.ceil(math.log(2 * outer_scale / margin, _RATIO)))
-    for level in range(1, levels + 1):
-        periods = [e + margin * _RATIO**level for e in extent]
-        highest = _REACH * cutoff / _RATIO ** (level - 1)
-        fy, fx = (torch.arange(-math.ceil(highest * p), math.ceil(highest * p) + 1).double() / p for p in periods)
-        f = torch.hypot(fy[:, None], fx)
-        share = window(f, level - 1) - (window(f, level) if level < levels else 0)
-        power = von_karman_psd(f, r0, outer_scale) * share / (periods[0] * periods[1])
-        bands.append(_Band(fy, fx, power.sqrt()))
-    return bands
-
-
-def _draw(
-    bands: list[_Band], generator: torch.Generator | None, dtype: torch.dtype, device: torch.device
-) -> list[Tensor]:
-    """Complex coefficients of all waves; the real and the imaginary part of their sum are independent fields."""
-    source = generator.device if generator is not None else device
-    kind = torch.complex64 if dtype == torch.float32 else torch.complex128
-    return [
-        torch.randn(b.amplitude.shape, generator=generator, dtype=kind, device=source).to(device)
-        * (math.sqrt(2) * b.amplitude).to(device, dtype)
-        for b in bands
-    ]
-
-
-def _synthesise(
-    bands: list[_Band],
-    coefficients: list[Tensor],
-    shape: tuple[int, int],
-    step: tuple[float, float],
-    displacement: tuple[float, float] = (0.0, 0.0),
-) -> Tensor:
-    """Sum of all waves on the samples: complex (rows, columns). `displacement` (y, x) [m] moves the field."""
-    total = 0.0
-    for number, (band, values) in enumerate(zip(bands, coefficients, strict=True)):
-        wave = []
-        for frequency, n, s, d in zip(band[:2], shape, step, displacement, strict=True):
-            place = torch.zeros(1) if number == 0 else torch.arange(n) * s
-            phase = 2 * math.pi * frequency[:, None] * (place.double() - d)
-            wave.append(torch.polar(torch.ones_like(phase), phase).to(values))
-        if number == 0:
-            moved = values * wave[0] * wave[1].T if any(displacement) else values
-            moved = torch.fft.ifft(moved, dim=-2, norm="forward")[: shape[0]]
-            total = total + torch.fft.ifft(moved, dim=-1, norm="forward")[:, : shape[1]]
-        else:
-            total = total + wave[0].T @ values @ wave[1]
-    return total
+_MAX_SAMPLES = 2**24  # of a field: a quarter of a gigabyte in complex128, several times
 
 
 def phase_screens(
@@ -136,6 +35,7 @@ def phase_screens(
     r0, outer_scale : float
         Fried parameter and outer scale [m].
     n_screens : int
+        A screen does not depend on how many follow it.
     generator : torch.Generator, optional
         Seeded, on the CPU or on `device`.
     dtype, device : optional
@@ -145,22 +45,27 @@ def phase_screens(
     ------
     ValueError
         If a length is not finite and positive, or a count not a whole number of at least 1.
+    TypeError
+        If `dtype` is neither float32 nor float64.
 
     Examples
     --------
-    >>> screens = phase_screens((64, 64), 0.02, r0=0.15, outer_scale=20.0, n_screens=3)
+    >>> generator = torch.Generator().manual_seed(0)
+    >>> screens = phase_screens((64, 64), 0.02, r0=0.15, outer_scale=20.0, n_screens=3, generator=generator)
     >>> screens.shape
     torch.Size([3, 64, 64])
     """
-    shape, step = _require_raster(shape, step, r0, outer_scale)
+    shape, step, dtype, device = _resolve(shape, step, dtype, device)
     _require_count("n_screens", n_screens)
-    dtype, device = dtype or torch.get_default_dtype(), torch.device(device or "cpu")
+    require_turbulence(r0, outer_scale)
     extent = (shape[0] * step[0], shape[1] * step[1])
-    bands = _bands(extent, _margin(extent, step), step, r0, outer_scale)
+    field = RandomField(
+        split_spectrum(extent, _margin(extent, step), step, r0, outer_scale), shape, step, dtype, device
+    )
     screens = torch.empty(n_screens, *shape, dtype=dtype, device=device)
     for first in range(0, n_screens, 2):
-        field = _synthesise(bands, _draw(bands, generator, dtype, device), shape, step)
-        screens[first : first + 2] = torch.view_as_real(field).movedim(-1, 0)[: n_screens - first]
+        pair = torch.view_as_real(field.sum(field.draw(generator))).movedim(-1, 0)
+        screens[first : first + 2] = pair[: n_screens - first]
     return screens
 
 
@@ -169,38 +74,42 @@ def frozen_flow(
     step: float | tuple[float, float],
     r0: float,
     outer_scale: float,
-    displacement: Tensor,
+    displacements: Tensor,
     generator: torch.Generator | None = None,
     dtype: torch.dtype | None = None,
     device: torch.device | str | None = None,
 ) -> Tensor:
-    """One screen, moved as a whole: (n_frames, rows, columns) [rad], frame t being screen(x - displacement[t]).
+    """One screen moved as a whole: (n_frames, rows, columns) [rad], frame t being screen(x - displacements[t]).
 
-    `displacement` (n_frames, 2) [m], (x, y). Other arguments as for `phase_screens`. Every wave is shifted exactly, by
-    any fraction of a sample, and the field is wide enough that none of the path is seen twice.
+    `displacements` (n_frames, 2) [m], (x, y). Other arguments as for `phase_screens`. Every wave is moved exactly, by
+    any fraction of a sample, and the field is wide enough that no part of the path is seen twice.
 
     Raises
     ------
     ValueError
-        As `phase_screens`; or if the path is too long to hold, with the length that fits.
+        As `phase_screens`; or if the field would be too large, with the number of frames that fit.
+    TypeError
+        As `phase_screens`.
     """
-    shape, step = _require_raster(shape, step, r0, outer_scale)
-    dtype, device = dtype or torch.get_default_dtype(), torch.device(device or "cpu")
-    path = displacement.detach().cpu().double().flip(-1)  # (y, x)
-    span = (path.amax(0) - path.amin(0)).tolist()
+    shape, step, dtype, device = _resolve(shape, step, dtype, device)
+    require_turbulence(r0, outer_scale)
+    path = displacements.detach().cpu().double().flip(-1)  # (y, x)
+    span = path.cummax(0).values - path.cummin(0).values  # up to each frame
     own = (shape[0] * step[0], shape[1] * step[1])
     margin = _margin(own, step)
-    extent = (own[0] + span[0], own[1] + span[1])
-    samples = (extent[0] + margin) / step[0] * (extent[1] + margin) / step[1]
-    if samples > _MAX_SAMPLES:
+    extents = span + torch.tensor(own, dtype=torch.float64)
+    fits = ((extents + margin) / torch.tensor(step, dtype=torch.float64)).prod(-1) <= _MAX_SAMPLES
+    if not bool(fits.all()):
         raise ValueError(
-            f"a path of {span[1]:.4g} m by {span[0]:.4g} m (x, y) needs a screen of {samples:.3g} samples, above "
-            f"{_MAX_SAMPLES}: take fewer frames, a shorter interval or a coarser grid"
+            f"the wind carries the screen {float(span[-1, 1]):.4g} m by {float(span[-1, 0]):.4g} m (x, y) in "
+            f"{len(path)} frames, more than fits into memory: at most {int(fits.sum())} frames are possible here, more "
+            "with a shorter interval, a coarser grid or a wind along x or y"
         )
-    bands = _bands(extent, margin, step, r0, outer_scale)
-    coefficients = _draw(bands, generator, dtype, device)
-    moves = (path - path[0]).tolist()
-    return torch.stack([_synthesise(bands, coefficients, shape, step, (dy, dx)).real for dy, dx in moves])
+    extent = (float(extents[-1, 0]), float(extents[-1, 1]))
+    field = RandomField(split_spectrum(extent, margin, step, r0, outer_scale), shape, step, dtype, device)
+    coefficients = field.draw(generator)
+    # The raster is at one corner of the field, whose period takes care of the sign of the path.
+    return torch.stack([field.sum(field.move(coefficients, (dy, dx))).real for dy, dx in path.tolist()])
 
 
 class TurbulencePhase(nn.Module):
@@ -218,7 +127,8 @@ class TurbulencePhase(nn.Module):
     Raises
     ------
     ValueError
-        If a scale is not finite and positive, or only one of `wind` and `frame_interval` is given.
+        If a scale or the interval is not finite and positive, `wind` is not two finite numbers, or only one of
+        `wind` and `frame_interval` is given.
 
     Notes
     -----
@@ -245,6 +155,10 @@ class TurbulencePhase(nn.Module):
         require_turbulence(r0, outer_scale)
         if (wind is None) != (frame_interval is None):
             raise ValueError("wind and frame_interval belong together: give both (frozen flow) or neither")
+        if wind is not None and not (len(wind) == 2 and all(math.isfinite(v) for v in wind)):
+            raise ValueError(f"wind is {wind}: it must be two finite numbers (vx, vy), in m/s")
+        if frame_interval is not None and not (math.isfinite(frame_interval) and frame_interval > 0):
+            raise ValueError(f"frame_interval is {frame_interval}: it must be finite and positive, in s")
         self.r0 = float(r0)
         self.outer_scale = float(outer_scale)
         self.wind = wind
@@ -257,46 +171,51 @@ class TurbulencePhase(nn.Module):
         if self.wind is None or self.frame_interval is None:
             screens = phase_screens(shape, samples.step, self.r0, self.outer_scale, n_frames, **like)
         else:
-            time = torch.arange(n_frames, dtype=torch.float64)[:, None] * self.frame_interval
-            path = time * torch.tensor(self.wind, dtype=torch.float64)
+            time = torch.arange(n_frames, dtype=torch.float64) * self.frame_interval
+            path = time[:, None] * torch.tensor(self.wind, dtype=torch.float64)
             screens = frozen_flow(shape, samples.step, self.r0, self.outer_scale, path, **like)
         return screens.flatten(1)[:, place]
 
     def extra_repr(self) -> str:
-        return f"r0={self.r0:.6g}, outer_scale={self.outer_scale:.6g}, wind={self.wind}"
+        flow = "" if self.wind is None else f", wind={self.wind}, frame_interval={self.frame_interval}"
+        return f"r0={self.r0:.6g}, outer_scale={self.outer_scale:.6g}{flow}"
 
 
 def _window(samples: PupilSamples) -> tuple[Tensor, tuple[int, int]]:
     """The smallest rectangle around a pupil that may lie across the raster's border: places in it, and its shape."""
-    shape, coordinates = [], []
-    for position, size in zip(
-        (samples.index // samples.raster[1], samples.index % samples.raster[1]), samples.raster, strict=True
-    ):
-        angle = 2 * math.pi / size * position
+    coordinates, shape = [], []
+    places = (samples.index // samples.raster[1], samples.index % samples.raster[1])
+    for place, size in zip(places, samples.raster, strict=True):
+        angle = 2 * math.pi / size * place  # the middle of a pupil that spans at most half the raster is a mean angle
         middle = torch.atan2((samples.weights * angle.sin()).sum(), (samples.weights * angle.cos()).sum())
-        start = int(torch.round(middle * size / (2 * math.pi))) - size // 2
-        local = (position - start) % size
-        shape.append(int(local.max() - local.min()) + 1)
+        local = (place - round(float(middle) * size / (2 * math.pi)) + size // 2) % size
         coordinates.append(local - local.min())
+        shape.append(int(coordinates[-1].max()) + 1)
     return coordinates[0] * shape[1] + coordinates[1], (shape[0], shape[1])
 
 
 def _margin(extent: tuple[float, float], step: tuple[float, float]) -> float:
+    """Distance [m] over which the first band loses its correlation."""
     return max(0.25 * max(extent), 16 * max(step))
 
 
 def _require_count(name: str, count: int) -> None:
-    if count != int(count) or count < 1:
+    if not isinstance(count, Integral) or count < 1:
         raise ValueError(f"{name} is {count}: it must be a whole number of at least 1")
 
 
-def _require_raster(
-    shape: tuple[int, int], step: float | tuple[float, float], r0: float, outer_scale: float
-) -> tuple[tuple[int, int], tuple[float, float]]:
-    require_turbulence(r0, outer_scale)
+def _resolve(
+    shape: tuple[int, int],
+    step: float | tuple[float, float],
+    dtype: torch.dtype | None,
+    device: torch.device | str | None,
+) -> tuple[tuple[int, int], tuple[float, float], torch.dtype, torch.device]:
     for side in shape:
         _require_count("a side of shape", side)
     dy, dx = (step, step) if isinstance(step, int | float) else step
     if not all(math.isfinite(s) and s > 0 for s in (dy, dx)):
         raise ValueError(f"step is {step}: it must be finite and positive, in m")
-    return (int(shape[0]), int(shape[1])), (float(dy), float(dx))
+    dtype = dtype or torch.get_default_dtype()
+    if dtype not in COMPLEX:
+        raise TypeError(f"dtype is {dtype}: it must be float32 or float64")
+    return (shape[0], shape[1]), (float(dy), float(dx)), dtype, torch.device(device or "cpu")

@@ -1,0 +1,121 @@
+"""Stationary Gaussian fields with the spectrum of von Karman turbulence, on a raster.
+
+The spectrum is split by smooth windows into bands, each sampled on a frequency lattice of its own: the first by FFT,
+the lower ones, the sub-harmonics, as explicit sums of waves on lattices ever finer. A lattice makes its band periodic;
+the smooth window gives the band a finite correlation length; and the period exceeds the field by at least that length.
+So no separation within the field meets the periodicity, and the covariance there is that of the spectrum (Poisson's
+summation formula). What is sampled also holds the frequencies beyond Nyquist, folded. The expected structure function
+is von Karman's to 0.6 % at one sample, where the folding is cut, and to 0.2 % from two samples to the whole field.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from scipy.fft import next_fast_len
+from torch import Tensor
+
+from torchmask.optics.von_karman import von_karman_psd
+
+_RATIO = 3.0  # of the frequencies of successive bands
+_CUTOFF = 2.0  # of the first band, in units of 1 / margin
+_STEEPNESS = 6  # of the windows exp(-x^6)
+_NEGLIGIBLE = 1.55  # their x where they end
+COMPLEX = {torch.float32: torch.complex64, torch.float64: torch.complex128}
+
+
+class Band(NamedTuple):
+    """Waves on a rectangular lattice: frequencies [cycles/m] of rows and columns, rms amplitudes [rad]."""
+
+    frequency_y: Tensor
+    frequency_x: Tensor
+    amplitude: Tensor
+
+
+def split_spectrum(
+    extent: tuple[float, float], margin: float, step: tuple[float, float], r0: float, outer_scale: float
+) -> list[Band]:
+    """Bands for a field over `extent` (y, x) [m] in steps of `step`; the first is the FFT's. float64, on the CPU."""
+    cutoff = _CUTOFF / margin
+
+    def below(frequency: Tensor, level: int) -> Tensor:
+        """Share of the spectrum that is left to the bands below band `level`."""
+        return torch.exp(-((frequency * _RATIO**level / cutoff) ** _STEEPNESS))
+
+    sizes = [int(next_fast_len(math.ceil((e + margin) / s)) or 0) for e, s in zip(extent, step, strict=True)]
+    # The spectrum is even, so one quadrant tells all.
+    fy, fx = (torch.arange(n // 2 + 1, dtype=torch.float64) / (n * s) for n, s in zip(sizes, step, strict=True))
+    density = torch.zeros(len(fy), len(fx), dtype=torch.float64)
+    for alias_y in range(-2, 3):
+        for alias_x in range(-2, 3):
+            f = torch.hypot(fy[:, None] + alias_y / step[0], fx + alias_x / step[1])
+            density += von_karman_psd(f, r0, outer_scale) * (1 - below(f, 0))
+    density /= sizes[0] * step[0] * sizes[1] * step[1]
+    fy, fx = (torch.fft.fftfreq(n, s, dtype=torch.float64) for n, s in zip(sizes, step, strict=True))
+    rows, columns = (torch.minimum(torch.arange(n), n - torch.arange(n)) for n in sizes)
+    bands = [Band(fy, fx, density.sqrt()[rows][:, columns])]
+
+    levels = max(1, math.ceil(math.log(2 * outer_scale / margin, _RATIO)))  # until the lattice resolves 1 / L0
+    for level in range(1, levels + 1):
+        periods = [e + margin * _RATIO**level for e in extent]
+        counts = [math.ceil(_NEGLIGIBLE * cutoff / _RATIO ** (level - 1) * p) for p in periods]
+        fy, fx = (torch.arange(-n, n + 1, dtype=torch.float64) / p for n, p in zip(counts, periods, strict=True))
+        f = torch.hypot(fy[:, None], fx)
+        share = below(f, level - 1) - (below(f, level) if level < levels else 0)
+        density = von_karman_psd(f, r0, outer_scale) * share / (periods[0] * periods[1])
+        bands.append(Band(fy, fx, density.sqrt()))
+    return bands
+
+
+class RandomField:
+    """A random field of `bands`, to be summed on a raster. Coefficients are lists, one tensor for each band."""
+
+    def __init__(
+        self,
+        bands: list[Band],
+        shape: tuple[int, int],
+        step: tuple[float, float],
+        dtype: torch.dtype,
+        device: torch.device,
+    ) -> None:
+        self.bands = bands
+        self.shape = shape
+        self.kind = {"dtype": COMPLEX[dtype], "device": device}
+        # randn gives complex numbers a mean square of 1: half of it for each of the two fields
+        self.amplitudes = [(math.sqrt(2) * band.amplitude).to(device, dtype) for band in bands]
+        places = [torch.arange(n, dtype=torch.float64) * s for n, s in zip(shape, step, strict=True)]
+        self.waves = [
+            (_phasor(places[0][:, None] * fy).to(**self.kind), _phasor(fx[:, None] * places[1]).to(**self.kind))
+            for fy, fx, _ in bands[1:]
+        ]
+
+    def draw(self, generator: torch.Generator | None) -> list[Tensor]:
+        """Random coefficients; the real and the imaginary part of their sum are two independent screens."""
+        source = self.kind["device"] if generator is None else generator.device
+        noise = [
+            torch.randn(a.shape, generator=generator, dtype=self.kind["dtype"], device=source) for a in self.amplitudes
+        ]
+        return [n.to(a.device) * a for n, a in zip(noise, self.amplitudes, strict=True)]
+
+    def move(self, coefficients: list[Tensor], displacement: tuple[float, float]) -> list[Tensor]:
+        """Coefficients of the field moved by `displacement` (y, x) [m]."""
+        dy, dx = displacement
+        return [
+            c * _phasor(-dy * fy[:, None]).to(**self.kind) * _phasor(-dx * fx).to(**self.kind)
+            for c, (fy, fx, _) in zip(coefficients, self.bands, strict=True)
+        ]
+
+    def sum(self, coefficients: list[Tensor]) -> Tensor:
+        """The field on the raster, complex (rows, columns)."""
+        rows, columns = self.shape
+        strip = torch.fft.ifft(coefficients[0], dim=0, norm="forward")[:rows]
+        field = torch.fft.ifft(strip, dim=1, norm="forward")[:, :columns]
+        for c, (wave_y, wave_x) in zip(coefficients[1:], self.waves, strict=True):
+            field = field + wave_y @ c @ wave_x
+        return field
+
+
+def _phasor(cycles: Tensor) -> Tensor:
+    return torch.polar(torch.ones_like(cycles), 2 * math.pi * cycles)
