@@ -5,6 +5,7 @@ import torch
 
 from torchmask.design.criterion import wiener_mse
 from torchmask.design.psd import NoisePSD, PowerLawPSD
+from torchmask.grid import Grid
 from torchmask.restoration.wiener import multiframe_wiener
 
 SHAPE = (12, 10)
@@ -24,14 +25,14 @@ def test_minimises_the_quadratic_it_stands_for(dtype, rounding):
     frames, otfs = draw(3, dtype)
     object_psd, noise_psd = PowerLawPSD(1.5, 50.0, 0.1), NoisePSD(50.0, 0.5)
     estimate = multiframe_wiener(frames, otfs, object_psd, noise_psd).requires_grad_()
-    from torchmask.grid import Grid
-
     grid = Grid(SHAPE, 1.0, 1.0)
     spectrum = torch.fft.fft2(estimate)
     misfit = (torch.fft.fft2(frames) - otfs * spectrum).abs() ** 2 / noise_psd(grid, dtype)
     prior = spectrum.abs() ** 2 / object_psd(grid, dtype)
     (gradient,) = torch.autograd.grad(misfit.sum() + prior.sum(), estimate)
-    (scale,) = torch.autograd.grad((torch.fft.fft2(estimate * 1.01).abs() ** 2 / noise_psd(grid, dtype)).sum(), estimate)
+    (scale,) = torch.autograd.grad(
+        (torch.fft.fft2(estimate * 1.01).abs() ** 2 / noise_psd(grid, dtype)).sum(), estimate
+    )
     assert estimate.dtype == dtype
     assert gradient.abs().max() < rounding * scale.abs().max()
 
@@ -45,7 +46,7 @@ def test_without_noise_recovers_the_object_exactly():
 
 
 def test_its_error_is_the_predicted_one():
-    """Over draws of object and noise of the given PSDs the mean squared error is wiener_mse, within 4 standard errors."""
+    """Over draws of object and noise the mean squared error is wiener_mse, within 4 standard errors."""
     n_frames, n_draws = 3, 3000
     _, otfs = draw(n_frames)
     signal, noise = torch.tensor(40.0, dtype=torch.float64), torch.tensor(9.0, dtype=torch.float64)

@@ -1,8 +1,9 @@
-"""What a restoration needs to know before it starts, taken from the frames themselves."""
+"""What a restoration needs to know beforehand, taken from the frames themselves."""
 
 from __future__ import annotations
 
 import math
+import warnings
 
 import torch
 from torch import Tensor
@@ -10,22 +11,96 @@ from torch import Tensor
 from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture
 
+_STRENGTH_RANGE = (0.05, 20.0)  # of the turbulence against its first guess, in (1/r0)^(5/3)
 
-def noise_variance(frames: Tensor, grid: Grid, aperture: Aperture) -> float:
+
+def check_frames(frames: Tensor, valid: Tensor | None, grid: Grid) -> tuple[Tensor, Tensor]:
+    """Frames (T, H, W) in floating point with pixels that are not valid filled in, and `valid` as (T, H, W).
+
+    Raises ValueError if a shape is wrong, a valid pixel is not finite, or a frame holds no light.
+    """
+    frames = torch.as_tensor(frames)
+    if frames.ndim != 3 or tuple(frames.shape[1:]) != grid.shape or not len(frames):
+        raise ValueError(
+            f"frames has shape {tuple(frames.shape)}: it must be (n_frames, {grid.shape[0]}, {grid.shape[1]}), with "
+            "at least one frame, as the grid says"
+        )
+    frames = frames.double()
+    if valid is None:
+        valid = torch.ones_like(frames, dtype=torch.bool)
+    else:
+        if valid.dtype != torch.bool or tuple(valid.shape[-2:]) != grid.shape or valid.ndim not in (2, 3):
+            raise ValueError(
+                f"valid is {valid.dtype} of shape {tuple(valid.shape)}: it must be bool, (H, W) or (T, H, W)"
+            )
+        valid = valid.expand(frames.shape)
+        frames = _fill(frames, valid)
+    bad = ~torch.isfinite(frames).flatten(1).all(1)
+    if bool(bad.any()):
+        raise ValueError(
+            f"frames {bad.nonzero().flatten().tolist()} hold values that are not finite: mark those pixels in `valid`"
+        )
+    dark = frames.mean((1, 2)) <= 0
+    if bool(dark.any()):
+        raise ValueError(f"frames {dark.nonzero().flatten().tolist()} hold no light: leave them out")
+    return frames, valid
+
+
+def _fill(frames: Tensor, valid: Tensor) -> Tensor:
+    """Replace pixels that are not valid by the mean of their valid neighbours, or of the frame where there is none.
+
+    They carry no weight in the restoration; this keeps them from spoiling the mean frame and the measured noise.
+    """
+    known = torch.where(valid, frames, 0.0)
+    kernel = torch.ones(1, 1, 3, 3, dtype=frames.dtype, device=frames.device)
+    around = torch.nn.functional.conv2d(known[:, None], kernel, padding=1)[:, 0]
+    count = torch.nn.functional.conv2d(valid[:, None].to(frames), kernel, padding=1)[:, 0]
+    overall = known.sum((1, 2), keepdim=True) / valid.sum((1, 2), keepdim=True).clamp(min=1)
+    return torch.where(valid, frames, torch.where(count > 0, around / count.clamp(min=1), overall))
+
+
+def noise_variance(frames: Tensor, grid: Grid, aperture: Aperture) -> float | None:
     """Mean noise variance of a pixel [electrons^2], from the frequencies that the aperture cannot transmit.
 
-    White noise has the same power at all frequencies, and beyond the cut-off there is nothing else. Frames (T, H, W).
-    The median over the frequencies (of power averaged over frames) leaves out the cross that a bright border makes.
-    Raises ValueError if the grid is so coarse that fewer than eight frequencies lie beyond the cut-off.
+    White noise has the same power at all frequencies, and beyond the cut-off there is nothing else. The median over
+    frequencies (of the power averaged over T frames, a gamma variable) leaves out the cross of a bright border.
+    None if fewer than eight frequencies lie beyond the cut-off.
     """
     nu_y, nu_x = grid.frequencies(frames.dtype, frames.device)
     beyond = torch.hypot(nu_y, nu_x) > grid.cutoff(aperture.extent)
     if int(beyond.sum()) < 8:
-        raise ValueError("no frequency lies beyond the cut-off of the aperture: give readout_noise")
+        return None
     power = (torch.fft.fft2(frames, norm="ortho").abs() ** 2)[..., beyond].mean(0)
-    degrees = len(frames)  # power is exponential, its mean over T frames a gamma variable
-    median_over_mean = math.exp(-1 / (3 * degrees)) if degrees > 1 else math.log(2)
+    n = len(frames)
+    median_over_mean = math.log(2) if n == 1 else (1 - 1 / (9 * n)) ** 3  # Wilson & Hilferty 1931
     return float(power.median()) / median_over_mean
+
+
+def expected_variance(frames: Tensor, grid: Grid, aperture: Aperture, readout_noise: float | None) -> float:
+    """Mean noise variance of a pixel [electrons^2]: photon and read-out noise, or what `noise_variance` measures.
+
+    Raises ValueError if nothing tells the noise; warns if both ways are open and disagree by more than a factor of 2.
+    """
+    measured = noise_variance(frames, grid, aperture)
+    if readout_noise is None:
+        if measured is None or measured <= 0:
+            raise ValueError("the noise cannot be measured beyond the cut-off frequency: give readout_noise")
+        return measured
+    variance = float(frames.mean()) + readout_noise**2
+    if measured is not None and not 0.5 < measured / variance < 2:
+        warnings.warn(
+            f"the frames' noise is {measured**0.5:.3g} electrons rms, but photon noise and readout_noise make "
+            f"{variance**0.5:.3g}: check the gain and readout_noise",
+            stacklevel=4,
+        )
+    return variance
+
+
+def border_brightness(frames: Tensor) -> float:
+    """Mean of the mean frame's outermost pixels over the mean of all."""
+    mean = frames.mean(0)
+    border = torch.cat([mean[0], mean[-1], mean[1:-1, 0], mean[1:-1, -1]])
+    return float(border.mean() / mean.mean())
 
 
 def mean_frame(frames: Tensor, field: Grid) -> Tensor:
@@ -33,3 +108,23 @@ def mean_frame(frames: Tensor, field: Grid) -> Tensor:
     mean = frames.mean(0).clamp(min=0)
     rows, columns = field.shape
     return torch.nn.functional.pad(mean, (0, columns - mean.shape[1], 0, rows - mean.shape[0]))
+
+
+def turbulence_strength(coefficients: Tensor, mixing: Tensor) -> float | None:
+    """Variance of restored aberrations (T, N, J) over that of the prior, mixing (N J, K): (r0 of the prior / r0)^(5/3).
+
+    From tips and tilts relative to their mean over the sub-apertures, which are seen best and depend least on the
+    outer scale; from defocus to Noll 10 for a single aperture. None where there are no such modes.
+    """
+    n_frames, n_sub, n_modes = coefficients.shape
+    low, high = (1, 3) if n_sub > 1 else (3, 10)
+    if n_modes < low + 2:
+        return None
+    covariance = (mixing @ mixing.T).to(coefficients).unflatten(1, (n_sub, n_modes)).unflatten(0, (n_sub, n_modes))
+    modes = coefficients[..., low:high]
+    expected = torch.einsum("njnj->j", covariance)[low:high].sum()
+    if n_sub > 1:
+        modes = modes - modes.mean(1, keepdim=True)
+        expected = expected - torch.einsum("njmj->j", covariance)[low:high].sum() / n_sub
+    ratio = float((modes**2).sum() / n_frames / expected)
+    return min(max(ratio, _STRENGTH_RANGE[0]), _STRENGTH_RANGE[1])

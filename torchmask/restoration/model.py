@@ -47,15 +47,19 @@ class ExposureModel(nn.Module):
 
     Notes
     -----
-    `forward(object, z)` takes an object (H', W') on `field` and z (T, K), and returns frames (T, H, W), differentiable by
-    autograd. `misfit` compares with given frames at the cost of six FFTs a frame and a memory that does not
+    `forward(object, z)` takes an object (H', W') on `field` and z (T, K), and returns frames (T, H, W), differentiable
+    by autograd. `misfit` compares with given frames at the cost of six FFTs a frame and a memory that does not
     grow with T; `weighted_misfit` is the same as a node of an autograd graph.
+
+    The attenuation of the image by the cells of the pupil samples, which `PSF` divides out, is left in: on a field of
+    this size it stands in for the light that leaves the field, and fits end-to-end simulations better.
     """
 
     weights: Tensor
     index: Tensor
     basis: Tensor
     mixing: Tensor
+    positions: Tensor
 
     def __init__(
         self,
@@ -82,11 +86,13 @@ class ExposureModel(nn.Module):
         mixed = torch.einsum("npj,njk->npk", basis, mixing.unflatten(0, (n_sub, n_modes)))[open_cell]
         weights = samples.weights.detach()[open_cell]
         kwargs = {"dtype": dtype or basis.dtype, "device": device}
-        # Parseval: this makes the sum of every PSF 1, whatever the phase.
+        # Parseval: this makes the sum of every PSF 1, whatever the phase, as long as holes share no cell.
         self.register_buffer("weights", (weights / weights.norm()).to(**kwargs))
         self.register_buffer("index", samples.index[open_cell].to(device=device))
         self.register_buffer("basis", mixed.to(**kwargs))
         self.register_buffer("mixing", mixing.to(**kwargs))
+        positions = (samples.offsets + aperture.centers[:, None]).detach()[open_cell] / grid.period
+        self.register_buffer("positions", positions.to(**kwargs))  # (P, 2), (x, y) in cycles/pixel
 
     @property
     def n_parameters(self) -> int:
@@ -170,7 +176,9 @@ class ExposureModel(nn.Module):
         return 2 * (pupil.imag * field.real - pupil.real * field.imag) @ self.basis
 
     @torch.no_grad()
-    def curvature(self, image: Tensor, z: Tensor, precision: Tensor, generator: torch.Generator) -> tuple[Tensor, float]:
+    def curvature(
+        self, image: Tensor, z: Tensor, precision: Tensor, generator: torch.Generator
+    ) -> tuple[Tensor, float]:
         """Diagonal of the Gauss-Newton Hessian of `misfit`: mean over frames for each z (K,), and for one object pixel.
 
         J^T W J is the covariance of J^T W^(1/2) n with white noise n, so one draw of noise per frame suffices for

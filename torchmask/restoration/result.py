@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -56,8 +57,9 @@ class RestorationResult:
         """Read what `save` wrote; tensors on the CPU. Raises ValueError for a missing, damaged or foreign file."""
         names = [item.name for item in fields(cls)]
         stored = load_npz(path, required=names)
-        scalars = {"tv_weight", "r0", "noise", "converged", "message", "n_evaluations", "seconds"}
-        return cls(**{n: stored[n].item() if n in scalars else torch.from_numpy(stored[n]) for n in names})
+        values: dict[str, Any] = {name: torch.from_numpy(stored[name]) for name in names if stored[name].ndim}
+        values.update({name: stored[name].item() for name in names if not stored[name].ndim})
+        return cls(**values)
 
     def summary(self) -> str:
         """A few lines for people."""

@@ -18,8 +18,8 @@ def multiframe_wiener(frames: Tensor, otfs: Tensor, object_psd: PSD, noise_psd: 
     otfs : (..., T, H, W) complex tensor
         In FFT order, 1 at zero frequency.
     object_psd, noise_psd : callable or Tensor
-        As for `torchmask.design.criterion.wiener_mse`, in the convention of an unnormalised DFT; that of the noise is of one frame.
-        An object PSD of zero sets that frequency to zero.
+        As for `torchmask.design.criterion.wiener_mse`, in the convention of an unnormalised DFT; that of the noise is
+        of one frame. An object PSD of zero sets that frequency to zero.
 
     Returns
     -------
@@ -40,7 +40,9 @@ def multiframe_wiener(frames: Tensor, otfs: Tensor, object_psd: PSD, noise_psd: 
     True
     """
     if not frames.is_floating_point() or not otfs.is_complex():
-        raise TypeError(f"frames are {frames.dtype} and otfs {otfs.dtype}: they must be real floating point and complex")
+        raise TypeError(
+            f"frames are {frames.dtype} and otfs {otfs.dtype}: they must be real floating point and complex"
+        )
     if frames.ndim < 3 or otfs.ndim < 3 or frames.shape[-3:] != otfs.shape[-3:]:
         raise ValueError(
             f"frames have shape {tuple(frames.shape)} and otfs {tuple(otfs.shape)}: both must end in the same "

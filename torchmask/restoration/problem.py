@@ -1,0 +1,146 @@
+"""The joint problem of object and aberrations as a bound-constrained minimiser sees it: one scaled vector."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import numpy as np
+import torch
+from scipy.optimize import Bounds, minimize
+from torch import Tensor
+
+from torchmask.restoration.model import ExposureModel
+from torchmask.restoration.priors import total_variation, total_variation_curvature
+
+_CORRECTIONS = 20
+_OBJECT_STEP = 0.3  # of the object's scale against that of the aberrations: measured, a factor of 3 either way is worse
+_LEAST_CURVATURE = 1e-6  # of the largest: directions that neither data nor prior hold are left with a finite scale
+_LEAST_GAIN = 1e-3
+_PROBE_SEED = 0
+
+
+@dataclass(frozen=True)
+class State:
+    """What goes on from one restart to the next.
+
+    image : (H', W') object in units of the stack's mean pixel
+    z : (T, K) aberrations
+    gains : (T,) transmission of the frames, 1 on average
+    prior : weight of ||z||^2 / 2, which follows the strength of the turbulence
+    excess : (T,) variance of a frame's residuals over that of its noise, at least 1
+    """
+
+    image: Tensor
+    z: Tensor
+    gains: Tensor
+    prior: float
+    excess: Tensor
+
+
+@dataclass(frozen=True)
+class JointProblem:
+    """1/2 sum precision/excess (gain * forward - frames)^2 + tv_weight TV(image) + prior/2 ||z||^2, image >= 0.
+
+    frames : (T, H, W) in units of their mean; precision : (T or 1, H or 1, W or 1)
+    free : which of "object" and "aberrations" may change
+    """
+
+    model: ExposureModel
+    frames: Tensor
+    precision: Tensor
+    tv_weight: float
+    free: tuple[str, ...] = ("object", "aberrations")
+
+    def scaled_data(self, state: State) -> tuple[Tensor, Tensor]:
+        """Frames and precision with the gains divided out of the model: (frames / g, precision g^2 / excess)."""
+        gains = state.gains[:, None, None].to(self.frames)
+        return self.frames / gains, self.precision * (gains**2 / state.excess[:, None, None].to(gains))
+
+    def scales(self, state: State) -> tuple[Tensor, Tensor]:
+        """Units in which the diagonal of the Hessian is about one, for image (H', W') and z (K,).
+
+        Curvature of the aberrations is measured by probes; that of the object by the energy of the PSFs and
+        the quadratic that majorises TV, which tells flat pixels from edges.
+        """
+        generator = torch.Generator().manual_seed(_PROBE_SEED)
+        curvature, pixel = self.model.curvature(state.image, state.z, self.scaled_data(state)[1], generator)
+        curvature = curvature + state.prior
+        z_scale = curvature.clamp(min=_LEAST_CURVATURE * float(curvature.max())).rsqrt()
+        image_curvature = pixel + self.tv_weight * total_variation_curvature(state.image)
+        return _OBJECT_STEP * image_curvature.rsqrt(), z_scale
+
+    def cost(self, state: State, image: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The cost with the gains and prior of `state`, and its gradients in image and z (zero where not free)."""
+        frames, precision = self.scaled_data(state)
+        by_object, by_aberrations = ("object" in self.free), ("aberrations" in self.free)
+        misfit = self.model.misfit(image, z, frames, precision, want_object=by_object, want_aberrations=by_aberrations)
+        variation, slope = total_variation(image)
+        value = misfit.value.sum() + self.tv_weight * variation + 0.5 * state.prior * (z**2).sum()
+        image_gradient = torch.zeros_like(image)
+        z_gradient = torch.zeros_like(z)
+        if misfit.object_gradient is not None:
+            image_gradient = misfit.object_gradient + self.tv_weight * slope
+        if misfit.aberration_gradient is not None:
+            z_gradient = misfit.aberration_gradient + state.prior * z
+        return value, image_gradient, z_gradient
+
+    def descend(self, state: State, n_iterations: int, progress: Callable[[float, int, Any], None]) -> State:
+        """L-BFGS-B from `state`; `progress(cost, evaluations, function giving (image, z))` after every iteration."""
+        image_scale, z_scale = self.scales(state)
+        n, evaluations = state.image.numel(), 0
+
+        def split(x: np.ndarray) -> tuple[Tensor, Tensor]:
+            flat = torch.from_numpy(x).to(state.image)
+            return flat[:n].view_as(state.image) * image_scale, flat[n:].view_as(state.z) * z_scale
+
+        def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
+            nonlocal evaluations
+            evaluations += 1
+            value, image_gradient, z_gradient = self.cost(state, *split(x))
+            gradient = torch.cat([(image_gradient * image_scale).flatten(), (z_gradient * z_scale).flatten()])
+            return float(value), gradient.cpu().numpy()
+
+        def after(intermediate_result: Any) -> None:
+            nonlocal evaluations
+            done, evaluations = evaluations, 0
+            progress(float(intermediate_result.fun), done, lambda: split(intermediate_result.x))
+
+        start = torch.cat([(state.image / image_scale).flatten(), (state.z / z_scale).flatten()]).cpu().numpy()
+        lower = np.full(len(start), -np.inf)
+        lower[:n] = 0
+        result = minimize(
+            cost,
+            start,
+            jac=True,
+            method="L-BFGS-B",
+            bounds=Bounds(cast(Any, lower), np.inf),  # its annotation knows numbers only
+            options={
+                "maxiter": n_iterations,
+                "maxfun": 4 * n_iterations,
+                "maxcor": _CORRECTIONS,
+                "ftol": 1e-12,
+                "gtol": 0,
+            },
+            callback=after,
+        )
+        image, z = split(result.x)
+        return replace(state, image=image, z=z)
+
+    def calibrate(self, state: State) -> State:
+        """The state with the gains that fit best, 1 on average, and the excess that is left then.
+
+        A frame that the model cannot follow, because it has fallen into a local minimum or its phase has more
+        detail than the modes, counts for less: the scale of its residuals is estimated with everything else.
+        """
+        gains, squares = [], []
+        for part in self.model.chunks(len(state.z)):
+            frames, model = self.frames[part], self.model(state.image, state.z[part])
+            precision = (self.precision[part] if len(self.precision) > 1 else self.precision).expand_as(frames)
+            gain = (precision * model * frames).sum((1, 2)) / (precision * model**2).sum((1, 2))
+            gains.append(gain)
+            error = (precision * (frames - gain[:, None, None] * model) ** 2).sum((1, 2))
+            squares.append(error / (precision > 0).sum((1, 2)).clamp(min=1))
+        gain = torch.cat(gains).to(state.z).clamp(min=_LEAST_GAIN)
+        return replace(state, gains=gain / gain.mean(), excess=torch.cat(squares).to(state.z).clamp(min=1))

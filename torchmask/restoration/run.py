@@ -1,0 +1,260 @@
+"""One run of a myopic deconvolution, from the frames to the result."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import time
+import warnings
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchmask.io import load_npz, save_npz
+from torchmask.record import Callback, Record
+from torchmask.restoration.initialization import (
+    border_brightness,
+    expected_variance,
+    mean_frame,
+    turbulence_strength,
+)
+from torchmask.restoration.problem import JointProblem, State
+from torchmask.restoration.result import RestorationResult
+from torchmask.restoration.subpixel import centre_on_pixels
+
+if TYPE_CHECKING:
+    from torchmask.restoration.myopic import MyopicDeconvolution
+
+SEGMENT = 100  # iterations between restarts of L-BFGS-B
+_SETTLED = 0.03  # relative decrease in a segment below which the place between the pixels is worth looking for
+_CENTRINGS = 2  # how often at most
+_START = 0.7  # rms of the first whitened aberrations of a point-symmetric pupil
+_SEED = 0
+_BRIGHT_BORDER = 0.5  # of the mean pixel
+
+
+@dataclass
+class _Progress:
+    """Everything a later segment depends on; what a checkpoint holds."""
+
+    state: State
+    costs: list[float] = field(default_factory=list)
+    n_evaluations: int = 0
+    centrings: int = 0
+    message: str = ""  # why it stopped, empty until then
+
+
+class Restoration:
+    """Holds frames (T, H, W) in units of their mean pixel; calling it restores the object behind them."""
+
+    def __init__(self, method: MyopicDeconvolution, frames: Tensor, valid: Tensor, callback: Callback | None) -> None:
+        self.method, self.model, self.callback = method, method.model, callback
+        self.unit = float(frames.mean())
+        self.variance = expected_variance(frames, method.grid, method.aperture, method.readout_noise)
+        if border_brightness(frames) > _BRIGHT_BORDER:
+            warnings.warn("the frames are bright at the border: does the object reach beyond the field?", stacklevel=3)
+        basis = self.model.basis
+        self.frames, self.valid = (frames / self.unit).to(basis), valid.to(basis.device)
+        weight = torch.ones(1, 1, 1) if bool(valid.all()) else valid
+        precision = weight.to(basis) * (self.unit**2 / self.variance)
+        self.problem = JointProblem(self.model, self.frames, precision, method.tv_weight)
+        self._symmetric = method.aperture.n_subapertures == 1  # under point reflection, and of many modes
+
+    def __call__(
+        self,
+        coefficients: Tensor | None,
+        known_object: Tensor | None,
+        start: RestorationResult | None,
+        checkpoint: str | Path | None,
+        started: float,
+    ) -> RestorationResult:
+        free = [name for name, known in (("object", known_object), ("aberrations", coefficients)) if known is None]
+        self.problem = replace(self.problem, free=tuple(free))
+        if checkpoint is not None and Path(checkpoint).exists():
+            progress = self._resume(checkpoint)
+        else:
+            progress = self._begin(coefficients, known_object, start)
+        while not progress.message:
+            self._advance(progress)
+            if checkpoint is not None:
+                self._keep(progress, checkpoint)
+        return self._result(progress, time.perf_counter() - started)
+
+    def _advance(self, progress: _Progress) -> None:
+        """One segment, then what is brought up to date between two."""
+        method, problem = self.method, self.problem
+        state, left = progress.state, method.max_iterations - len(progress.costs)
+        before = float(problem.cost(state, state.image, state.z)[0])
+
+        def step(cost: float, evaluations: int, variables: Any) -> None:
+            progress.costs.append(cost)
+            progress.n_evaluations += evaluations
+            self._record(progress, variables)
+
+        progress.state = state = problem.descend(state, min(SEGMENT, left), step)
+        after = float(problem.cost(state, state.image, state.z)[0])
+        decrease = (before - after) / abs(after)
+        both = len(problem.free) == 2
+        if both and decrease < _SETTLED and progress.centrings < _CENTRINGS and left > SEGMENT:
+            progress.centrings += 1
+            progress.state = centre_on_pixels(problem, state)
+        elif decrease < method.tolerance:
+            progress.message = f"converged: the last {SEGMENT} iterations lowered the cost by a fraction {decrease:.1e}"
+            return
+        if left <= SEGMENT:
+            progress.message = f"stopped at max_iterations = {method.max_iterations}"
+            return
+        progress.state = self._update(progress.state, settled=progress.centrings > 0)
+
+    def _update(self, state: State, settled: bool) -> State:
+        """Gains, excess noise and strength of the turbulence as the state itself tells them.
+
+        Frames of a mask keep their full weight until they have settled, for it is that which draws them out of wrong
+        fringe orders.
+        """
+        fitted = self.problem.calibrate(state)
+        state = fitted if settled or self._symmetric else replace(fitted, excess=state.excess)
+        if self.method.known_r0 or not self.method.aberration_prior or "aberrations" not in self.problem.free:
+            return state
+        strength = turbulence_strength(self._coefficients(state.z), self.model.mixing)
+        return state if strength is None else replace(state, prior=1 / strength)
+
+    def _begin(
+        self, coefficients: Tensor | None, known_object: Tensor | None, start: RestorationResult | None
+    ) -> _Progress:
+        grid, shape = self.method.grid, (len(self.frames), self.model.n_parameters)
+        image = mean_frame(self.frames, self.model.field).double()
+        z = torch.zeros(shape, dtype=torch.float64, device=image.device)
+        if self._symmetric:
+            # Zero is a saddle point there: the sign of the even modes of a point-symmetric pupil cannot be seen.
+            noise = torch.randn(shape, dtype=z.dtype, generator=torch.Generator().manual_seed(_SEED))
+            z = noise.to(z) * (_START if self.method.aberration_prior else _START / 7)
+        if coefficients is not None:
+            expected = (len(z), self.method.aperture.n_subapertures, self.method.n_modes)
+            if tuple(coefficients.shape) != expected:
+                raise ValueError(f"coefficients has shape {tuple(coefficients.shape)}: it must be {expected}")
+            z = self._whiten(coefficients)
+        if known_object is not None:
+            if tuple(known_object.shape) != grid.shape:
+                raise ValueError(f"known_object has shape {tuple(known_object.shape)}: it must be {grid.shape}")
+            image = mean_frame(known_object[None].to(image), self.model.field)
+            image = image / float(self.model(image, z).mean())
+        gains = self.frames.mean((1, 2)).double()
+        gains = gains / gains.mean()
+        prior = 1.0 if self.method.aberration_prior else 0.0
+        excess = torch.ones_like(gains)
+        if self._symmetric:
+            # What the mean frame leaves unexplained; else the first steps overfit with the modes that move least.
+            change = self.frames - gains[:, None, None].to(self.frames) * self.frames.mean(0)
+            excess = (change**2 * self.problem.precision).mean((1, 2)).double().clamp(min=1)
+        state = State(image, z, gains, prior, excess)
+        return _Progress(state) if start is None else self._warm(state, start)
+
+    def _warm(self, state: State, start: RestorationResult) -> _Progress:
+        """Go on from `start`; frames that it does not know are first fitted to its object."""
+        known, field_shape = len(start.coefficients), tuple(state.image.shape)
+        expected = (self.method.aperture.n_subapertures, self.method.n_modes)
+        fits = tuple(start.extended_object.shape) == field_shape and tuple(start.coefficients.shape[1:]) == expected
+        if known > len(state.z) or not fits:
+            raise ValueError(
+                f"start has coefficients {tuple(start.coefficients.shape)} and an object on "
+                f"{tuple(start.extended_object.shape)} pixels: (at most {len(state.z)}, *{expected}) and {field_shape} "
+                "are needed"
+            )
+        image, z = state.image, state.z.clone()
+        if "object" in self.problem.free:
+            image = start.extended_object.to(image) / self.unit
+        if "aberrations" in self.problem.free:
+            z[:known] = self._whiten(start.coefficients)
+        progress = _Progress(replace(state, image=image, z=z), centrings=_CENTRINGS)
+        if known < len(z) and "aberrations" in self.problem.free:
+            precision = self.problem.precision
+            fresh = replace(
+                self.problem,
+                frames=self.frames[known:],
+                precision=precision[known:] if len(precision) > 1 else precision,
+                free=("aberrations",),
+            )
+
+            def count(cost: float, evaluations: int, variables: Any) -> None:
+                progress.n_evaluations += evaluations
+
+            part = replace(progress.state, z=z[known:], gains=state.gains[known:], excess=state.excess[known:])
+            z[known:] = fresh.descend(part, SEGMENT, count).z
+        return progress
+
+    def _record(self, progress: _Progress, variables: Any) -> None:
+        if self.callback is None:
+            return
+        step, arrays = len(progress.costs), {}
+        if step == 1 or step % 10 == 0:
+            image, z = variables()
+            rows, columns = self.method.grid.shape
+            arrays = {"object": image[:rows, :columns] * self.unit, "coefficients": self._coefficients(z)}
+        scalars = {"cost": progress.costs[-1]}
+        self.callback(Record("restoration", step, self.method.max_iterations, scalars, arrays))
+
+    def _coefficients(self, z: Tensor) -> Tensor:
+        flat = z @ self.model.mixing.to(z).T
+        return flat.unflatten(1, (self.method.aperture.n_subapertures, self.method.n_modes))
+
+    def _whiten(self, coefficients: Tensor) -> Tensor:
+        """z (T, K) whose coefficients come closest to (T, N, J); exact but for the mean piston."""
+        mixing = self.model.mixing.double()
+        return coefficients.to(mixing).flatten(1) @ torch.linalg.pinv(mixing).T
+
+    def _fingerprint(self) -> str:
+        """Tells whether a checkpoint belongs to these frames and settings."""
+        digest = hashlib.sha256(self.frames.cpu().numpy().tobytes() + self.model.basis.cpu().numpy().tobytes())
+        digest.update(self.problem.precision.cpu().numpy().tobytes())
+        digest.update(repr((self.problem.free, self.method.tv_weight, self.method.aberration_prior)).encode())
+        return digest.hexdigest()
+
+    def _keep(self, progress: _Progress, path: str | Path) -> None:
+        arrays = {name: getattr(progress.state, name) for name in ("image", "z", "gains", "prior", "excess")}
+        arrays |= {name: getattr(progress, name) for name in ("costs", "n_evaluations", "centrings", "message")}
+        save_npz(path, arrays | {"fingerprint": self._fingerprint()}, replace=True)
+
+    def _resume(self, path: str | Path) -> _Progress:
+        names = ("image", "z", "gains", "prior", "excess", "costs", "n_evaluations", "centrings", "message")
+        stored = load_npz(path, required=(*names, "fingerprint"))
+        if stored["fingerprint"].item() != self._fingerprint():
+            raise ValueError(f"{path} is the checkpoint of other frames or settings: give another name or remove it")
+        device = self.frames.device
+        image, z, gains, excess = (torch.from_numpy(stored[n]).to(device) for n in ("image", "z", "gains", "excess"))
+        costs = np.atleast_1d(stored["costs"]).tolist()
+        counts = (int(stored["n_evaluations"]), int(stored["centrings"]))
+        message = str(stored["message"].item())
+        if message.startswith("stopped") and len(costs) < self.method.max_iterations:
+            message = ""  # a larger budget than before: go on
+        return _Progress(State(image, z, gains, float(stored["prior"]), excess), costs, *counts, message)
+
+    def _result(self, progress: _Progress, seconds: float) -> RestorationResult:
+        method, state = self.method, progress.state
+        rows, columns = method.grid.shape
+        gains = state.gains[:, None, None].to(self.frames)
+        frames = torch.cat([self.model(state.image, state.z[part]) for part in self.model.chunks(len(state.z))]) * gains
+        residuals = (self.frames - frames) * self.problem.precision.sqrt()
+        n_valid = self.valid.sum((1, 2)).clamp(min=1)
+        image = state.image * self.unit
+        return RestorationResult(
+            object=image[:rows, :columns].clone(),
+            extended_object=image,
+            coefficients=self._coefficients(state.z),
+            gains=state.gains,
+            model=frames * self.unit,
+            residuals=residuals,
+            chi_square=(residuals**2).sum((1, 2)) / n_valid,
+            tv_weight=method.tv_weight,
+            r0=method.r0 * state.prior ** (3 / 5) if method.aberration_prior else math.nan,
+            noise=self.variance**0.5,
+            cost=torch.tensor(progress.costs, dtype=torch.float64),
+            converged=progress.message.startswith("converged"),
+            message=progress.message,
+            n_evaluations=progress.n_evaluations,
+            seconds=seconds,
+        )
