@@ -1,0 +1,55 @@
+"""Differentiable co-design of aperture masks and image restoration for imaging through turbulence.
+
+mask -> pupil field -> PSF / OTF -> short exposures -> restored object
+"""
+
+from torchmask.design.constraints import check
+from torchmask.design.criterion import AsymptoticMSE, wiener_mse
+from torchmask.design.manufacture import load_mask
+from torchmask.design.psd import NoisePSD, PowerLawPSD
+from torchmask.design.refine import refine_mask
+from torchmask.design.search import SearchResult, search_mask
+from torchmask.design.table import design_table
+from torchmask.grid import Grid
+from torchmask.optics.aperture import FullAperture, SparseAperture
+from torchmask.optics.detector import Detector
+from torchmask.optics.otf import OTF, PSF
+from torchmask.optics.turbulence import TurbulencePhase
+from torchmask.optics.zernike import ZernikePhase
+from torchmask.restoration.myopic import MyopicDeconvolution
+from torchmask.restoration.result import RestorationResult
+from torchmask.restoration.wiener import multiframe_wiener
+from torchmask.simulation.observation import Observation, simulate_observation
+from torchmask.simulation.scene import SceneOptions, make_scene
+from torchmask.tracking import RunLogger
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "OTF",
+    "PSF",
+    "AsymptoticMSE",
+    "Detector",
+    "FullAperture",
+    "Grid",
+    "MyopicDeconvolution",
+    "NoisePSD",
+    "Observation",
+    "PowerLawPSD",
+    "RestorationResult",
+    "RunLogger",
+    "SceneOptions",
+    "SearchResult",
+    "SparseAperture",
+    "TurbulencePhase",
+    "ZernikePhase",
+    "check",
+    "design_table",
+    "load_mask",
+    "make_scene",
+    "multiframe_wiener",
+    "refine_mask",
+    "search_mask",
+    "simulate_observation",
+    "wiener_mse",
+]
