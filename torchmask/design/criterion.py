@@ -45,9 +45,10 @@ class AsymptoticMSE(nn.Module):
     Notes
     -----
     `forward(aperture)` returns (...), one value for each mask of the population `aperture.centers` (..., N, 2), in
-    the dtype of the centres and differentiable (once) in them. Cost and memory grow with the pixels of the patches,
-    N^2 c^2 G^2 / 2 per mask, c = diameter of a sub-aperture / grid.period; memory beyond that of one mask is
-    chunked away. It raises ValueError for an aperture without closed form (full or obstructed) and for c > 1/2.
+    the dtype of the centres (float64 or float32) and differentiable once in them. Cost grows with the G^2 pixels of
+    the grid and the 2 N^2 c^2 G^2 of the patches, c = diameter of a sub-aperture / grid.period; a large population is
+    treated in chunks, so that memory does not. It raises ValueError for an aperture without closed form (full or
+    obstructed) and for c > 1/2. On CUDA equal calls may differ by rounding (atomic sums).
 
     Examples
     --------
@@ -67,7 +68,7 @@ class AsymptoticMSE(nn.Module):
 
     def __init__(self, grid: Grid, object_psd: PSD, noise_psd: PSD, n_frames: int) -> None:
         super().__init__()
-        if n_frames != int(n_frames) or n_frames < 1:
+        if not math.isfinite(n_frames) or n_frames != int(n_frames) or n_frames < 1:
             raise ValueError(f"n_frames is {n_frames}: it must be a whole number of at least 1")
         self.grid = grid
         self.n_frames = int(n_frames)
@@ -76,6 +77,8 @@ class AsymptoticMSE(nn.Module):
         self.register_buffer("noise_psd", evaluate_psd(noise_psd, grid, "noise_psd"))
         if not bool((self.noise_psd > 0).all()):
             raise ValueError("noise_psd is 0 somewhere: without noise the error is 0 wherever light comes through")
+        if not bool((self.object_psd > 0).any()):
+            raise ValueError("object_psd is 0 everywhere: there is nothing to restore")
         self._pack()
         self.register_load_state_dict_post_hook(_pack_again)
 
@@ -103,7 +106,7 @@ class AsymptoticMSE(nn.Module):
     def forward(self, aperture: Aperture) -> Tensor:
         centers = aperture.centers
         geometry = self._geometry(aperture)
-        flat = centers.reshape(-1, *centers.shape[-2:])
+        flat = centers.reshape(math.prod(centers.shape[:-2]), *centers.shape[-2:])
         weight, ratio = self._weight.to(centers.dtype), self._ratio.to(centers.dtype)
         return BaselineMSE.apply(flat, weight, ratio, geometry).reshape(centers.shape[:-2])  # type: ignore[no-any-return]
 
@@ -132,12 +135,19 @@ class AsymptoticMSE(nn.Module):
         return other.to(self.object_psd.device, self.object_psd.dtype)
 
     def _geometry(self, aperture: Aperture) -> Geometry:
+        if not isinstance(aperture, Aperture):
+            raise TypeError(f"aperture is a {type(aperture).__name__}: make a SparseAperture of the centres")
         if isinstance(aperture, FullAperture) or aperture.central_obstruction > 0:
             raise ValueError(
                 "MSE_a is defined for masks of clear sub-apertures (SparseAperture): a full or obstructed pupil has "
                 "aberrations that a piston per sub-aperture does not describe; take wiener_mse of drawn OTFs instead"
             )
-        diameter = aperture.subaperture_diameter
+        centers, diameter = aperture.centers, aperture.subaperture_diameter
+        if centers.dtype not in (torch.float32, torch.float64) or centers.device != self.object_psd.device:
+            raise ValueError(
+                f"the centres are {centers.dtype} on {centers.device}, the criterion is on {self.object_psd.device}: "
+                "both must be on one device, and the centres float32 or float64"
+            )
         reach = diameter * (1.0 if aperture.shape == "disc" else 2 / math.sqrt(3))
         if reach > 0.5 * self.grid.period * (1 + 1e-9):
             raise ValueError(
@@ -186,5 +196,9 @@ def _reflect(image: Tensor) -> Tensor:
 
 
 def _pack_again(module: nn.Module, _: Any) -> None:
+    """After load_state_dict: the PSDs may be others than those of the constructor."""
     assert isinstance(module, AsymptoticMSE)
     module._pack()
+    model, psd = module._object_model, module.object_psd
+    if model is not None and not torch.equal(evaluate_psd(model, module.grid, "object_psd").to(psd), psd):
+        module._object_model = None
