@@ -115,7 +115,8 @@ def evaluate_psd(
     """
     value: Any = psd if isinstance(psd, Tensor) or not callable(psd) else psd(grid, dtype, device)
     if not isinstance(value, Tensor) or not value.is_floating_point():
-        raise TypeError(f"{name} is {value!r}: it must be a real tensor (H, W), or psd(grid, dtype, device) giving one")
+        given = f"{value.dtype} tensor" if isinstance(value, Tensor) else type(value).__name__
+        raise TypeError(f"{name} is a {given}: it must be a real tensor (H, W), or psd(grid, dtype, device) giving one")
     try:
         value = value.detach().to(dtype=dtype, device=device).expand(grid.shape).clone()
     except RuntimeError:
@@ -134,12 +135,12 @@ def resample_psd(psd: Tensor, shape: tuple[int, int]) -> Tensor:
     """
     for axis, size in ((-2, shape[0]), (-1, shape[1])):
         old = psd.shape[axis]
-        position = torch.fft.fftfreq(size, dtype=psd.dtype, device=psd.device) * old
-        lower = (position + 1e-9).floor()  # a common frequency is not to fall short of itself by rounding
-        weight = (position - lower).clamp(min=0)
+        # whole-number arithmetic: a common frequency falls exactly on itself
+        position = ((torch.arange(size, device=psd.device) + size // 2) % size - size // 2) * old
+        lower, weight = position // size, (position % size).to(psd.dtype) / size
         if axis == -2:
             weight = weight[:, None]
-        first = psd.index_select(axis, lower.long() % old)
-        second = psd.index_select(axis, (lower.long() + 1) % old)
+        first = psd.index_select(axis, lower % old)
+        second = psd.index_select(axis, (lower + 1) % old)
         psd = first + weight * (second - first)
     return psd
