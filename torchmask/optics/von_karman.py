@@ -128,7 +128,8 @@ def modal_covariance(aperture: Aperture, n_modes: int, r0: float, outer_scale: f
     shared, highest = _SHARED + bend, (_HIGHEST + bend) / (1 - aperture.central_obstruction)  # rings have finer modes
     total = _gram(aperture, n_modes, r0, outer_scale, centers, 0.0, shared)
     own = _gram(aperture, n_modes, r0, outer_scale, torch.zeros_like(centers[:1]), shared, highest)
-    return (total + torch.kron(torch.eye(len(centers), dtype=torch.float64), own)).to(aperture.centers.device)
+    total = total + torch.kron(torch.eye(len(centers), dtype=torch.float64), own)
+    return ((total + total.T) / 2).to(aperture.centers.device)
 
 
 def _gram(
