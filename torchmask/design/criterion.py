@@ -104,6 +104,8 @@ class AsymptoticMSE(nn.Module):
         self.register_buffer("_ratio", torch.stack(ratios), persistent=False)
 
     def forward(self, aperture: Aperture) -> Tensor:
+        if not isinstance(aperture, Aperture):
+            raise TypeError(f"aperture is a {type(aperture).__name__}: make a SparseAperture of the centres")
         centers = aperture.centers
         geometry = self._geometry(aperture)
         flat = centers.reshape(math.prod(centers.shape[:-2]), *centers.shape[-2:])
@@ -135,8 +137,6 @@ class AsymptoticMSE(nn.Module):
         return other.to(self.object_psd.device, self.object_psd.dtype)
 
     def _geometry(self, aperture: Aperture) -> Geometry:
-        if not isinstance(aperture, Aperture):
-            raise TypeError(f"aperture is a {type(aperture).__name__}: make a SparseAperture of the centres")
         if isinstance(aperture, FullAperture) or aperture.central_obstruction > 0:
             raise ValueError(
                 "MSE_a is defined for masks of clear sub-apertures (SparseAperture): a full or obstructed pupil has "
@@ -150,9 +150,10 @@ class AsymptoticMSE(nn.Module):
             )
         reach = diameter * (1.0 if aperture.shape == "disc" else 2 / math.sqrt(3))
         if reach > 0.5 * self.grid.period * (1 + 1e-9):
+            needed = (1 - 1e-6) * self.grid.wavelength / (2 * reach)
             raise ValueError(
                 f"the OTF of a sub-aperture reaches {self.grid.cutoff(reach):.3f} cycles/pixel, above 1/2, and "
-                f"overlaps itself: pixel_scale must be at most {self.grid.wavelength / (2 * reach):.4g} rad"
+                f"overlaps itself: pixel_scale must be at most {needed:.7g} rad"
             )
         return Geometry(self.grid.shape, self.grid.period, aperture.shape, diameter, aperture.orientation, reach)
 

@@ -209,18 +209,30 @@ class BaselineMSE(torch.autograd.Function):
         plan = plan_of(geometry, centers.shape[-2], centers.dtype, centers.device)
         differentiate = ctx.needs_input_grad[0]
         pixels = len(plan.first) * len(plan.row) * len(plan.column)
-        n_chunks = math.ceil(len(centers) * pixels / _CHUNK.get(centers.device.type, 2**24))
+        masks = max(1, _CHUNK.get(centers.device.type, 2**24) // pixels)
+        n_chunks = math.ceil(len(centers) / masks)
         chunks = centers.split(math.ceil(len(centers) / n_chunks)) if n_chunks > 1 else (centers,)
         parts = [_mse_and_gradient(chunk, weight, ratio, geometry, plan, differentiate) for chunk in chunks]
         if differentiate:
-            ctx.save_for_backward(torch.cat([gradient for _, gradient in parts if gradient is not None]))
+            ctx.save_for_backward(centers, torch.cat([gradient for _, gradient in parts if gradient is not None]))
         return torch.cat([value for value, _ in parts])
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *grad: Tensor) -> tuple[Tensor, None, None, None]:
-        (gradient,) = ctx.saved_tensors
-        return grad[0][:, None, None] * gradient, None, None, None
+        centers, gradient = ctx.saved_tensors
+        return grad[0][:, None, None] * _DifferentiatedOnce.apply(gradient, centers), None, None, None
+
+
+class _DifferentiatedOnce(torch.autograd.Function):
+    """A gradient that says so when it is differentiated: torch would take it for a constant, and Hessians for 0."""
+
+    @staticmethod
+    def forward(ctx: Any, gradient: Tensor, centers: Tensor) -> Tensor:
+        return gradient.view_as(gradient)
+
+    @staticmethod
+    def backward(ctx: Any, *grad: Tensor) -> tuple[Tensor, Tensor]:
+        raise RuntimeError("MSE_a has a first derivative only: take differences of its gradient for a Hessian")
 
 
 def _mse_and_gradient(
