@@ -86,6 +86,12 @@ class JointProblem:
             z_gradient = misfit.aberration_gradient + state.prior * z
         return value, image_gradient, z_gradient
 
+    def frame_costs(self, state: State) -> Tensor:
+        """Misfit and prior of each frame, (T,)."""
+        frames, precision = self.scaled_data(state)
+        misfit = self.model.misfit(state.image, state.z, frames, precision, want_object=False, want_aberrations=False)
+        return misfit.value.to(state.z) + 0.5 * state.prior * (state.z**2).sum(1)
+
     def descend(self, state: State, n_iterations: int, progress: Callable[[float, int, Any], None]) -> State:
         """L-BFGS-B from `state`; `progress(cost, evaluations, function giving (image, z))` after every iteration."""
         image_scale, z_scale = self.scales(state)

@@ -23,6 +23,7 @@ from torchmask.restoration.initialization import (
     turbulence_strength,
 )
 from torchmask.restoration.problem import JointProblem, State
+from torchmask.restoration.repair import repair
 from torchmask.restoration.result import RestorationResult
 from torchmask.restoration.subpixel import centre_on_pixels
 
@@ -101,6 +102,9 @@ class Restoration:
         both = len(problem.free) == 2
         if both and decrease < _SETTLED and progress.centrings < _CENTRINGS and left > SEGMENT:
             progress.centrings += 1
+            fitted = problem.calibrate(state)
+            state, evaluations = repair(problem, state, fitted.excess, seed=progress.centrings)
+            progress.n_evaluations += evaluations
             progress.state = centre_on_pixels(problem, state)
         elif decrease < method.tolerance:
             progress.message = f"converged: the last {SEGMENT} iterations lowered the cost by a fraction {decrease:.1e}"
@@ -108,16 +112,15 @@ class Restoration:
         if left <= SEGMENT:
             progress.message = f"stopped at max_iterations = {method.max_iterations}"
             return
-        progress.state = self._update(progress.state, settled=progress.centrings > 0)
+        progress.state = self._update(progress.state)
 
-    def _update(self, state: State, settled: bool) -> State:
+    def _update(self, state: State) -> State:
         """Gains, excess noise and strength of the turbulence as the state itself tells them.
 
-        Frames of a mask keep their full weight until they have settled, for it is that which draws them out of wrong
-        fringe orders.
+        Frames of a mask keep their full weight: those that fit badly are what draws a wrong object to the right one.
         """
         fitted = self.problem.calibrate(state)
-        state = fitted if settled or self._symmetric else replace(fitted, excess=state.excess)
+        state = fitted if self._symmetric else replace(fitted, excess=state.excess)
         if self.method.known_r0 or not self.method.aberration_prior or "aberrations" not in self.problem.free:
             return state
         strength = turbulence_strength(self._coefficients(state.z), self.model.mixing)

@@ -1,0 +1,54 @@
+"""Frames that have fallen into a local minimum, started anew against the object that the others agree on.
+
+With the object known, the aberrations of a frame are a small problem of their own, so several random starts are cheap.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchmask.restoration.problem import JointProblem, State
+
+_OUTLYING = 1.25  # times the median residual variance of the frames
+_STARTS = 6
+_ITERATIONS = 60
+
+
+def repair(problem: JointProblem, state: State, excess: Tensor, seed: int) -> tuple[State, int]:
+    """Aberrations of outlying frames from the best of several random starts, and the evaluations that it took.
+
+    `excess` (T,) tells which frames fit badly. A frame keeps its aberrations unless others lower its cost.
+    """
+    bad = (excess > _OUTLYING * excess.median()).nonzero().flatten()
+    if not len(bad):
+        return state, 0
+    precision = problem.precision
+    part = replace(
+        problem,
+        frames=problem.frames[bad],
+        precision=precision[bad] if len(precision) > 1 else precision,
+        free=("aberrations",),
+    )
+    generator = torch.Generator().manual_seed(seed)
+    n_evaluations = 0
+
+    def count(cost: float, evaluations: int, variables: Any) -> None:
+        nonlocal n_evaluations
+        n_evaluations += evaluations
+
+    now = replace(state, z=state.z[bad], gains=state.gains[bad], excess=state.excess[bad])
+    best, least = now.z, part.frame_costs(now)
+    spread = float(state.z.square().mean().sqrt())
+    for _ in range(_STARTS):
+        noise = torch.randn(now.z.shape, dtype=now.z.dtype, generator=generator).to(now.z)
+        trial = part.descend(replace(now, z=spread * noise), _ITERATIONS, count)
+        costs = part.frame_costs(trial)
+        best = torch.where((costs < least)[:, None], trial.z, best)
+        least = torch.minimum(costs, least)
+    z = state.z.clone()
+    z[bad] = best
+    return replace(state, z=z), n_evaluations * len(bad) // len(state.z)
