@@ -73,6 +73,11 @@ def test_redundant_rows_and_squares():
     assert square.largest_gap == pytest.approx(math.sqrt(0.5), rel=1e-12)
 
 
+def test_two_holes_must_be_two_diameters_apart():
+    """With two holes only the patch of baseline zero is near: from three on, differences of baselines are baselines."""
+    assert analyse_redundancy(mask_of([[0.0, 0], [0.6, 0]], 0.1)).strict_hole_diameter == pytest.approx(0.3, rel=1e-12)
+
+
 def test_the_tolerance_decides_what_is_distinct():
     row = mask_of([[0.0, 0], [1, 0], [2.03, 0]], 0.1, 4.0)
     assert analyse_redundancy(row).n_distinct == 3

@@ -101,6 +101,19 @@ def test_diameter_and_both(mask, bowl):
     assert abs(together.rms - math.sqrt(growth / 13)) < 4 * together.error
 
 
+@pytest.mark.parametrize("kind", ["position", "diameter", "both"])
+def test_only_what_is_asked_for_errs(mask, bowl, kind):
+    moved, resized = set(), set()
+
+    def record(aperture):
+        moved.add(bool((aperture.centers != mask.centers).any()))
+        resized.add(aperture.subaperture_diameter != mask.subaperture_diameter)
+        return bowl(aperture) / 5 * funnel(aperture) / 3
+
+    machining_tolerance(record, mask, 4e-5, kind=kind, n_draws=16, generator=seeded(14))
+    assert (True in moved, True in resized) == (kind != "diameter", kind != "position")
+
+
 def test_the_diameter_error_is_gaussian_and_common_to_all_holes(mask):
     seen = []
 
