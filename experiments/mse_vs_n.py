@@ -1,0 +1,293 @@
+"""How many holes: the relative MSE of the best mask against N, at constant collecting area.
+
+    python experiments/mse_vs_n.py                                   # minutes
+    python experiments/mse_vs_n.py --budget 200000 --seed 0 1 2 3 4  # the best there are
+    python experiments/mse_vs_n.py --smoke                           # everything, tiny, in seconds
+
+MSE_a, of several searches each, and beside it the mean Wiener MSE of the same masks under full von Karman screens. The
+picture, the numbers and what they say go to a new folder, runs/<name>/; searches and draws are kept in --sweep, one
+file each, so that a run that was stopped goes on, and experiments/optimal_masks.py shares them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import tyro
+
+from torchmask._drawing import COLORS, FAINT, INK, new_figure, styled
+from torchmask.design.space import Design, DesignSpace
+from torchmask.design.table import DesignTable, design_table
+from torchmask.io import atomic_write, write_json
+from torchmask.progress import Progress
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_FLAT = (0.9, 0.95)  # shares of the whole drop between which the curve is said to flatten
+_TOUCHING = 6.0121  # piston structure function of two touching holes [(d/r0)^(5/3)], Kolmogorov, by integration
+
+
+@dataclass(frozen=True)
+class Config:
+    """Everything a run depends on."""
+
+    n_subapertures: tuple[int, ...] = tuple(range(3, 21))
+    """Numbers of holes, N."""
+    fill_factor: float = 0.15
+    """Collecting area N d^2 / D^2."""
+    n_photons: float = 1e7
+    """Per exposure."""
+    n_frames: int = 20
+    """Exposures, K."""
+    exponent: float = 1.5
+    """Of the power-law power spectrum of the object."""
+    d_over_r0: float = 7.0
+    """Strength of the turbulence, D / r0."""
+    max_hole_over_r0: float = 1.5
+    """Largest holes that are tried in that turbulence, d / r0."""
+    n_draws: int = 4
+    """Stacks of K exposures drawn through each mask."""
+    n_pixels: int = 256
+    """Frequency grid, per side."""
+    seed: tuple[int, ...] = (0, 1)
+    """Of the searches; their scatter is that of the curve."""
+    budget: int = 10_000
+    """Evaluations of each search."""
+    workers: int | None = None
+    """Processes at a time; None: one per core."""
+    backend: Literal["loky", "ray"] = "loky"
+    """This machine or a Ray cluster."""
+    smoke: bool = False
+    """Everything tiny, to see that it runs."""
+    name: str | None = None
+    """Folder of the run below `runs`; None: date and time."""
+    runs: Path = Path("runs")
+    """Where run folders are made."""
+    sweep: Path = Path("runs/sweep")
+    """Where searches and draws are kept, to go on after an interruption."""
+
+
+def space(config: Config, turbulence: bool) -> DesignSpace:
+    """One search for each N and seed; under turbulence without the holes that are too large for it."""
+    return DesignSpace(
+        n_subapertures=config.n_subapertures,
+        fill_factor=(config.fill_factor,),
+        n_photons=(config.n_photons,),
+        reference_fill_factor=config.fill_factor,
+        n_frames=(config.n_frames,),
+        diameter_over_r0=(config.d_over_r0,) if turbulence else (),
+        max_hole_over_r0=config.max_hole_over_r0,
+        seed=config.seed,
+        n_pixels=config.n_pixels,
+        exponent=config.exponent,
+        n_draws=config.n_draws,
+        budget=config.budget,
+    )
+
+
+def curve(config: Config, still: DesignTable, turbulent: DesignTable) -> list[dict[str, Any]]:
+    """A row for each N: the best of the searches, their scatter, and the turbulence at the best."""
+    rows = []
+    for n in config.n_subapertures:
+        found = [row for row in still.rows if row.n_subapertures == n]
+        if any(row.infeasible for row in found):
+            raise ValueError(f"no mask of {n} holes: {found[0].infeasible}")
+        errors = [error(row) for row in found]
+        best = found[errors.index(min(errors))]
+        (measured,) = (row for row in turbulent.rows if (row.n_subapertures, row.seed) == (n, best.seed))
+        hole = best.subaperture_diameter / still.space.mask_diameter * config.d_over_r0
+        rows.append(
+            {
+                "n_subapertures": n,
+                "relative_mse": min(errors),
+                "above_floor": best.above_floor,
+                "all_seeds": errors,
+                "scatter": max(errors) / min(errors) - 1,
+                "wiener_mse": measured.wiener_mse,
+                "wiener_error": measured.wiener_error,
+                "hole_over_r0": hole,
+                "coherence_of_touching_holes": math.exp(-_TOUCHING * hole ** (5 / 3) / 2),
+                "not_tried_in_turbulence": measured.infeasible,
+            }
+        )
+    return rows
+
+
+def error(row: Design) -> float:
+    """Relative MSE_a of a row that has a mask."""
+    assert row.relative_mse is not None
+    return row.relative_mse
+
+
+def rises(rows: Sequence[dict[str, Any]]) -> list[tuple[int, int, float, float]]:
+    """(N, next N, rise, scatter) wherever the curve goes up: relative rise, and the larger scatter of the two."""
+    found = []
+    for row, following in itertools.pairwise(rows):
+        rise = following["relative_mse"] / row["relative_mse"] - 1
+        if rise > 0:
+            scatter = max(row["scatter"], following["scatter"])
+            found.append((row["n_subapertures"], following["n_subapertures"], rise, scatter))
+    return found
+
+
+def reached(rows: Sequence[dict[str, Any]], share: float) -> int:
+    """The smallest N that has made `share` of the drop from the first N to the lowest MSE."""
+    errors = [row["relative_mse"] for row in rows]
+    goal = max(errors[0] - share * (errors[0] - min(errors)), min(errors))  # but for rounding
+    return next(row["n_subapertures"] for row, value in zip(rows, errors, strict=True) if value <= goal)
+
+
+def findings(config: Config, rows: Sequence[dict[str, Any]]) -> list[str]:
+    """What the numbers say, in sentences."""
+    by_n = {row["n_subapertures"]: row for row in rows}
+    first, last = rows[0], rows[-1]
+    begin, end = (reached(rows, share) for share in _FLAT)
+    lines = [
+        f"From N = {first['n_subapertures']} to {last['n_subapertures']} the relative MSE falls from "
+        f"{first['relative_mse']:.4f} to {last['relative_mse']:.4f}. It flattens between N = {begin} and {end}, where "
+        f"{100 * _FLAT[0]:.0f} and {100 * _FLAT[1]:.0f} % of the drop are made."
+    ]
+    steps = [
+        f"{a['n_subapertures']} to {b['n_subapertures']}: {100 * (1 - b['relative_mse'] / a['relative_mse']):.1f} %"
+        for a, b in itertools.pairwise(rows)
+    ]
+    lines.append(f"What each further hole gains: {'; '.join(steps)}.")
+    lines.append(f"Scatter of {len(config.seed)} searches: at most {100 * max(r['scatter'] for r in rows):.2f} %.")
+    up = rises(rows)
+    if up:
+        worse = "; ".join(f"{a} to {b} by {100 * r:.2f} % (scatter {100 * s:.2f} %)" for a, b, r, s in up)
+        beyond = any(r > s for _, _, r, s in up)
+        lines.append(f"The curve goes up {'BEYOND' if beyond else 'within'} the scatter of the searches: {worse}.")
+    else:
+        lines.append("The curve never goes up.")
+    if 11 in by_n and last["n_subapertures"] > 11:
+        lines.append(judge_eleven(config, first, by_n[11], last))
+    tried = [row for row in rows if row["wiener_mse"] is not None]
+    ratios = [row["wiener_mse"] / row["relative_mse"] - 1 for row in tried]
+    lines.append(
+        f"Under von Karman screens of D/r0 = {config.d_over_r0:g} the Wiener MSE of {config.n_frames} exposures, with "
+        f"every OTF known, differs from MSE_a by {100 * min(ratios):+.2f} to {100 * max(ratios):+.2f} %."
+    )
+    lines += [
+        f"N = {row['n_subapertures']} is not tried in turbulence: {row['not_tried_in_turbulence']}."
+        for row in rows
+        if row["not_tried_in_turbulence"]
+    ]
+    return lines
+
+
+def judge_eleven(config: Config, first: dict[str, Any], own: dict[str, Any], last: dict[str, Any]) -> str:
+    """What N = 11 gives up, and what it spares."""
+    share = (first["relative_mse"] - own["relative_mse"]) / (first["relative_mse"] - last["relative_mse"])
+    rest = 100 * (1 - last["relative_mse"] / own["relative_mse"])
+    more = last["n_subapertures"]
+    verdict = "N = 11 is a reasonable choice" if share >= _FLAT[0] else "N = 11 is too few by this measure"
+    return (
+        f"{verdict}: it has made {100 * share:.0f} % of the drop, and all {more - 11} further holes together gain "
+        f"{rest:.0f} %. Each hole adds its aberrations to what the restoration must find, and holes shrink: at "
+        f"D/r0 = {config.d_over_r0:g} those of N = 11 are {own['hole_over_r0']:.2f} r0 wide and touching ones keep a "
+        f"coherence of {own['coherence_of_touching_holes']:.2f}; at N = {more} it is {last['hole_over_r0']:.2f} r0 and "
+        f"{last['coherence_of_touching_holes']:.2f}, so that independent pistons, on which MSE_a rests, hold less."
+    )
+
+
+def markdown(config: Config, rows: Sequence[dict[str, Any]]) -> str:
+    """The numbers, for readers."""
+    lines = [
+        "# Relative MSE against the number of holes",
+        "",
+        f"D = 1 m, N d^2 / D^2 = {config.fill_factor:g}, p = {config.exponent:g}, {config.n_photons:g} photons, "
+        f"K = {config.n_frames}, {config.n_pixels} frequencies a side; {len(config.seed)} searches of {config.budget} "
+        f"evaluations. ± is one standard error of {config.n_draws} stacks of exposures.",
+        "",
+        *(f"- {line}" for line in findings(config, rows)),
+        "",
+        "| N | relative MSE | above the floor | scatter | Wiener MSE in turbulence | d/r0 | coherence of neighbours |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        wiener = "-"
+        if row["wiener_mse"] is not None:
+            wiener = f"{row['wiener_mse']:.4f} ± {row['wiener_error']:.4f}"
+        lines.append(
+            f"| {row['n_subapertures']} | {row['relative_mse']:.4f} | {row['above_floor']:.4f} | "
+            f"{100 * row['scatter']:.2f} % | {wiener} | {row['hole_over_r0']:.2f} | "
+            f"{row['coherence_of_touching_holes']:.3f} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+@styled
+def figure(config: Config, rows: Sequence[dict[str, Any]]) -> Figure:
+    """The curve, all searches, the floor and the turbulence; below, what each further hole gains."""
+    sheet = new_figure(6.4, 5.4)
+    top, bottom = sheet.subplots(2, 1, sharex=True, height_ratios=[2.2, 1])
+    n = [row["n_subapertures"] for row in rows]
+    best = [row["relative_mse"] for row in rows]
+    floor = best[0] - rows[0]["above_floor"]
+    top.plot(n, best, "-o", color=COLORS[0], markersize=4, label="MSE$_a$, best search")
+    others = [(row["n_subapertures"], value) for row in rows for value in row["all_seeds"]]
+    top.plot(*zip(*others, strict=True), "_", color=COLORS[0], markersize=9, label="each search")
+    tried = [row for row in rows if row["wiener_mse"] is not None]
+    top.errorbar(
+        [row["n_subapertures"] for row in tried],
+        [row["wiener_mse"] for row in tried],
+        [row["wiener_error"] for row in tried],
+        color=COLORS[1],
+        marker="s",
+        markersize=3.5,
+        linestyle="none",
+        capsize=2,
+        label=f"Wiener MSE, D/r$_0$ = {config.d_over_r0:g}",
+    )
+    top.axhline(floor, color=FAINT, linestyle="--", linewidth=0.9)
+    top.text(n[-1], floor, "no mask can change this ", color=INK, va="bottom", ha="right", fontsize=8)
+    top.set(ylabel="relative MSE", ylim=(0, None), title="At constant collecting area, the gain of further holes fades")
+    top.legend()
+    gain = [100 * (1 - after / before) for before, after in itertools.pairwise(best)]
+    bottom.bar(n[1:], gain, color=COLORS[0], width=0.6)
+    bottom.axhline(0, color=FAINT, linewidth=0.7)
+    bottom.set(xlabel="number of holes N", ylabel="gain of the\nN-th hole [%]", xticks=n)
+    return sheet
+
+
+def main(config: Config) -> int:
+    """Run in a new folder."""
+    directory = config.runs / (config.name or datetime.now().strftime("mse_vs_n-%Y%m%d-%H%M%S"))
+    if config.smoke:
+        config = dataclasses.replace(config, n_subapertures=(3, 4, 5), n_pixels=64, n_frames=2, n_draws=2, budget=200)
+    try:
+        if directory.exists():
+            raise ValueError(f"{directory} exists and is not overwritten: choose another --name")
+        with Progress() as progress:
+            options: dict[str, Any] = {"backend": config.backend, "n_workers": config.workers, "callback": progress}
+            still = design_table(space(config, turbulence=False), config.sweep, **options)
+            turbulent = design_table(space(config, turbulence=True), config.sweep, **options)
+        rows = curve(config, still, turbulent)
+        directory.mkdir(parents=True)
+        write_json(directory / "mse_vs_n.json", {"config": config, "rows": rows})
+        with atomic_write(directory / "mse_vs_n.md") as file:
+            file.write(markdown(config, rows).encode())
+        with atomic_write(directory / "mse_vs_n.png") as file:
+            figure(config, rows).savefig(file, format="png")
+    except KeyboardInterrupt:
+        print(f"\ninterrupted: call again with --sweep {config.sweep} to go on", file=sys.stderr)
+        return 130
+    except ValueError as problem:
+        print(f"mse_vs_n: {problem}", file=sys.stderr)
+        return 2
+    print(*findings(config, rows), f"written to {directory}", sep="\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Config, description=__doc__)))
