@@ -5,7 +5,7 @@ the lower ones, the sub-harmonics, as explicit sums of waves on lattices ever fi
 the smooth window gives the band a finite correlation length; and the period exceeds the field by at least that length.
 So no separation within the field meets the periodicity, and the covariance there is that of the spectrum (Poisson's
 summation formula). What is sampled also holds the frequencies beyond Nyquist, folded. The expected structure function
-is von Karman's to 0.6 % at one sample, where the folding is cut, and to 0.2 % from two samples to the whole field.
+is von Karman's to 0.3 %, 0.2 % for outer scales up to 20 times the field, from one sample to the whole field.
 """
 
 from __future__ import annotations
@@ -17,12 +17,13 @@ import torch
 from scipy.fft import next_fast_len
 from torch import Tensor
 
-from torchmask.optics.von_karman import von_karman_psd
+from torchmask.optics.von_karman import PSD_CONSTANT, von_karman_psd
 
 _RATIO = 3.0  # of the frequencies of successive bands
 _CUTOFF = 2.0  # of the first band, in units of 1 / margin
 _STEEPNESS = 6  # of the windows exp(-x^6)
 _NEGLIGIBLE = 1.55  # their x where they end
+_ALIASES = 1  # of the frequencies beyond Nyquist, on either side, that are told apart
 COMPLEX = {torch.float32: torch.complex64, torch.float64: torch.complex128}
 
 
@@ -47,9 +48,9 @@ def split_spectrum(
     sizes = [int(next_fast_len(math.ceil((e + margin) / s)) or 0) for e, s in zip(extent, step, strict=True)]
     # The spectrum is even, so one quadrant tells all.
     fy, fx = (torch.arange(n // 2 + 1, dtype=torch.float64) / (n * s) for n, s in zip(sizes, step, strict=True))
-    density = torch.zeros(len(fy), len(fx), dtype=torch.float64)
-    for alias_y in range(-2, 3):
-        for alias_x in range(-2, 3):
+    density = torch.full((len(fy), len(fx)), _beyond(step, r0, outer_scale), dtype=torch.float64)
+    for alias_y in range(-_ALIASES, _ALIASES + 1):
+        for alias_x in range(-_ALIASES, _ALIASES + 1):
             f = torch.hypot(fy[:, None] + alias_y / step[0], fx + alias_x / step[1])
             density += von_karman_psd(f, r0, outer_scale) * (1 - below(f, 0))
     density /= sizes[0] * step[0] * sizes[1] * step[1]
@@ -67,6 +68,19 @@ def split_spectrum(
         density = von_karman_psd(f, r0, outer_scale) * share / (periods[0] * periods[1])
         bands.append(Band(fy, fx, density.sqrt()))
     return bands
+
+
+def _beyond(step: tuple[float, float], r0: float, outer_scale: float) -> float:
+    """Density that the power beyond all aliases adds to the sampled spectrum, as if it were white [rad^2 m^2].
+
+    The radial integral of the spectrum from the edge of the aliases, a rectangle, to infinity is closed; the angular
+    one is a mean over a quarter turn.
+    """
+    n = 64
+    angle = math.pi / (2 * n) * (torch.arange(n, dtype=torch.float64) + 0.5)
+    edge = (_ALIASES + 0.5) * torch.minimum(1 / (step[0] * angle.sin()), 1 / (step[1] * angle.cos()))
+    power = 1.2 * math.pi * PSD_CONSTANT * r0 ** (-5 / 3) * (edge**2 + outer_scale**-2) ** (-5 / 6)
+    return float(power.mean()) * step[0] * step[1]
 
 
 class RandomField:
