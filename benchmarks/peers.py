@@ -209,7 +209,7 @@ def shift_and_add(frames: Tensor) -> np.ndarray:
 
 
 def average_psf(observation: Observation) -> np.ndarray:
-    """What shift-and-add makes of a star in such turbulence, from other screens: (H, W), sum 1, near the middle."""
+    """What shift-and-add makes of a star, through other screens: sum 1, peak in the middle of odd sides."""
     assert observation.r0 is not None
     rows, columns = observation.grid.shape
     star = torch.zeros(rows, columns, dtype=torch.float64)
@@ -220,6 +220,9 @@ def average_psf(observation: Observation) -> np.ndarray:
         star, observation.aperture, observation.grid, turbulence, Detector(), _PSF_FRAMES, generator
     )
     psf = shift_and_add(stars.frames).clip(min=0)
+    peak = np.unravel_index(psf.argmax(), psf.shape)
+    psf = np.roll(psf, (rows // 2 - int(peak[0]), columns // 2 - int(peak[1])), axis=(0, 1))
+    psf = psf[1 - rows % 2 :, 1 - columns % 2 :]  # on even sides a PSF and its mirror image have different middles
     return psf / psf.sum()
 
 

@@ -1,0 +1,179 @@
+"""The side-by-side benchmark: that each peer is used as it should be, and that the table says what was measured."""
+
+import importlib.util
+import json
+import logging
+import sys
+from importlib.metadata import PackageNotFoundError
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from torchmask.grid import Grid
+from torchmask.metrics import score
+from torchmask.optics.aperture import FullAperture
+from torchmask.optics.detector import Detector
+from torchmask.optics.turbulence import TurbulencePhase
+from torchmask.simulation.observation import simulate_observation
+from torchmask.simulation.scene import SceneOptions, make_scene
+
+PATH = Path(__file__).parents[2] / "benchmarks" / "peers.py"
+GRID = Grid.nyquist(1.0, 550e-9, 48)
+
+
+@pytest.fixture(scope="module")
+def script():
+    spec = importlib.util.spec_from_file_location("peers", PATH)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["peers"] = module
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules["peers"]
+
+
+def observe(strength=3.0, n_frames=8):
+    scene = make_scene(GRID.shape, 1e7, SceneOptions(size=0.5))
+    turbulence = TurbulencePhase(1 / strength, 20.0)
+    generator = torch.Generator().manual_seed(0)
+    return simulate_observation(scene, FullAperture(0.95), GRID, turbulence, Detector(1.5), n_frames, generator)
+
+
+@pytest.fixture(scope="module")
+def observation():
+    return observe()
+
+
+def best_score(candidates, observation):
+    return min(score(candidate.image, observation.object, 0.5) for candidate in candidates)
+
+
+def test_shift_and_add_undoes_shifts_by_fractions_of_a_pixel(script):
+    sharp = make_scene((48, 48), 1.0, SceneOptions(size=0.5))
+    nu = torch.fft.fftfreq(48, dtype=torch.float64)
+    smooth = torch.fft.fft2(sharp) * torch.exp(-((nu[:, None] / 0.15) ** 2) - (nu / 0.15) ** 2)
+    shifts = [(0.0, 0.0), (1.3, -2.6), (-0.7, 0.4), (2.2, 1.9)]
+    ramps = [torch.exp(-2j * np.pi * (nu[:, None] * dy + nu * dx)) for dy, dx in shifts]
+    frames = torch.stack([torch.fft.ifft2(smooth * ramp).real for ramp in ramps])
+    assert score(frames.mean(0), frames[0], 0.5) > 0.1
+    # Registered to 0.1 pixel, so each is at most 0.05 pixel off in either direction: the slope times that.
+    slope = torch.stack([torch.fft.ifft2(smooth * 2j * np.pi * f).real.norm() for f in (nu[:, None], nu[None])]).norm()
+    assert score(script.shift_and_add(frames), frames[0], 0.5) < 0.05 * float(slope / frames[0].norm())
+
+
+def test_the_average_psf_is_sharper_than_the_long_exposure_and_of_unit_sum(script, observation):
+    psf = script.average_psf(observation)
+    assert psf.shape == (47, 47)
+    assert psf.sum() == pytest.approx(1, rel=1e-12)
+    # 8 frames scatter, but removing tip-tilt at D/r0 = 3 raises the peak by far more.
+    assert psf.max() > 1.2 * float(observation.psfs.mean(0).max())
+    assert np.unravel_index(psf.argmax(), psf.shape) == (23, 23)
+
+
+@pytest.mark.parametrize("method", ["richardson_lucy", "unsupervised_wiener", "known_psfs"])
+def test_each_deconvolution_improves_on_shift_and_add(script, observation, method):
+    config = script.Config()
+    before = best_score(script.added(observation, config), observation)
+    assert best_score(getattr(script, method)(observation, config), observation) < 0.8 * before
+
+
+def test_the_limit_is_ahead_of_every_peer(script, observation):
+    config = script.Config()
+    names = ("added", "richardson_lucy", "unsupervised_wiener")
+    peers = [best_score(getattr(script, name)(observation, config), observation) for name in names]
+    assert best_score(script.known_psfs(observation, config), observation) < min(peers)
+
+
+def test_torchmfbd_restores_and_leaves_nothing_behind(script, observation, tmp_path, monkeypatch, capsys):
+    pytest.importorskip("torchmfbd")
+    monkeypatch.chdir(tmp_path)
+    state, disabled = torch.get_rng_state(), logging.root.manager.disable
+    monkeypatch.setattr(script, "MFBD_SETTINGS", (script.MFBDSettings(20, 0.1, 0.1),))
+    candidates = list(script.mfbd(observation, script.Config(mfbd_iterations=60)))
+    assert len(candidates) == len(script._CUTOFFS)
+    added = best_score(script.added(observation, script.Config()), observation)
+    assert best_score(candidates, observation) < 0.8 * added
+    assert torch.equal(torch.get_rng_state(), state)
+    assert logging.root.manager.disable == disabled
+    assert torch.get_default_dtype() == torch.float32
+    assert list(tmp_path.iterdir()) == []
+    assert capsys.readouterr() == ("", "")
+
+
+def test_torchmfbd_gets_the_telescope_in_its_own_units(script, observation, monkeypatch):
+    torchmfbd = pytest.importorskip("torchmfbd")
+    from torchmfbd.util import psf_scale
+
+    class Seen(Exception):
+        pass
+
+    def look(config):
+        raise Seen(config)
+
+    monkeypatch.setattr(torchmfbd, "Deconvolution", look)
+    with pytest.raises(Seen) as caught:
+        script._run_mfbd(observation, script.MFBD_SETTINGS[0], 1)
+    config = caught.value.args[0]
+    scale = psf_scale(config["object1"]["wavelength"], config["telescope"]["diameter"], config["images"]["pix_size"])
+    # How many times the diameter the pupil plane is wide: wavelength / (pixel_scale D), 2 / 0.95 here.
+    assert scale == pytest.approx(2 / 0.95, rel=1e-12)
+
+
+def test_torchmfbd_is_not_asked_to_model_a_mask(script):
+    stack = script.simulated(script.Config(smoke=True))["satellite_mask"]
+    assert list(script.mfbd(stack, script.Config())) == []
+
+
+def test_a_peer_gets_the_best_of_its_candidates_and_of_clipping(script):
+    truth = make_scene((48, 48), 1e4, SceneOptions(size=0.5))
+    noise = torch.randn(48, 48, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    images = {"worse": truth + 20 * noise, "better": truth + 5 * noise}
+    candidates = [script.Candidate(name, image, 1.0) for name, image in images.items()]
+    row = script.best("peer", iter(candidates), truth, 0.5)
+    assert row["settings"] == "better"
+    assert row["score"] == score(images["better"].clamp(min=0), truth, 0.5) < score(images["better"], truth, 0.5)
+    assert script.best("peer", iter([]), truth, 0.5) is None
+
+
+def test_the_lead_leaves_out_who_knows_the_psfs(script):
+    scores = {script.OURS: 0.1, "torchmfbd": 0.2, "shift-and-add": 0.4, script.LIMIT: 0.05}
+    rows = [{"stack": "s", "method": name, "score": value} for name, value in scores.items()]
+    lead = script.lead(rows)
+    assert lead["best_peer"] == "torchmfbd"
+    assert (lead["lead"], lead["over_limit"]) == (pytest.approx(2.0), pytest.approx(2.0))
+
+
+def test_the_table_holds_every_method_with_versions(script, tmp_path, capsys):
+    pytest.importorskip("torchmfbd")
+    config = script.Config(smoke=True, runs=tmp_path, name="peers")
+    assert script.main(config) == 0
+    record = json.loads((tmp_path / "peers" / "peers.json").read_text())
+    found = {(row["stack"], row["method"]) for row in record["rows"]}
+    everything = {(stack, method) for stack in ("satellite_mask", "satellite_full") for method in script.METHODS}
+    assert everything - found == {("satellite_mask", "torchmfbd")}
+    assert all(0 < row["score"] < 1 and row["seconds"] >= 0 for row in record["rows"])
+    text = (tmp_path / "peers" / "peers.md").read_text()
+    assert text in capsys.readouterr().out
+    assert all(f"{name} {number}" in text for name, number in record["versions"].items())
+    assert script.main(config) == 2  # nothing is overwritten
+    assert "exists" in capsys.readouterr().err
+
+
+def test_a_missing_package_or_truth_is_one_line_before_any_work(script, observation, tmp_path, monkeypatch, capsys):
+    import dataclasses
+
+    path = tmp_path / "blind.npz"
+    dataclasses.replace(observation, object=None, psfs=None).save(path)
+    monkeypatch.setattr(script, "versions", dict)
+    assert script.main(script.Config(stacks=(path,), runs=tmp_path, name="new")) == 2
+    assert "lacks object, psfs" in capsys.readouterr().err
+    monkeypatch.undo()
+
+    def missing(name):
+        raise PackageNotFoundError(name)
+
+    monkeypatch.setattr(script, "version", missing)
+    assert script.main(script.Config(runs=tmp_path, name="new")) == 2
+    assert "torchmask[bench]" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
