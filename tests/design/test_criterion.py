@@ -434,7 +434,7 @@ def test_an_ordinary_optimiser_improves_a_mask() -> None:
 
 
 def test_diverged_centres_give_nan_and_no_crash() -> None:
-    criterion = criterion_of(grid_of(16))
+    criterion = criterion_of(grid_of((17, 19)))
     centers = uniform(3, 4, 2) - 0.5
     mask = mask_of(centers.clone())
     mask.centers[1, 2, 0] = math.nan
@@ -527,3 +527,17 @@ def test_impossible_psds_are_refused() -> None:
         criterion_of(grid).floor(0.0)
     with pytest.raises(ValueError, match="frame"):
         wiener_mse(torch.ones(8, 8), one[:8, :8], one[:8, :8])
+
+
+@pytest.mark.parametrize("shape", ["disc", "hexagon"])
+def test_works_on_the_device_of_the_centres(shape: str) -> None:
+    """The meta device stands for any other: it refuses to be mixed with the CPU."""
+    criterion = criterion_of(grid_of(16)).to("meta")
+    mask = mask_of(nn.Parameter(uniform(3, 4, 2) - 0.5), shape)
+    with pytest.raises(ValueError, match="must be on one device"):
+        criterion(mask)
+    value = criterion.relative(mask.to("meta"))
+    value.sum().backward()
+    assert (value.device.type, value.shape) == ("meta", (3,))
+    assert mask.centers.grad is not None
+    assert mask.centers.grad.device.type == "meta"

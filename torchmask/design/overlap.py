@@ -67,7 +67,7 @@ def disc_patches(x: Tensor, y: Tensor, constants: list[Tensor], differentiate: b
     those by the common shift of each patch's (x, y), (..., 2); it may be called once, and only if `differentiate`.
     """
     # All arrays in one allocation: the heap keeps one block for the next call where it would return several.
-    work = x.new_empty(4 if differentiate else 3, *torch.broadcast_shapes(x.shape, y.shape))
+    work = x.new_empty(4 if differentiate else 3, *x.shape[:-2], y.shape[-2], x.shape[-1])
     v, inverse, a = work[0], work[1], work[2]
     *series, one = constants
     tiny = torch.finfo(x.dtype).tiny * 1e3  # gives distance 0 a finite inverse, which x = y = 0 then multiplies
