@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchmask.design.merit import Criterion, Holes, Merit
 from torchmask.design.refine import PENALTY, Monitor
+from torchmask.design.starts import random_mask
 
 
 def evolve(
@@ -22,10 +23,9 @@ def evolve(
     import cma
 
     merit = Merit(criterion, holes, PENALTY)
-    generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
-    best, best_value = holes.random(1, generator)[0], np.inf
+    best, best_value = random_mask(holes, rng), np.inf
     while merit.evaluations + population <= budget:
-        start = holes.random(1, generator)[0].double().cpu().numpy()
+        start = random_mask(holes, rng).double().cpu().numpy()
         options = {
             "popsize": population,
             "randn": lambda *shape: rng.standard_normal(shape),

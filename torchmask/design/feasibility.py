@@ -64,7 +64,10 @@ class Inequality(Constraint):
 
 
 class LinearEquality(Constraint):
-    """A rule `matrix @ centers.flatten() = values`."""
+    """A rule `matrix @ centers.flatten() = values`: it pins holes, or ties them together by turns about the centre.
+
+    Searches stretch the disc radially and count on such rules to survive that.
+    """
 
     @abstractmethod
     def equations(self, n_subapertures: int) -> tuple[Array, Array]:

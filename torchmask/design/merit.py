@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
@@ -35,48 +36,57 @@ class Holes:
 
     Notes
     -----
-    Coordinates x (..., F) and margins are in units of the mask diameter.
+    Coordinates x (..., F) and margins are in units of the mask diameter. The plane of x is rolled onto the disc that
+    centres may lie in, |centre| = R sin(|x| / R): no centre can leave it, and a hole that is drawn to the rim, as in
+    most good masks, finds a smooth minimum there and not a wall.
     """
 
     def __init__(self, template: SparseAperture, constraints: Sequence[Constraint]) -> None:
         self.template = template
         self.constraints = tuple(constraints)
+        self.radius = center_radius(template) / template.mask_diameter
         self.subspace = Subspace(template.n_subapertures, constraints, template.centers)
+        pinned = self.subspace.origin.unflatten(-1, (-1, 2)) / template.mask_diameter
+        self.subspace.origin = self._unroll(pinned, 1.0).flatten(-2)
+
+    def _unroll(self, centers: Tensor, largest: float) -> Tensor:
+        """The inverse of the rolling; radii are brought below `largest` of the disc's, where the slope vanishes."""
+        length = torch.linalg.vector_norm(centers, dim=-1, keepdim=True) / self.radius
+        sine = length.clamp(max=largest)
+        return centers * torch.where(length > 0, sine.asin() / length, 1.0)
 
     def aperture(self, x: Tensor) -> SparseAperture:
         """The masks at x (..., F)."""
-        return with_centers(self.template, self.subspace.centers(x * self.template.mask_diameter))
+        plane = self.subspace.centers(x)
+        squared = (plane**2).sum(-1, keepdim=True)
+        length = torch.where(squared > 0, squared, 1.0).sqrt() * (squared > 0)
+        centers = plane * torch.sinc(length / (torch.pi * self.radius))
+        return with_centers(self.template, centers * self.template.mask_diameter)
 
     def coordinates(self, centers: Tensor) -> Tensor:
-        """The coordinates of the masks nearest to `centers` (..., N, 2) [m] that obey the equalities."""
-        return self.subspace.coordinates(centers) / self.template.mask_diameter
+        """The coordinates of masks near `centers` (..., N, 2) [m] that obey the equalities; off the rim by 1e-3."""
+        return self.subspace.coordinates(self._unroll(centers / self.template.mask_diameter, 0.999))
 
     def margins(self, x: Tensor) -> Tensor:
         """Margins (..., M) of all inequalities."""
         return all_margins(self.aperture(x), self.constraints) / self.template.mask_diameter
 
     def place(self, x: Tensor, hole: int, position: Tensor) -> Tensor:
-        """x with one hole moved to `position` (..., 2), as far as it may, and all that is tied to it."""
-        scale = self.template.mask_diameter
-        return self.subspace.place(x * scale, hole, position * scale) / scale
-
-    def random(self, n: int, generator: torch.Generator) -> Tensor:
-        """Coordinates (n, F) of masks whose holes are thrown into the disc, whether they overlap or not."""
-        x = self.coordinates(self.template.centers).expand(n, -1)
-        for hole in range(self.template.n_subapertures):
-            x = self.place(x, hole, self.random_positions(n, generator).to(x))
-        return x
-
-    def random_positions(self, n: int, generator: torch.Generator) -> Tensor:
-        """n centres (n, 2), uniform over the disc that centres may lie in, in mask diameters."""
-        radius = (1 - self.template.subaperture_diameter / self.template.mask_diameter) / 2
-        u = torch.rand(n, 2, generator=generator, dtype=torch.float64)
-        angle = 2 * torch.pi * u[:, 1]
-        return radius * u[:, :1].sqrt() * torch.stack([angle.cos(), angle.sin()], dim=-1)
+        """x (..., F) with one hole at `position` (..., 2) [mask diameters], as far as it may, and all tied to it."""
+        return self.subspace.place(x, hole, self._unroll(position.to(x), 1.0))
 
     def feasible(self, x: Tensor) -> SparseAperture:
         """The mask nearest to x (F,) that obeys all rules, to rounding. Raises `Infeasible` if none is found."""
-        return project(self.aperture(x), self.constraints)
+        return project(self.aperture(x.detach()), self.constraints)
+
+
+def center_radius(aperture: SparseAperture) -> float:
+    """Radius of the disc outside of which no centre can lie if the hole is to be inside the mask [m]."""
+    diameter = aperture.subaperture_diameter
+    if aperture.shape == "disc":
+        return (aperture.mask_diameter - diameter) / 2
+    # a hexagon that shows a side to the rim reaches farthest
+    return math.sqrt(max(0.0, aperture.mask_diameter**2 / 4 - diameter**2 / 12)) - diameter / 2
 
 
 class Evaluation(NamedTuple):

@@ -45,8 +45,8 @@ def search_mask(
     fill_factor : float
         N d^2 / D^2, which sets the diameter d of the holes.
     method : {"hybrid", "cma"}
-        "cma": CMA-ES with penalties, the published method. "hybrid": batched quasi-Newton descents from random masks, then
-        basin hopping on a pool of the best, on a coarse frequency grid; better at equal time.
+        "cma": CMA-ES with penalties, the published method. "hybrid": batched quasi-Newton descents from random
+        masks, then basin hopping on a pool of the best, on a coarse frequency grid; better at equal time.
     refine : bool
         End with a gradient stage on the grid of `criterion`. Without it the best mask of the search is only moved onto
         the rules.
@@ -81,7 +81,7 @@ def search_mask(
     else:
         budget = 100_000 if budget is None else budget
         monitor = Monitor("design/hybrid", budget, holes, callback)
-        starts, used = explore(coarse_criterion(criterion, diameter), holes, budget, rng, monitor)
+        starts, used = explore(coarse_criterion(criterion), holes, budget, rng, monitor)
     history = monitor.history
     if refine:
         allowance = 400 * len(starts)

@@ -1,0 +1,41 @@
+"""Random masks to begin a search from, and random changes to a good one."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchmask.design.merit import Holes
+
+
+def random_mask(holes: Holes, rng: np.random.Generator) -> Tensor:
+    """Coordinates (F,) of a random mask, whether holes overlap or not.
+
+    Masks range from an even spread over the disc to a ring at the rim, radius = R u^a with a drawn for each mask;
+    half of them have nearly even angles. Good masks of many holes are uneven rings, which an even spread misses.
+    """
+    n = holes.template.n_subapertures
+    radii = holes.radius * rng.random(n) ** rng.uniform(0, 0.5)
+    angles = 2 * math.pi * rng.random(n)
+    if rng.random() < 0.5:
+        angles = 2 * math.pi / n * (np.arange(n) + rng.random() * rng.standard_normal(n))
+    positions = torch.as_tensor(np.stack([radii * np.cos(angles), radii * np.sin(angles)], axis=-1))
+    x = holes.subspace.origin.new_zeros(holes.subspace.size)
+    for hole in range(n):
+        x = holes.place(x, hole, positions[hole])
+    return x
+
+
+def changed_mask(holes: Holes, x: Tensor, rng: np.random.Generator) -> Tensor:
+    """A start near the mask x (F,): all holes a little, one anywhere, or two anywhere."""
+    moved = int(rng.integers(3))
+    if moved == 0:
+        return x + 0.03 * torch.as_tensor(rng.standard_normal(len(x))).to(x)
+    n = holes.template.n_subapertures
+    for hole in rng.choice(n, size=min(n, moved), replace=False):
+        radius, angle = holes.radius * rng.random() ** rng.uniform(0, 0.5), 2 * math.pi * rng.random()
+        x = holes.place(x, int(hole), torch.tensor([radius * math.cos(angle), radius * math.sin(angle)]))
+    return x
