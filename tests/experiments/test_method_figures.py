@@ -7,6 +7,7 @@ import json
 import math
 
 import asymptotic_limit
+import design_table
 import mse_vs_n
 import numpy as np
 import optimal_masks
@@ -204,3 +205,18 @@ def test_the_scripts_share_their_searches(tmp_path):
     line = mse_vs_n.Config(runs=tmp_path, name="curve", workers=1, d_over_r0=3.0, n_draws=2, **settings)
     assert mse_vs_n.main(dataclasses.replace(line, n_frames=20)) == 0
     assert set((tmp_path / "sweep" / "tasks").glob("*search*")) == searches
+
+
+def test_the_table_on_the_command_line(tmp_path, capsys):
+    config = design_table.Config(tmp_path / "table", smoke=True, workers=1)
+    assert design_table.main(config) == 0
+    assert "d/r0 is 1.57, above 1.5" in capsys.readouterr().out  # three holes at D/r0 = 7
+    found = json.loads((tmp_path / "table" / "table.json").read_text())["rows"]
+    assert [row["infeasible"] is None for row in found] == [False, True]
+    assert found[1]["wiener_mse"] > 0
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "table" / "tasks").iterdir()}
+    assert design_table.main(config) == 0
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "table" / "tasks").iterdir()} == before
+    crowded = dataclasses.replace(config, space=dataclasses.replace(config.space, diameter_over_r0=(30.0,)))
+    assert design_table.main(crowded) == 2
+    assert "no combination can be designed" in capsys.readouterr().err

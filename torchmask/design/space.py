@@ -21,43 +21,45 @@ _MAY_BE_ZERO = ("seed", "exponent", "readout_noise")
 class DesignSpace:
     """What a design table varies, and what it holds fixed. Every combination of the first six is a row.
 
-    n_subapertures : numbers of holes N
-    fill_factor : collecting areas N d^2 / D^2
-    n_photons : photons per frame collected at `reference_fill_factor`; at other areas in proportion to N d^2
-    n_frames : numbers of exposures K
-    diameter_over_r0 : strengths of turbulence D / r0; none for MSE_a alone, without limit on d / r0
-    seed : seeds of the search
-    reference_fill_factor : where `n_photons` is quoted
-    max_hole_over_r0 : largest d / r0 that is designed for
-    mask_diameter, wavelength : [m]
-    n_pixels : of the image, sampled at Nyquist for D
-    exponent, knee : of the object's `PowerLawPSD`
-    readout_noise : [electrons rms per pixel]
-    outer_scale : of the turbulence [m]
-    n_draws : stacks of K exposures drawn, for the mean of `wiener_mse` and its standard error
-    method, budget : of `search_mask`
-
     Raises ValueError for an axis that is empty or repeats a value, and for values out of range.
     """
 
     n_subapertures: tuple[int, ...] = (6, 9, 11, 13, 16)
+    """Numbers of holes N."""
     fill_factor: tuple[float, ...] = (0.15,)
+    """Collecting areas N d^2 / D^2."""
     n_photons: tuple[float, ...] = (1e7,)
+    """Photons per frame at `reference_fill_factor`; other areas collect in proportion to N d^2."""
     n_frames: tuple[int, ...] = (20,)
+    """Numbers of exposures K."""
     diameter_over_r0: tuple[float, ...] = (7.0,)
+    """Strengths of turbulence D / r0; none at all: MSE_a alone, without limit on d / r0."""
     seed: tuple[int, ...] = (0,)
+    """Seeds of the search."""
     reference_fill_factor: float = 0.15
+    """Where `n_photons` is quoted."""
     max_hole_over_r0: float = 1.5
+    """Largest d / r0 that is designed for."""
     mask_diameter: float = 1.0
+    """D [m]."""
     wavelength: float = 550e-9
+    """[m]"""
     n_pixels: int = 256
+    """Of the image, per side, sampled at Nyquist for D."""
     exponent: float = 1.5
+    """Of the object's power-law power spectrum."""
     knee: float = 1 / 64
+    """Frequency below which that spectrum is flat [cycles/pixel]."""
     readout_noise: float = 0.0
+    """[electrons rms per pixel]"""
     outer_scale: float = 20.0
+    """Of the turbulence [m]."""
     n_draws: int = 16
+    """Stacks of K exposures drawn, for the mean of `wiener_mse` and its standard error."""
     method: str = "hybrid"
+    """Of `search_mask`."""
     budget: int | None = None
+    """Of `search_mask`."""
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
