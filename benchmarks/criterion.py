@@ -19,7 +19,7 @@ import math
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -202,7 +202,8 @@ def main(config: Config) -> None:
     if config.threads is not None:
         torch.set_num_threads(config.threads)
     if config.smoke:
-        config = Config(config.device, config.dtype, config.threads, (6,), (64,), (1, 4), 0.05, True)
+        config = replace(config, n_subapertures=(6,), n_pixels=(64,), populations=(1, 4), seconds=0.05)
+    measure(replace(config, seconds=0.0), 3, 64, 1)  # what is imported or compiled at a first call
     where = torch.cuda.get_device_name(config.device) if config.device.startswith("cuda") else "CPU"
     print(f"{where}, {torch.get_num_threads()} threads, {config.dtype}, torch {torch.__version__}; milliseconds\n")
     print(
