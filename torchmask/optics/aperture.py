@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from torchmask.grid import Grid
+from torchmask.optics.packing import hole_diameter, random_packing
 from torchmask.optics import catalog
 
 SHAPES = ("disc", "hexagon")
@@ -262,6 +263,38 @@ class SparseAperture(Aperture):
         (6, 0.15)
         """
         return cls(**catalog.layout(name, mask_diameter, fill_factor, mirrored), dtype=dtype, device=device)
+
+    @classmethod
+    def random(
+        cls,
+        n_subapertures: int,
+        mask_diameter: float,
+        fill_factor: float,
+        generator: torch.Generator | None = None,
+        *,
+        dtype: torch.dtype | None = None,
+        device: torch.device | str | None = None,
+    ) -> SparseAperture:
+        """A mask of round holes at random places, inside the disc and without overlap.
+
+        Parameters
+        ----------
+        n_subapertures : int
+            N.
+        mask_diameter : float
+            D [m].
+        fill_factor : float
+            N d^2 / D^2, which sets the diameter d of the holes.
+        generator : torch.Generator, optional
+
+        Raises
+        ------
+        ValueError
+            If the holes cannot be packed; the message says the largest fill factor that can.
+        """
+        diameter = hole_diameter(n_subapertures, mask_diameter, fill_factor)
+        centers = random_packing(n_subapertures, mask_diameter, fill_factor, generator)
+        return cls(centers, diameter, mask_diameter, dtype=dtype, device=device)
 
     @property
     def fill_factor(self) -> float:

@@ -1,0 +1,163 @@
+"""How large N equal discs in a larger disc can be, and random masks of discs that fit."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from scipy.optimize import minimize
+from torch import Tensor
+
+# Diameter of the enclosing disc over that of N = 1, 2, ... equal discs packed in it, the smallest known: R. L. Graham,
+# B. D. Lubachevsky, K. J. Nurmela, P. R. J. Ostergard, Discrete Mathematics 181, 139 (1998); E. Specht, packomania.com.
+# Proven optimal up to 14 and for 19.
+_RATIOS = (
+    1.0,
+    2.0,
+    1 + 2 / math.sqrt(3),
+    1 + math.sqrt(2),
+    1 + math.sqrt(2 * (1 + 1 / math.sqrt(5))),
+    3.0,
+    3.0,
+    1 + 1 / math.sin(math.pi / 7),
+    1 + math.sqrt(2 * (2 + math.sqrt(2))),
+    3.8130256313981246,
+    1 + 1 / math.sin(math.pi / 9),
+    4.0296019301161834,
+    2 + math.sqrt(5),
+    4.3284285548608363,
+    1 + math.sqrt(6 + 2 / math.sqrt(5) + 4 * math.sqrt(1 + 2 / math.sqrt(5))),
+    4.6154255948731940,
+    4.7920337488105831,
+    1 + math.sqrt(2) + math.sqrt(6),
+    1 + math.sqrt(2) + math.sqrt(6),
+    5.1223207369915291,
+)
+_ATTEMPTS = 60
+_ROUNDING = 1e-12  # of the mask diameter
+
+
+def largest_fill_factor(n_subapertures: int) -> float:
+    """The largest N d^2 / D^2 of N discs of diameter d inside one of diameter D.
+
+    Up to N = 20 the best packing known; beyond, an upper bound that no packing reaches (N. Oler, Acta Mathematica 105,
+    19 (1961): at most 2/sqrt(3) area + perimeter/2 + 1 points at distances of at least 1 lie in a convex figure).
+    """
+    n = n_subapertures
+    if n <= len(_RATIOS):
+        return n / _RATIOS[n - 1] ** 2
+    area = 2 * math.pi / math.sqrt(3)  # radius of the centres' disc in hole diameters: area r^2 + pi r + 1 = N
+    radius = (math.sqrt(math.pi**2 + 4 * area * (n - 1)) - math.pi) / (2 * area)
+    return n / (1 + 2 * radius) ** 2
+
+
+def hole_diameter(n_subapertures: int, mask_diameter: float, fill_factor: float) -> float:
+    """Diameter d [m] of N holes in a disc of diameter D with N d^2 / D^2 = `fill_factor`.
+
+    Raises
+    ------
+    ValueError
+        For numbers out of range and for holes that cannot be packed: says the largest fill factor that can.
+    """
+    if n_subapertures != int(n_subapertures) or n_subapertures < 1:
+        raise ValueError(f"n_subapertures is {n_subapertures}: it must be a whole number of at least 1")
+    if not (math.isfinite(mask_diameter) and mask_diameter > 0):
+        raise ValueError(f"mask_diameter is {mask_diameter}: it must be finite and positive, in m")
+    largest = largest_fill_factor(int(n_subapertures))
+    if not 0 < fill_factor <= largest * (1 + 1e-12):
+        stated = math.floor(largest * 1e5) / 1e5
+        raise ValueError(
+            f"fill_factor is {fill_factor}: {n_subapertures} round holes in a disc need N d^2/D^2 above 0 and at most "
+            f"{stated:.5f}, which is {'the best packing known' if n_subapertures <= len(_RATIOS) else 'a bound'}"
+        )
+    return mask_diameter * math.sqrt(fill_factor / n_subapertures)
+
+
+def random_packing(
+    n_subapertures: int, mask_diameter: float, fill_factor: float, generator: torch.Generator | None = None
+) -> Tensor:
+    """Centres (N, 2) [m], float64, of randomly placed holes that lie in the mask disc and do not overlap.
+
+    Holes fall uniformly into the disc and push each other apart until they fit. Raises ValueError if they cannot.
+    """
+    reach = hole_diameter(n_subapertures, 1.0, fill_factor)
+    best = 0.0
+    for _ in range(_ATTEMPTS):
+        u = torch.rand(n_subapertures, 2, generator=generator, dtype=torch.float64).numpy()
+        angle = 2 * math.pi * u[:, 1]
+        thrown = (1 - reach) / 2 * np.sqrt(u[:, :1]) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        for centers in (thrown, relaxed := _push_apart(thrown, reach)):
+            if _largest_diameter(centers) >= reach - _ROUNDING:
+                return torch.as_tensor(mask_diameter * centers)
+        inflated = _inflate(relaxed)
+        best = max(best, _largest_diameter(inflated))
+        if best >= reach - _ROUNDING:
+            return torch.as_tensor(mask_diameter * inflated)
+    raise ValueError(
+        f"fill_factor is {fill_factor}: in {_ATTEMPTS} attempts {n_subapertures} round holes were packed into the disc "
+        f"with at most {math.floor(n_subapertures * best**2 * 1e5) / 1e5:.5f}"
+    )
+
+
+def _largest_diameter(centers: np.ndarray) -> float:
+    """Of discs at these centres that neither overlap nor leave the disc of diameter 1."""
+    to_rim = 1 - 2 * np.linalg.norm(centers, axis=-1).max()
+    first, second = np.triu_indices(len(centers), 1)
+    return float(min(to_rim, np.linalg.norm(centers[first] - centers[second], axis=-1).min(initial=np.inf)))
+
+
+def _push_apart(centers: np.ndarray, diameter: float) -> np.ndarray:
+    """Minimise the sum of the squared overlaps of the discs, which are taken a little larger to end clear."""
+    diameter = diameter * (1 + 1e-6)
+    first, second = np.triu_indices(len(centers), 1)
+
+    def energy(flat: np.ndarray) -> tuple[float, np.ndarray]:
+        points = flat.reshape(-1, 2)
+        apart = points[first] - points[second]
+        distance = np.maximum(np.linalg.norm(apart, axis=-1), 1e-12)
+        radius = np.maximum(np.linalg.norm(points, axis=-1), 1e-12)
+        overlap = np.maximum(diameter - distance, 0)
+        beyond = np.maximum(radius - (1 - diameter) / 2, 0)
+        push = (overlap / distance)[:, None] * apart
+        gradient = 2 * (beyond / radius)[:, None] * points
+        np.add.at(gradient, first, -2 * push)
+        np.add.at(gradient, second, 2 * push)
+        return float((overlap**2).sum() + (beyond**2).sum()), gradient.ravel()
+
+    # The energy is a square: 1e-16 leaves overlaps of 1e-8, less than what the discs were enlarged by.
+    return minimize(energy, centers.ravel(), jac=True, method="L-BFGS-B", tol=1e-18).x.reshape(-1, 2)
+
+
+def _inflate(centers: np.ndarray) -> np.ndarray:
+    """Move the centres to the locally largest equal discs that fit (sequential quadratic programming)."""
+    n = len(centers)
+    first, second = np.triu_indices(n, 1)
+    size = _largest_diameter(centers)
+    near = np.linalg.norm(centers[first] - centers[second], axis=-1) < 2.5 * max(size, 0.9 / math.sqrt(n))
+    first, second = first[near], second[near]
+    rows = np.arange(len(first))
+
+    def clearance(z: np.ndarray) -> np.ndarray:
+        points, d = z[:-1].reshape(-1, 2), z[-1]
+        pairs = ((points[first] - points[second]) ** 2).sum(-1) - d**2
+        return np.concatenate([pairs, (1 - d) ** 2 / 4 - (points**2).sum(-1)])
+
+    def jacobian(z: np.ndarray) -> np.ndarray:
+        points, d = z[:-1].reshape(-1, 2), z[-1]
+        slope = np.zeros((len(first) + n, n, 2))
+        apart = 2 * (points[first] - points[second])
+        slope[rows, first], slope[rows, second] = apart, -apart
+        slope[len(first) + np.arange(n), np.arange(n)] = -2 * points
+        by_size = np.concatenate([np.full(len(first), -2 * d), np.full(n, -(1 - d) / 2)])
+        return np.concatenate([slope.reshape(len(slope), -1), by_size[:, None]], axis=1)
+
+    result = minimize(
+        lambda z: (-z[-1], np.append(np.zeros(2 * n), -1.0)),
+        np.append(centers.ravel(), size),
+        jac=True,
+        method="SLSQP",
+        constraints={"type": "ineq", "fun": clearance, "jac": jacobian},
+        options={"maxiter": 200, "ftol": 1e-15},
+    )
+    return result.x[:-1].reshape(-1, 2)
