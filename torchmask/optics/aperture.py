@@ -14,8 +14,8 @@ import torch
 from torch import Tensor, nn
 
 from torchmask.grid import Grid
-from torchmask.optics.packing import hole_diameter, random_packing
 from torchmask.optics import catalog
+from torchmask.optics.packing import hole_diameter, random_packing
 
 SHAPES = ("disc", "hexagon")
 
