@@ -135,11 +135,7 @@ class JointProblem:
         return replace(state, image=image, z=z)
 
     def calibrate(self, state: State) -> State:
-        """The state with the gains that fit best, 1 on average, and the excess that is left then.
-
-        A frame that the model cannot follow, because it has fallen into a local minimum or its phase has more
-        detail than the modes, counts for less: the scale of its residuals is estimated with everything else.
-        """
+        """The state with the gains that fit best, 1 on average, and the excess that is left then."""
         gains, squares = [], []
         for part in self.model.chunks(len(state.z)):
             frames, model = self.frames[part], self.model(state.image, state.z[part])

@@ -31,8 +31,9 @@ if TYPE_CHECKING:
     from torchmask.restoration.myopic import MyopicDeconvolution
 
 SEGMENT = 100  # iterations between restarts of L-BFGS-B
-_SETTLED = 0.03  # relative decrease in a segment below which the place between the pixels is worth looking for
-_CENTRINGS = 2  # how often at most
+_BLURRED = 300  # iterations after which the object is sharp enough to look for its place and for lost frames
+_CENTRINGS = 3  # how often that is done
+_CONTINUATION = 30.0  # the first noise variance: what the mean frame leaves unexplained over this
 _START = 0.7  # rms of the first whitened aberrations of a point-symmetric pupil
 _SEED = 0
 _BRIGHT_BORDER = 0.5  # of the mean pixel
@@ -100,12 +101,9 @@ class Restoration:
         after = float(problem.cost(state, state.image, state.z)[0])
         decrease = (before - after) / abs(after)
         both = len(problem.free) == 2
-        if both and decrease < _SETTLED and progress.centrings < _CENTRINGS and left > SEGMENT:
-            progress.centrings += 1
-            fitted = problem.calibrate(state)
-            state, evaluations = repair(problem, state, fitted.excess, seed=progress.centrings)
-            progress.n_evaluations += evaluations
-            progress.state = centre_on_pixels(problem, state)
+        if both and progress.centrings < _CENTRINGS and left > SEGMENT:
+            if len(progress.costs) >= _BLURRED:
+                self._relocate(progress)
         elif decrease < method.tolerance:
             progress.message = f"converged: the last {SEGMENT} iterations lowered the cost by a fraction {decrease:.1e}"
             return
@@ -114,13 +112,23 @@ class Restoration:
             return
         progress.state = self._update(progress.state)
 
+    def _relocate(self, progress: _Progress) -> None:
+        """What no descent does: frames in a local minimum start anew, the object moves between the pixels."""
+        progress.centrings += 1
+        excess = self.problem.calibrate(progress.state).excess
+        state, evaluations = repair(self.problem, progress.state, excess, seed=progress.centrings)
+        progress.n_evaluations += evaluations
+        progress.state = centre_on_pixels(self.problem, state)
+        if progress.state is state:  # it is where it belongs
+            progress.centrings = _CENTRINGS
+
     def _update(self, state: State) -> State:
         """Gains, excess noise and strength of the turbulence as the state itself tells them.
 
-        Frames of a mask keep their full weight: those that fit badly are what draws a wrong object to the right one.
+        The excess is common to all frames: those that fit badly are what draws a wrong object to the right one.
         """
-        fitted = self.problem.calibrate(state)
-        state = fitted if self._symmetric else replace(fitted, excess=state.excess)
+        state = self.problem.calibrate(state)
+        state = replace(state, excess=state.excess.mean().expand_as(state.excess).clone())
         if self.method.known_r0 or not self.method.aberration_prior or "aberrations" not in self.problem.free:
             return state
         strength = turbulence_strength(self._coefficients(state.z), self.model.mixing)
@@ -149,11 +157,9 @@ class Restoration:
         gains = self.frames.mean((1, 2)).double()
         gains = gains / gains.mean()
         prior = 1.0 if self.method.aberration_prior else 0.0
-        excess = torch.ones_like(gains)
-        if self._symmetric:
-            # What the mean frame leaves unexplained; else the first steps overfit with the modes that move least.
-            change = self.frames - gains[:, None, None].to(self.frames) * self.frames.mean(0)
-            excess = (change**2 * self.problem.precision).mean((1, 2)).double().clamp(min=1)
+        change = self.frames - gains[:, None, None].to(self.frames) * self.frames.mean(0)
+        unexplained = float((change**2 * self.problem.precision).mean()) / _CONTINUATION
+        excess = torch.full_like(gains, max(1.0, unexplained))
         state = State(image, z, gains, prior, excess)
         return _Progress(state) if start is None else self._warm(state, start)
 
