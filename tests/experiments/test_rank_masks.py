@@ -1,12 +1,10 @@
 import csv
 import dataclasses
-import importlib.util
 import json
 import math
-import sys
-from pathlib import Path
 
 import pytest
+import rank_masks
 import torch
 
 from torchmask.design.constraints import InsideDisc, NoOverlap
@@ -14,39 +12,27 @@ from torchmask.design.manufacture import load_mask
 from torchmask.optics import catalog
 from torchmask.optics.aperture import SparseAperture
 
-PATH = Path(__file__).parents[2] / "experiments" / "rank_masks.py"
-
 
 @pytest.fixture(scope="module")
-def script():
-    spec = importlib.util.spec_from_file_location("rank_masks", PATH)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["rank_masks"] = module
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules["rank_masks"]
-
-
-@pytest.fixture(scope="module")
-def finished(script, tmp_path_factory):
-    config = script.Config(smoke=True, name="ranking", runs=tmp_path_factory.mktemp("runs"))
-    assert script.main(config) == 0
+def finished(tmp_path_factory):
+    config = rank_masks.Config(smoke=True, name="ranking", runs=tmp_path_factory.mktemp("runs"))
+    assert rank_masks.main(config) == 0
     return config.runs / "ranking"
 
 
 @pytest.mark.parametrize("name", catalog.names())
-def test_the_largest_fill_factor_is_where_holes_touch(script, name):
+def test_the_largest_fill_factor_is_where_holes_touch(name):
     entry = catalog.entry(name)
-    largest = script.largest_fill_factor(entry)
+    largest = rank_masks.largest_fill_factor(entry)
     for factor, feasible in ((1 - 1e-9, True), (1 + 1e-6, False)):
-        fill = largest * factor * script.SHAPE_AREA["disc"] / script.SHAPE_AREA[entry.shape]
+        fill = largest * factor * rank_masks.SHAPE_AREA["disc"] / rank_masks.SHAPE_AREA[entry.shape]
         mask = SparseAperture.from_catalog(name, 1.0, fill)
         assert bool((NoOverlap().margins(mask) >= 0).all()) == feasible
         assert bool((InsideDisc().margins(mask) >= -1e-12).all())
 
 
-def test_all_ranked_masks_collect_the_same_light(script):
-    known, crowded = script.lay_out(script.Config())
+def test_all_ranked_masks_collect_the_same_light():
+    known, crowded = rank_masks.lay_out(rank_masks.Config())
     assert set(known) | set(crowded) == set(catalog.names())
     assert not set(known) & set(crowded)
     for name, mask in known.items():
@@ -54,7 +40,7 @@ def test_all_ranked_masks_collect_the_same_light(script):
     assert {mask.shape for mask in known.values()} == {"disc", "hexagon"}
 
 
-def test_the_table_is_in_order_and_the_same_in_all_files(script, finished):
+def test_the_table_is_in_order_and_the_same_in_all_files(finished):
     rows = json.loads((finished / "ranking.json").read_text())["rows"]
     values = [row["relative_mse"] for row in rows]
     assert values == sorted(values)
@@ -66,8 +52,8 @@ def test_the_table_is_in_order_and_the_same_in_all_files(script, finished):
     assert (finished / "ranking.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_rows_hold_what_the_library_says_of_the_masks(script, finished):
-    criterion = script.make_criterion(dataclasses.replace(script.Config(), n_frequencies=64))
+def test_rows_hold_what_the_library_says_of_the_masks(finished):
+    criterion = rank_masks.make_criterion(dataclasses.replace(rank_masks.Config(), n_frequencies=64))
     rows = {row["mask"]: row for row in json.loads((finished / "ranking.json").read_text())["rows"]}
     own = load_mask(finished / "torchmask_6.json")
     for name, mask in (("golay6", SparseAperture.from_catalog("golay6", 1.0, 0.15)), ("torchmask_6", own)):
@@ -78,14 +64,14 @@ def test_rows_hold_what_the_library_says_of_the_masks(script, finished):
     assert rows["golay9"]["excess_percent"] is None  # no mask of our own with nine holes in this run
 
 
-def test_a_finished_run_is_not_overwritten(script, finished, capsys):
+def test_a_finished_run_is_not_overwritten(finished, capsys):
     before = (finished / "ranking.json").read_bytes()
-    assert script.main(script.Config(smoke=True, name="ranking", runs=finished.parent)) == 2
+    assert rank_masks.main(rank_masks.Config(smoke=True, name="ranking", runs=finished.parent)) == 2
     assert "exists and is not overwritten" in capsys.readouterr().err
     assert (finished / "ranking.json").read_bytes() == before
 
 
-def test_impossible_requests_are_refused(script, tmp_path, capsys):
-    assert script.main(script.Config(fill_factor=-0.15, smoke=True, runs=tmp_path)) == 2
+def test_impossible_requests_are_refused(tmp_path, capsys):
+    assert rank_masks.main(rank_masks.Config(fill_factor=-0.15, smoke=True, runs=tmp_path)) == 2
     assert "rank_masks: fill_factor is -0.15" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
