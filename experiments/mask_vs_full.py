@@ -137,6 +137,8 @@ def _check(config: Config) -> None:
     for name in ("n_frames", "iterations", "restarts"):
         if getattr(config, name) < 1:
             raise ValueError(f"{name} is {getattr(config, name)}: it must be at least 1")
+    if config.restarts > config.n_frames:
+        raise ValueError(f"restarts is {config.restarts}: {config.n_frames} frames have no more starts than that")
     if not 0 <= config.views <= len(VIEWS) or not (config.views or config.scenes):
         raise ValueError(f"views is {config.views}: it must be 0 to {len(VIEWS)}, and 0 only with other scenes")
     names = [path.name for path in config.scenes]
@@ -189,8 +191,8 @@ def observe(task: Mapping[str, Any]) -> tuple[Observation, Tensor]:
 def measure(task: dict[str, Any]) -> dict[str, Any]:
     """The task of one restoration: `start` counts the starts of a myopic one, "truth" gives it the aberrations.
 
-    The starting aberrations of a full pupil belong to the place of a frame in the stack, so another order of the frames
-    is another start; order 0 is the one they came in.
+    The starting aberrations of a full pupil belong to the place of a frame in the stack, so the frames turned round by
+    some places have another start each.
     """
     observation, truth = observe(task)
     aperture, grid, frames = observation.aperture, observation.grid, observation.frames
@@ -201,9 +203,8 @@ def measure(task: dict[str, Any]) -> dict[str, Any]:
         )
         result = method.restore(frames, coefficients=truth)
     else:
-        order = np.random.default_rng(task["start"]).permutation(len(frames)) if task["start"] else range(len(frames))
         method = MyopicDeconvolution(aperture, grid, max_iterations=task["iterations"])
-        result = method.restore(frames[list(order)])
+        result = method.restore(frames.roll(task["start"], dims=0))
     assert observation.object is not None
     cutoff = grid.cutoff(DIAMETER)
     return {

@@ -97,7 +97,7 @@ def test_the_full_pupil_reaches_as_far_and_gets_light_by_its_area(script):
     assert full.n_photons / mask.n_photons == pytest.approx(reach**2 / (3 * 0.2**2), rel=1e-12)
 
 
-def test_another_order_of_the_frames_is_another_start_of_the_full_pupil(script):
+def test_frames_turned_round_are_another_start_of_the_full_pupil(script):
     first, again, other = (script.measure(task(instrument="full", start=start)) for start in (0, 0, 1))
     assert first["score"] == again["score"]
     assert abs(first["chi_square"] / other["chi_square"] - 1) > 1e-6
@@ -203,6 +203,7 @@ def test_a_scene_counts_by_its_content(script, tmp_path):
         ({"seeds": (1, 1)}, "none twice"),
         ({"views": 0}, "views"),
         ({"restarts": 0}, "restarts"),
+        ({"restarts": 11}, "10 frames"),
         ({"scenes": (Path("none.obj"),)}, "none.obj"),
         ({"scenes": (Path("a/x.obj"), Path("b/x.obj"))}, "a name of its own"),
     ],
