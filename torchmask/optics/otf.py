@@ -105,7 +105,10 @@ def _cell_transfer(samples: PupilSamples) -> Tensor:
     """Attenuation of the image by the size of the pupil samples' cells, (rows, columns).
 
     Open fractions are the pupil averaged over a cell, so the amplitude in the image is multiplied by the
-    transform of that cell, a sinc that falls to 2/pi at the border. Dividing it out halves the error of the OTF.
+    transform of that cell, a sinc that falls to 2/pi at the border. Dividing it out halves the error of the OTF
+    of a smooth wavefront. The price is paid by turbulence that the raster undersamples: its scattered light is
+    amplified near the border, which lowers the OTF of a full pupil at D/r0 = 7 by 2.7 % on a raster of 128 and
+    by 0.3 % on one of 512, so a simulation oversamples.
     """
     dtype, device = samples.weights.dtype, samples.weights.device
     rows, columns = (torch.sinc(torch.fft.fftfreq(n, dtype=dtype, device=device)) ** 2 for n in samples.raster)
