@@ -21,6 +21,7 @@ from torchmask.simulation.observation import Observation, simulate_observation
 
 GRID = Grid.nyquist(1.0, 550e-9, 48)
 R0, OUTER_SCALE, READOUT = 0.25, 20.0, 1.5
+N_MODES = 10  # so many that at this d/r0 what they leave out is below the noise
 STACKS = Path(__file__).parents[3] / "shared" / "stacks"
 
 
@@ -60,7 +61,7 @@ def observation():
 @pytest.fixture(scope="module")
 def known(observation):
     """A restoration that knows the turbulence and the noise."""
-    method = MyopicDeconvolution(mask(), GRID, r0=R0, outer_scale=OUTER_SCALE, readout_noise=READOUT)
+    method = MyopicDeconvolution(mask(), GRID, N_MODES, r0=R0, outer_scale=OUTER_SCALE, readout_noise=READOUT)
     return method.restore(observation.frames)
 
 
@@ -78,7 +79,9 @@ def test_beats_the_mean_frame_and_explains_the_data(observation, known):
     assert bool(torch.isfinite(known.coefficients).all())
     # 8 frames of 2304 pixels less about 1500 parameters; light from outside the modes adds a little.
     assert 0.85 < float(known.chi_square.mean()) < 1.1
-    assert float(known.object.sum()) == pytest.approx(float(observation.object.sum()), rel=0.02)
+    # Between the photons on the frames and those of the scene: about 6 % fall beside the field, which the model keeps.
+    assert float(observation.frames.sum((1, 2)).mean()) * 0.99 < float(known.object.sum())
+    assert float(known.object.sum()) < 1.01 * float(observation.object.sum())
     assert torch.allclose(known.model + known.residuals * known.noise, observation.frames, rtol=1e-9, atol=1e-6)
 
 
@@ -117,7 +120,7 @@ def test_one_frame_and_odd_sizes(n_frames, grid):
 
 
 def test_known_aberrations_and_known_object(observation, known):
-    method = MyopicDeconvolution(mask(), GRID, r0=R0, readout_noise=READOUT)
+    method = MyopicDeconvolution(mask(), GRID, N_MODES, r0=R0, readout_noise=READOUT)
     non_blind = method.restore(observation.frames, coefficients=known.coefficients)
     # As given, but for the mean piston of each frame, which no frame can tell.
     change = non_blind.coefficients - known.coefficients
@@ -135,10 +138,10 @@ def test_known_aberrations_and_known_object(observation, known):
 
 def test_adding_a_frame_costs_a_fraction(observation, known):
     more = torch.cat([observation.frames, observe(n_frames=1, seed=5).frames])
-    method = MyopicDeconvolution(mask(), GRID, r0=R0, outer_scale=OUTER_SCALE, readout_noise=READOUT)
+    method = MyopicDeconvolution(mask(), GRID, N_MODES, r0=R0, outer_scale=OUTER_SCALE, readout_noise=READOUT)
     result = method.restore(more, start=known)
     assert result.coefficients.shape[0] == 9
-    assert result.n_evaluations < 0.6 * known.n_evaluations
+    assert result.n_evaluations < 0.7 * known.n_evaluations
     assert errors(observation, result.object)[0] < 1.05 * errors(observation, known.object)[0]
     assert float(result.chi_square[-1]) < 1.2
     with pytest.raises(ValueError, match="at most 3"):
@@ -146,7 +149,7 @@ def test_adding_a_frame_costs_a_fraction(observation, known):
 
 
 def test_float32_goes_on_where_float64_was(observation, known):
-    method = MyopicDeconvolution(mask(), GRID, r0=R0, readout_noise=READOUT, dtype=torch.float32)
+    method = MyopicDeconvolution(mask(), GRID, N_MODES, r0=R0, readout_noise=READOUT, dtype=torch.float32)
     result = method.restore(observation.frames, start=known)
     assert result.model.dtype == torch.float32
     assert errors(observation, result.object)[0] == pytest.approx(errors(observation, known.object)[0], rel=0.02)
@@ -155,7 +158,7 @@ def test_float32_goes_on_where_float64_was(observation, known):
 def test_dead_pixels_are_left_out(observation, known):
     valid = torch.rand(GRID.shape, generator=torch.Generator().manual_seed(0)) > 0.02
     spoilt = torch.where(valid, observation.frames, math.nan)
-    method = MyopicDeconvolution(mask(), GRID, r0=R0, outer_scale=OUTER_SCALE, readout_noise=READOUT)
+    method = MyopicDeconvolution(mask(), GRID, N_MODES, r0=R0, outer_scale=OUTER_SCALE, readout_noise=READOUT)
     with pytest.raises(ValueError, match="mark those pixels in `valid`"):
         method.restore(spoilt)
     result = method.restore(spoilt, valid=valid)
@@ -164,7 +167,7 @@ def test_dead_pixels_are_left_out(observation, known):
 
 
 def test_interrupted_and_resumed_is_the_same(observation, tmp_path):
-    method = MyopicDeconvolution(mask(), GRID, r0=R0, readout_noise=READOUT, max_iterations=250, tolerance=0)
+    method = MyopicDeconvolution(mask(), GRID, N_MODES, r0=R0, readout_noise=READOUT, max_iterations=250, tolerance=0)
     whole = method.restore(observation.frames)
 
     def interrupt(record: Record) -> None:
@@ -187,7 +190,7 @@ def test_interrupted_and_resumed_is_the_same(observation, tmp_path):
 
 def test_records_hold_the_state(observation):
     records: list[Record] = []
-    method = MyopicDeconvolution(mask(), GRID, r0=R0, readout_noise=READOUT, max_iterations=20, tolerance=0)
+    method = MyopicDeconvolution(mask(), GRID, N_MODES, r0=R0, readout_noise=READOUT, max_iterations=20, tolerance=0)
     result = method.restore(observation.frames, callback=records.append)
     assert [record.step for record in records] == list(range(1, 21))
     assert all(record.n_steps == 20 and record.stage == "restoration" for record in records)
@@ -241,7 +244,7 @@ def test_refuses_settings(options, words):
 
 
 def test_refuses_shapes_that_disagree(observation, known):
-    method = MyopicDeconvolution(mask(), GRID, r0=R0, readout_noise=READOUT)
+    method = MyopicDeconvolution(mask(), GRID, N_MODES, r0=R0, readout_noise=READOUT)
     with pytest.raises(ValueError, match="as the grid says"):
         method.restore(observation.frames[:, :-2])
     with pytest.raises(ValueError, match="coefficients has shape"):

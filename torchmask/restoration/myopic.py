@@ -27,9 +27,11 @@ class MyopicDeconvolution(nn.Module):
 
         1/2 sum_t || (g_t window(h_t(a_t) * o) - y_t) / sigma ||^2  +  mu TV(o)  +  1/2 ||z||^2
 
-    by L-BFGS-B in variables scaled by the diagonal of the Hessian, from zero aberrations and the clipped mean frame. It
-    restarts every 100 iterations: then the scales, the transmission g_t of each frame and, if r0 is not given, the
-    strength of the turbulence are brought up to date, and the object is moved between the pixels to where it fits best.
+    by L-BFGS-B in variables scaled by the diagonal of the Hessian, from zero aberrations (random ones for a full pupil)
+    and the clipped mean frame. It restarts every 100 iterations: then the scales, the transmission g_t of each frame
+    and, if r0 is not given, the strength of the turbulence are brought up to date; sigma falls from what the mean frame
+    leaves unexplained to the noise or to what the model cannot explain, if that is more; frames that fit badly start
+    anew from random aberrations, and the object is moved between the pixels to where it fits best.
 
     Parameters
     ----------
@@ -37,7 +39,7 @@ class MyopicDeconvolution(nn.Module):
     grid : Grid
         Of the frames.
     n_modes : int, optional
-        Zernike modes per sub-aperture, Noll 1 to n_modes. None: 10, or 136 for a full pupil.
+        Zernike modes per sub-aperture, Noll 1 to n_modes. None: 6, or 231 for a full pupil.
     r0, outer_scale : float, optional
         Of the turbulence [m]. None: r0 is estimated from the restored aberrations; 20 mask diameters.
     readout_noise : float, optional
@@ -82,7 +84,7 @@ class MyopicDeconvolution(nn.Module):
         tv_weight: float = 1.0,
         aberration_prior: bool = True,
         max_iterations: int = 1000,
-        tolerance: float = 3e-4,
+        tolerance: float = 1e-4,
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
     ) -> None:
@@ -101,7 +103,7 @@ class MyopicDeconvolution(nn.Module):
                 f"max_iterations is {max_iterations} and tolerance {tolerance}: they must be at least 1 and at least 0"
             )
         symmetric = aperture.n_subapertures == 1
-        self.n_modes = n_modes or (136 if symmetric else 10)
+        self.n_modes = n_modes or (231 if symmetric else 6)
         self.known_r0 = r0 is not None
         # Masks are made for holes of about r0; a full pupil that needs a restoration spans several.
         self.r0 = r0 or aperture.subaperture_diameter / (7 if symmetric else 1)
