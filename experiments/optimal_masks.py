@@ -161,7 +161,7 @@ def gallery(rows: Sequence[dict[str, Any]], masks: Sequence[SparseAperture]) -> 
     """Each mask above its u-v coverage."""
     columns = min(6, len(rows))
     lines = math.ceil(len(rows) / columns)
-    sheet = new_figure(1.75 * columns + 0.2, 3.65 * lines + 0.5)
+    sheet = new_figure(1.75 * columns + 0.2, 3.85 * lines + 0.5)
     axes = sheet.subplots(2 * lines, columns, squeeze=False)
     for ax in axes.flat:
         ax.set_axis_off()
@@ -172,6 +172,7 @@ def gallery(rows: Sequence[dict[str, Any]], masks: Sequence[SparseAperture]) -> 
         draw_coverage(axes[2 * line + 1, column], mask)
         text = f"{row['relative_mse']:.4f}\n{row['above_floor']:.4f} above floor"
         axes[2 * line + 1, column].text(0.5, -0.02, text, transform=axes[2 * line + 1, column].transAxes, **CAPTION)
+    sheet.get_layout_engine().set(h_pad=0.07)  # type: ignore[union-attr]
     sheet.suptitle("Optimal masks, their u-v coverage and their relative MSE", x=0.012, ha="left", fontsize=11)
     return sheet
 
