@@ -102,16 +102,22 @@ def this_library(observation: Observation, config: Config) -> Iterator[Candidate
 
 @dataclass(frozen=True)
 class MFBDSettings:
-    """Of torchmfbd: Karhunen-Loeve modes without piston, step of Adam, rms of the first coefficients [rad]."""
+    """Of torchmfbd: Karhunen-Loeve modes without piston, step of Adam, and what regularises the division by the OTFs."""
 
     n_modes: int
     step: float
-    start: float
+    noise: float
 
 
-# The best of those tried, also by the weight of the noise, apodisation, joint estimation of the object and schedule.
-MFBD_SETTINGS = (MFBDSettings(44, 0.1, 0.1), MFBDSettings(65, 0.1, 0.1), MFBDSettings(90, 0.05, 0.1))
-_MFBD_NOISE = 1e-3  # regularises the division by the power of the OTFs; its own estimate does worse
+# The best of those tried, with 44 to 135 modes, steps of 0.02 to 0.1, noise of 1e-4 to 1e-2 and its own estimate, starts
+# of 0 to 0.3 rad rms, apodisation, slower schedules up to 1000 iterations and a joint estimation of the object.
+MFBD_SETTINGS = (
+    MFBDSettings(65, 0.1, 1e-3),
+    MFBDSettings(90, 0.05, 1e-3),
+    MFBDSettings(90, 0.05, 1e-4),
+    MFBDSettings(135, 0.05, 1e-3),
+)
+_MFBD_START = 0.1  # rms of the first coefficients [rad]
 
 
 def mfbd(observation: Observation, config: Config) -> Iterator[Candidate]:
@@ -125,7 +131,8 @@ def mfbd(observation: Observation, config: Config) -> Iterator[Candidate]:
             images = _run_mfbd(observation, settings, 5 if config.smoke else config.mfbd_iterations)
         seconds = time.perf_counter() - started
         for cutoff, image in images.items():
-            yield Candidate(f"{settings.n_modes} KL modes, step {settings.step:g}, cut-off {cutoff:g}", image, seconds)
+            text = f"{settings.n_modes} KL modes, step {settings.step:g}, noise {settings.noise:g}, cut-off {cutoff:g}"
+            yield Candidate(text, image, seconds)
 
 
 def _run_mfbd(observation: Observation, settings: MFBDSettings, iterations: int) -> dict[float, Tensor]:
@@ -159,12 +166,12 @@ def _run_mfbd(observation: Observation, settings: MFBDSettings, iterations: int)
             },
             "regularization": {"iuwt1": {"variable": "object", "lambda": 0.0, "nbands": 5}},
             "psf": {"model": "kl", "nmax_modes": settings.n_modes},
-            "initialization": {"object": "contrast", "modes_std": settings.start},
+            "initialization": {"object": "contrast", "modes_std": _MFBD_START},
             "annealing": {"type": "linear", "start_pct": 0.0, "end_pct": 0.6},
         }
     )
     frames = (observation.frames / observation.frames.mean()).float()[None]
-    deconvolution.add_frames(frames, sigma=torch.full(frames.shape[:2], _MFBD_NOISE))
+    deconvolution.add_frames(frames, sigma=torch.full(frames.shape[:2], settings.noise))
     deconvolution.deconvolve(n_iterations=iterations)
     images = {}
     for cutoff in _CUTOFFS:
@@ -237,7 +244,7 @@ def richardson_lucy(observation: Observation, config: Config) -> Iterator[Candid
     from skimage.restoration import richardson_lucy
 
     psf = average_psf(observation)
-    for iterations in (3,) if config.smoke else (5, 10, 20, 40, 80, 160, 320):
+    for iterations in (3,) if config.smoke else (5, 10, 20, 40, 80, 160, 320, 640, 1280):
         started = time.perf_counter()
         image = shift_and_add(observation.frames)
         image = image.clip(min=1e-6 * image.max())

@@ -89,7 +89,7 @@ def test_torchmfbd_restores_and_leaves_nothing_behind(script, observation, tmp_p
     pytest.importorskip("torchmfbd")
     monkeypatch.chdir(tmp_path)
     state, disabled = torch.get_rng_state(), logging.root.manager.disable
-    monkeypatch.setattr(script, "MFBD_SETTINGS", (script.MFBDSettings(20, 0.1, 0.1),))
+    monkeypatch.setattr(script, "MFBD_SETTINGS", (script.MFBDSettings(20, 0.1, 1e-3),))
     candidates = list(script.mfbd(observation, script.Config(mfbd_iterations=60)))
     assert len(candidates) == len(script._CUTOFFS)
     added = best_score(script.added(observation, script.Config()), observation)
