@@ -102,14 +102,14 @@ def this_library(observation: Observation, config: Config) -> Iterator[Candidate
 
 @dataclass(frozen=True)
 class MFBDSettings:
-    """Of torchmfbd: Karhunen-Loeve modes without piston, step of Adam, and what regularises the division by the OTFs."""
+    """Of torchmfbd: Karhunen-Loeve modes without piston, step of Adam, regularisation of the division by the OTFs."""
 
     n_modes: int
     step: float
     noise: float
 
 
-# The best of those tried, with 44 to 135 modes, steps of 0.02 to 0.1, noise of 1e-4 to 1e-2 and its own estimate, starts
+# The best of those tried: 44 to 135 modes, steps of 0.02 to 0.1, noise of 1e-4 to 1e-2 and its own estimate, starts
 # of 0 to 0.3 rad rms, apodisation, slower schedules up to 1000 iterations and a joint estimation of the object.
 MFBD_SETTINGS = (
     MFBDSettings(65, 0.1, 1e-3),
