@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from torchmask._drawing import COLORS, FAINT, INK, new_figure, styled
+from torchmask._drawing import COLORS, FAINT, INK, PALE, new_figure, styled
 from torchmask.design.space import Design, DesignSpace
 from torchmask.design.table import DesignTable, design_table
 from torchmask.io import atomic_write, write_json
@@ -32,7 +32,7 @@ from torchmask.progress import Progress
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_FLAT = (0.9, 0.95)  # shares of the whole drop between which the curve is said to flatten
+_FLAT = (0.85, 0.97)  # shares of the whole drop between which the curve is said to flatten
 _TOUCHING = 6.0121  # piston structure function of two touching holes [(d/r0)^(5/3)], Kolmogorov, by integration
 
 
@@ -148,7 +148,6 @@ def reached(rows: Sequence[dict[str, Any]], share: float) -> int:
 
 def findings(config: Config, rows: Sequence[dict[str, Any]]) -> list[str]:
     """What the numbers say, in sentences."""
-    by_n = {row["n_subapertures"]: row for row in rows}
     first, last = rows[0], rows[-1]
     begin, end = (reached(rows, share) for share in _FLAT)
     lines = [
@@ -169,8 +168,8 @@ def findings(config: Config, rows: Sequence[dict[str, Any]]) -> list[str]:
         lines.append(f"The curve goes up {'BEYOND' if beyond else 'within'} the scatter of the searches: {worse}.")
     else:
         lines.append("The curve never goes up.")
-    if 11 in by_n and last["n_subapertures"] > 11:
-        lines.append(judge_eleven(config, first, by_n[11], last))
+    if any(row["n_subapertures"] == 11 for row in rows[:-1]):
+        lines.append(judge_eleven(config, rows, begin, end))
     tried = [row for row in rows if row["wiener_mse"] is not None]
     ratios = [row["wiener_mse"] / row["relative_mse"] - 1 for row in tried]
     lines.append(
@@ -185,18 +184,21 @@ def findings(config: Config, rows: Sequence[dict[str, Any]]) -> list[str]:
     return lines
 
 
-def judge_eleven(config: Config, first: dict[str, Any], own: dict[str, Any], last: dict[str, Any]) -> str:
+def judge_eleven(config: Config, rows: Sequence[dict[str, Any]], begin: int, end: int) -> str:
     """What N = 11 gives up, and what it spares."""
+    first, last = rows[0], rows[-1]
+    own = next(row for row in rows if row["n_subapertures"] == 11)
     share = (first["relative_mse"] - own["relative_mse"]) / (first["relative_mse"] - last["relative_mse"])
     rest = 100 * (1 - last["relative_mse"] / own["relative_mse"])
     more = last["n_subapertures"]
-    verdict = "N = 11 is a reasonable choice" if share >= _FLAT[0] else "N = 11 is too few by this measure"
+    verdict = "is too few" if begin > 11 else "is more than it takes" if end < 11 else "is a reasonable choice"
     return (
-        f"{verdict}: it has made {100 * share:.0f} % of the drop, and all {more - 11} further holes together gain "
-        f"{rest:.0f} %. Each hole adds its aberrations to what the restoration must find, and holes shrink: at "
-        f"D/r0 = {config.d_over_r0:g} those of N = 11 are {own['hole_over_r0']:.2f} r0 wide and touching ones keep a "
-        f"coherence of {own['coherence_of_touching_holes']:.2f}; at N = {more} it is {last['hole_over_r0']:.2f} r0 and "
-        f"{last['coherence_of_touching_holes']:.2f}, so that independent pistons, on which MSE_a rests, hold less."
+        f"By this measure N = 11 {verdict}: it has made {100 * share:.0f} % of the drop, and all {more - 11} further "
+        f"holes together lower the MSE by {rest:.0f} %. Each hole adds its aberrations to what the restoration must "
+        f"find, and holes shrink: at D/r0 = {config.d_over_r0:g} those of N = 11 are {own['hole_over_r0']:.2f} r0 wide "
+        f"and touching ones keep a coherence of {own['coherence_of_touching_holes']:.2f}; at N = {more} it is "
+        f"{last['hole_over_r0']:.2f} r0 and {last['coherence_of_touching_holes']:.2f}, so that independent pistons, on "
+        "which MSE_a rests, hold less."
     )
 
 
@@ -217,7 +219,7 @@ def markdown(config: Config, rows: Sequence[dict[str, Any]]) -> str:
     for row in rows:
         wiener = "-"
         if row["wiener_mse"] is not None:
-            wiener = f"{row['wiener_mse']:.4f} ± {row['wiener_error']:.4f}"
+            wiener = f"{row['wiener_mse']:.6f} ± {row['wiener_error']:.6f}"
         lines.append(
             f"| {row['n_subapertures']} | {row['relative_mse']:.4f} | {row['above_floor']:.4f} | "
             f"{100 * row['scatter']:.2f} % | {wiener} | {row['hole_over_r0']:.2f} | "
@@ -244,13 +246,18 @@ def figure(config: Config, rows: Sequence[dict[str, Any]]) -> Figure:
         [row["wiener_error"] for row in tried],
         color=COLORS[1],
         marker="s",
-        markersize=3.5,
+        markersize=7,
+        markerfacecolor="none",
         linestyle="none",
         capsize=2,
         label=f"Wiener MSE, D/r$_0$ = {config.d_over_r0:g}",
     )
     top.axhline(floor, color=FAINT, linestyle="--", linewidth=0.9)
-    top.text(n[-1], floor, "no mask can change this ", color=INK, va="bottom", ha="right", fontsize=8)
+    top.text(n[-1], 0.96 * floor, "no mask can change this", color=INK, va="top", ha="right", fontsize=8)
+    begin, end = (reached(rows, share) for share in _FLAT)
+    for ax in (top, bottom):
+        shares = " to ".join(f"{100 * share:.0f}" for share in _FLAT)
+        ax.axvspan(begin, end, color=PALE, zorder=0, linewidth=0, label=f"{shares} % of the drop")
     top.set(ylabel="relative MSE", ylim=(0, None), title="At constant collecting area, the gain of further holes fades")
     top.legend()
     gain = [100 * (1 - after / before) for before, after in itertools.pairwise(best)]

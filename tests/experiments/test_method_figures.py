@@ -180,8 +180,11 @@ def test_where_the_curve_flattens():
     assert mse_vs_n.reached(falling, 0.0) == 3
     assert mse_vs_n.reached(falling, 1.0) == 14
     text = " ".join(mse_vs_n.findings(mse_vs_n.Config(), falling))
-    assert "flattens between N = 7 and 8" in text
-    assert "N = 11 is a reasonable choice: it has made 100 % of the drop" in text
+    assert "flattens between N = 6 and 9" in text
+    assert "N = 11 is more than it takes: it has made 100 % of the drop" in text
+    slower = curve([0.1 + 0.75**k for k in range(18)])  # N = 3 to 20
+    assert "flattens between N = 10 and 15" in " ".join(mse_vs_n.findings(mse_vs_n.Config(), slower))
+    assert "N = 11 is a reasonable choice: it has made 91 %" in " ".join(mse_vs_n.findings(mse_vs_n.Config(), slower))
     straight = curve([1 - 0.05 * k for k in range(18)])
     assert "N = 11 is too few" in " ".join(mse_vs_n.findings(mse_vs_n.Config(), straight))
 
