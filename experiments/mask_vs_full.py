@@ -71,7 +71,7 @@ class Config:
     """Electrons per frame through the mask."""
     d_over_r0: tuple[float, ...] = (3.0, 7.0, 15.0)
     """Strengths of the turbulence, D / r0."""
-    seeds: tuple[int, ...] = (0, 1)
+    seeds: tuple[int, ...] = (0, 1, 2)
     """Of the turbulence and the noise."""
     views: int = 2
     """How many of the two views of the packaged satellite are scenes: 0, 1 or 2."""
@@ -454,6 +454,8 @@ def main(config: Config) -> int:
         config = with_presets(config)
         if directory.exists():
             raise ValueError(f"{directory} exists and is not overwritten: choose another --name")
+        if directory.resolve() in (config.sweep.resolve(), *config.sweep.resolve().parents):
+            raise ValueError(f"--sweep {config.sweep} lies in the folder of this run: keep restorations elsewhere")
         with Progress() as progress:
             lines = run(config, directory, progress)
     except KeyboardInterrupt:

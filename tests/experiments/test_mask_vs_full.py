@@ -224,6 +224,14 @@ def test_an_existing_folder_is_never_touched(script, finished, capsys):
     assert (finished.runs / "first" / "mask_vs_full.json").stat().st_mtime_ns == before
 
 
+@pytest.mark.parametrize("inside", ["", "sweep"])
+def test_restorations_are_not_kept_in_the_folder_of_the_run(script, tmp_path, capsys, inside):
+    config = script.Config(smoke=True, name="run", runs=tmp_path, sweep=tmp_path / "run" / inside)
+    assert script.main(config) == 2
+    assert "elsewhere" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_the_whole_grid_is_the_one_asked_for(script):
     config = script.with_presets(script.Config(full=True))
     assert (min(config.photons), max(config.photons)) == (1e4, 1e8)
