@@ -32,10 +32,13 @@ def test_frequencies_are_those_of_the_dft(n_pixels, dtype):
     assert int(spectrum.argmax()) == 2 * grid.shape[1] + grid.shape[1] - 1
 
 
-def test_undersampling_is_refused_with_the_pixel_scale_that_is_needed():
-    grid = Grid(64, 2.75e-7, 550e-9)
-    with pytest.raises(ValueError, match=r"pixel_scale must be at most 1\.375e-07 rad"):
-        grid.require_sampling(2.0)
+def test_undersampling_is_refused_with_a_pixel_scale_that_is_accepted():
+    for diameter in (2.0, 1.7, 3.3333):
+        with pytest.raises(ValueError, match="pixel_scale must be at most") as refusal:
+            Grid(64, 2.75e-7, 550e-9).require_sampling(diameter)
+        needed = float(str(refusal.value).split("at most ")[1].removesuffix(" rad"))
+        assert needed == pytest.approx(550e-9 / (2 * diameter), rel=1.5e-4)
+        Grid(64, needed, 550e-9).require_sampling(diameter)
 
 
 @pytest.mark.parametrize(

@@ -97,8 +97,10 @@ class Grid:
     def require_sampling(self, diameter: float) -> None:
         """Raise ValueError unless the image of an aperture of `diameter` [m] is sampled without aliasing."""
         if self.cutoff(diameter) > 0.5 * (1 + _ROUNDING):
+            # rounded down, so that the printed value is accepted
+            needed = self.wavelength / (2 * diameter) * (1 - 5e-5)
             raise ValueError(
                 f"pixel_scale {self.pixel_scale:.4g} rad undersamples an aperture of {diameter:.4g} m at "
                 f"{self.wavelength:.4g} m (cut-off {self.cutoff(diameter):.3f} cycles/pixel, above 1/2): "
-                f"pixel_scale must be at most {self.wavelength / (2 * diameter):.4g} rad"
+                f"pixel_scale must be at most {needed:.5g} rad"
             )

@@ -92,7 +92,7 @@ def psf_from_samples(samples: PupilSamples, phase: Tensor | None = None) -> Tens
     if phase is None:
         field = weights.to(torch.complex64 if weights.dtype == torch.float32 else torch.complex128)
     else:
-        field = torch.polar(weights.expand(torch.broadcast_shapes(weights.shape, phase.shape)).contiguous(), phase)
+        field = weights * torch.polar(torch.ones_like(phase), phase)
     field, index = field.flatten(-2), index.expand(field.shape).flatten(-2)
     pupil = torch.zeros(*field.shape[:-1], math.prod(samples.raster), dtype=field.dtype, device=field.device)
     pupil = pupil.scatter_add(-1, index, field).unflatten(-1, samples.raster)
