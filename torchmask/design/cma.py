@@ -10,11 +10,13 @@ from torchmask.design.merit import Criterion, Holes, Merit
 from torchmask.design.refine import PENALTY, Monitor
 from torchmask.design.starts import random_mask
 
+POPULATION = 32
+
 
 def evolve(
-    criterion: Criterion, holes: Holes, budget: int, population: int, rng: np.random.Generator, monitor: Monitor
+    criterion: Criterion, holes: Holes, budget: int, rng: np.random.Generator, monitor: Monitor
 ) -> tuple[Tensor, int]:
-    """The best point x (F,) of CMA-ES with a quadratic penalty for broken rules, and the evaluations used.
+    """The best point x (1, F) of CMA-ES with a quadratic penalty for broken rules, and the evaluations used.
 
     Starts from a random mask with steps of a fifth of the mask diameter, each generation in one batched call, and
     begins anew from another one when it has come to rest and there is budget left. N. Hansen, The CMA evolution
@@ -23,6 +25,7 @@ def evolve(
     import cma
 
     merit = Merit(criterion, holes, PENALTY)
+    population = min(POPULATION, budget)
     best, best_value = random_mask(holes, rng), np.inf
     while merit.evaluations + population <= budget:
         start = random_mask(holes, rng).double().cpu().numpy()
@@ -47,4 +50,4 @@ def evolve(
             if float(values[index]) < best_value:
                 best, best_value = x[index], float(values[index])
             monitor.update(merit.evaluations, values, values.exp(), x)
-    return best, merit.evaluations
+    return best[None], merit.evaluations

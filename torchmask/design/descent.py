@@ -51,8 +51,8 @@ class BatchedBFGS:
         self._step = start.new_ones(n)
         self._accepted = start.new_zeros(n, dtype=torch.long)
 
-    def restart(self, members: Tensor, points: Tensor) -> None:
-        """Let the problems `members` (indices or mask) begin anew at `points`."""
+    def restart(self, members: Tensor | slice, points: Tensor) -> None:
+        """Let the problems `members` (indices, mask or slice) begin anew at `points`."""
         self.points[members] = points
         self.values[members] = torch.inf
         self._direction[members] = 0.0

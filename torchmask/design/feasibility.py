@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -158,59 +159,78 @@ def _project_one(
     aperture: SparseAperture, subspace: Subspace, constraints: Sequence[Constraint], slack: float
 ) -> Tensor:
     scale = aperture.mask_diameter
-    start = subspace.coordinates(aperture.centers)
-    margins = margin_function(aperture, subspace, constraints)
-    z = start.numpy() / scale
-    nearest = z
-    relevant = np.zeros(len(margins(z)[0]), dtype=bool)
-    for _ in range(8):
-        values, _ = margins(z)
-        if values.min(initial=np.inf) * scale >= slack / 2:
+    slack = slack / scale
+    margins = _margin_function(aperture, subspace, constraints)
+    nearest = subspace.coordinates(aperture.centers).numpy() / scale
+    z = nearest
+    relevant = np.zeros(0, dtype=bool)
+    while True:
+        values = margins.values(z)
+        shortfall = -values.min(initial=np.inf)
+        if shortfall <= -slack / 2:
             return subspace.centers(torch.as_tensor(z * scale))
-        # Only the margins near zero matter; others may come near as the holes move, so look again.
-        relevant |= values < 0.05 + max(0.0, -values.min())
+        # Only margins near zero matter; others may come near as the holes move, so look again.
+        near = values < (0.05 if shortfall > 1e-3 else 0.002)
+        before, relevant = relevant, near | relevant if len(relevant) else near
+        if len(before) and not (relevant & ~before).any():
+            names = ", ".join(map(str, constraints))
+            raise Infeasible(f"no mask near the given one obeys {names}: {shortfall * scale:.3g} m are missing")
         rows = np.flatnonzero(relevant)
-        z = _nearest_point(nearest, z, lambda z, rows=rows: margins(z, rows), slack / scale)
-    raise Infeasible(
-        f"no mask near the given one obeys {', '.join(map(str, constraints))}: "
-        f"{-margins(z)[0].min() * scale:.3g} m are missing"
-    )
+        # From afar the nearest mask is a matter of optimisation; what is then left goes by Newton's method.
+        if shortfall > 1e-3:
+            z = _nearest_point(nearest, z, margins, rows, slack)
+        z = _onto(z, margins, rows, slack)
 
 
-def _nearest_point(target: Array, start: Array, margins: Callable, slack: float) -> Array:
-    """argmin |z - target|^2 subject to margins >= slack, in units of the mask diameter."""
+def _nearest_point(target: Array, start: Array, margins: _Margins, rows: Array, slack: float) -> Array:
+    """argmin |z - target|^2 subject to margins >= slack."""
     result = minimize(
         lambda z: (0.5 * ((z - target) ** 2).sum(), z - target),
         start,
         jac=True,
         method="SLSQP",
-        constraints={"type": "ineq", "fun": lambda z: margins(z)[0] - slack, "jac": lambda z: margins(z)[1]},
-        options={"maxiter": 100, "ftol": 1e-14},
+        constraints={
+            "type": "ineq",
+            "fun": lambda z: margins.values(z)[rows] - slack,
+            "jac": lambda z: margins.jacobian(z, rows),
+        },
+        options={"maxiter": 60, "ftol": 1e-12},
     )
-    z = result.x
-    # The last digits: smallest steps onto the margins that are still short (Newton, quadratic).
-    for _ in range(20):
-        values, jacobian = margins(z)
+    return result.x if np.isfinite(result.x).all() else start
+
+
+def _onto(z: Array, margins: _Margins, rows: Array, slack: float) -> Array:
+    """The smallest steps onto the margins that are short, repeated: converges quadratically from nearby."""
+    for _ in range(30):
+        values = margins.values(z)[rows]
         short = values < slack
-        if not short.any() or not np.isfinite(values).all():
+        if not short.any():
             break
-        z = z + np.linalg.lstsq(jacobian[short], slack - values[short], rcond=1e-9)[0]
+        z = z + np.linalg.lstsq(margins.jacobian(z, rows[short]), slack - values[short], rcond=1e-9)[0]
     return z
 
 
-def margin_function(aperture: SparseAperture, subspace: Subspace, constraints: Sequence[Constraint]) -> Callable:
-    """margins(z, rows=None) -> (values (M), jacobian (M, F)), all lengths in units of the mask diameter."""
+class _Margins(NamedTuple):
+    """Margins (M) and the Jacobian (rows, F) of some of them, at z (F); all lengths in mask diameters."""
+
+    values: Callable[[Array], Array]
+    jacobian: Callable[[Array, Array], Array]
+
+
+def _margin_function(aperture: SparseAperture, subspace: Subspace, constraints: Sequence[Constraint]) -> _Margins:
     scale = aperture.mask_diameter
 
-    def margins(z: Array, rows: Array | None = None) -> tuple[Array, Array]:
-        with torch.no_grad():
-            values = all_margins(with_centers(aperture, subspace.centers(torch.as_tensor(z * scale))), constraints)
-        rows = np.flatnonzero(np.ones(len(values), dtype=bool)) if rows is None else rows
-        # One copy of the mask a row: the gradient of the sum of the rows' own margins is the Jacobian.
-        copies = torch.as_tensor(z * scale).expand(len(rows), -1).clone().requires_grad_()
-        own = all_margins(with_centers(aperture, subspace.centers(copies)), constraints)
-        own = own[torch.arange(len(rows)), torch.as_tensor(rows)]
-        (jacobian,) = torch.autograd.grad(own.sum(), copies)
-        return values.numpy()[rows] / scale, jacobian.numpy()
+    def margins(z: Tensor) -> Tensor:
+        return all_margins(with_centers(aperture, subspace.centers(z * scale)), constraints) / scale
 
-    return margins
+    def values(z: Array) -> Array:
+        with torch.no_grad():
+            return margins(torch.as_tensor(z)).numpy()
+
+    def jacobian(z: Array, rows: Array) -> Array:
+        # One copy of the mask a row: the gradient of the sum of the rows' own margins is the Jacobian.
+        copies = torch.as_tensor(z).expand(len(rows), -1).clone().requires_grad_()
+        own = margins(copies)[torch.arange(len(rows)), torch.as_tensor(rows)]
+        return torch.autograd.grad(own.sum(), copies)[0].numpy()
+
+    return _Margins(values, jacobian)

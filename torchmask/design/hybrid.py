@@ -13,7 +13,7 @@ from torchmask.design.starts import changed_mask, random_mask
 
 BATCH = 32  # masks in flight
 POOL = 12
-FINALISTS = 4
+FINALISTS = 8
 RANDOM_SHARE = 0.3  # of the budget goes to random starts before the pool is hopped on
 WEIGHT = 1e3  # of the squared overlaps: stiffer slows the descents, softer ranks by what the polish takes away
 TOLERANCE = 1e-3  # promised decrease of log MSE at which a descent ends; the pool is polished later
@@ -39,7 +39,7 @@ class Pool:
         self.entries = sorted([*self.entries, (value, x, shape)], key=lambda entry: entry[0])[: self.size]
 
 
-def explore(
+def hop(
     criterion: Criterion, holes: Holes, budget: int, rng: np.random.Generator, monitor: Monitor
 ) -> tuple[Tensor, int]:
     """The best few local optima (n, F) found within `budget` evaluations of `criterion`, best first, and their cost."""

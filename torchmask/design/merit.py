@@ -67,9 +67,9 @@ class Holes:
         """The coordinates of masks near `centers` (..., N, 2) [m] that obey the equalities; off the rim by 1e-3."""
         return self.subspace.coordinates(self._unroll(centers / self.template.mask_diameter, 0.999))
 
-    def margins(self, x: Tensor) -> Tensor:
+    def margins(self, aperture: SparseAperture) -> Tensor:
         """Margins (..., M) of all inequalities."""
-        return all_margins(self.aperture(x), self.constraints) / self.template.mask_diameter
+        return all_margins(aperture, self.constraints) / self.template.mask_diameter
 
     def place(self, x: Tensor, hole: int, position: Tensor) -> Tensor:
         """x (..., F) with one hole at `position` (..., 2) [mask diameters], as far as it may, and all tied to it."""
@@ -113,8 +113,8 @@ class Merit:
     def __call__(self, x: Tensor, multipliers: Tensor | float = 0.0) -> Evaluation:
         """At x (P, F), with multipliers (P, M)."""
         x = x.detach().requires_grad_()
-        relative = self.criterion.relative(self.holes.aperture(x))
-        margins = self.holes.margins(x)
+        aperture = self.holes.aperture(x)
+        relative, margins = self.criterion.relative(aperture), self.holes.margins(aperture)
         multipliers = torch.as_tensor(multipliers).to(margins)
         excess = (multipliers - self.weight * margins).clamp(min=0) ** 2 - multipliers**2
         merit = relative.log() + excess.sum(-1) / (2 * self.weight)
@@ -125,6 +125,7 @@ class Merit:
     def value(self, x: Tensor) -> Tensor:
         """The merit alone (P,), without multipliers."""
         with torch.no_grad():
-            shortfall = self.holes.margins(x).clamp(max=0)
+            aperture = self.holes.aperture(x)
+            shortfall = self.holes.margins(aperture).clamp(max=0)
             self.evaluations += len(x)
-            return self.criterion.relative(self.holes.aperture(x)).log() + self.weight / 2 * (shortfall**2).sum(-1)
+            return self.criterion.relative(aperture).log() + self.weight / 2 * (shortfall**2).sum(-1)

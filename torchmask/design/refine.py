@@ -42,25 +42,31 @@ class Monitor:
 
     def __init__(self, stage: str, budget: int, holes: Holes, callback: Callback | None) -> None:
         self.stage, self.budget, self.holes, self.callback = stage, budget, holes, callback
-        self.best = float("inf")
         self.rows: list[tuple[float, float]] = []
+        self._merit = self._relative = float("inf")
         self._centers: Tensor | None = None
-        self._due = 0
+        self._due = 0.0
 
-    def update(self, evaluations: int, merits: Tensor, relative_mse: Tensor, x: Tensor, last: bool = False) -> None:
-        """Tell what was found at x (P, F): the best merit so far is the best mask."""
+    def update(self, evaluations: int, merits: Tensor, relative_mse: Tensor, x: Tensor) -> None:
+        """Take note of what was found at x (P, F): the best merit so far is the best mask."""
         index = int(merits.nan_to_num(torch.inf).argmin())
-        if float(merits[index]) < self.best:
-            self.best = float(merits[index])
-            self._relative = float(relative_mse[index])
-            self._centers = self.holes.aperture(x[index]).centers.detach().clone()
-        if self._centers is None or (evaluations < self._due and not last):
-            return
-        self._due = evaluations + self.budget / 100
-        self.rows.append((evaluations, self._relative))
+        if float(merits[index]) < self._merit:
+            self._merit, self._relative = float(merits[index]), float(relative_mse[index])
+            self._centers = self.holes.aperture(x[index]).centers
+        if self._centers is not None and evaluations >= self._due:
+            self._due = evaluations + self.budget / 100
+            self.rows.append((evaluations, self._relative))
+            self._tell(evaluations, self._relative, self._centers)
+
+    def conclude(self, evaluations: int, relative_mse: float, aperture: SparseAperture) -> None:
+        """Tell what the stage returns."""
+        self.rows.append((evaluations, relative_mse))
+        self._tell(evaluations, relative_mse, aperture.centers)
+
+    def _tell(self, evaluations: int, relative_mse: float, centers: Tensor) -> None:
         if self.callback is not None:
-            scalars = {"relative_mse": self._relative}
-            self.callback(Record(self.stage, evaluations, self.budget, scalars, {"centers": self._centers}))
+            step, scalars = min(evaluations, self.budget), {"relative_mse": relative_mse}
+            self.callback(Record(self.stage, step, self.budget, scalars, {"centers": centers.detach().clone()}))
 
     @property
     def history(self) -> dict[str, Tensor]:
@@ -104,43 +110,56 @@ def refine_mask(
     return conclude(criterion, best, constraints, evaluations, monitor.history)
 
 
-def polish(criterion: Criterion, holes: Holes, x: Tensor, budget: int, monitor: Monitor) -> tuple[SparseAperture, int]:
+def polish(
+    criterion: Criterion,
+    holes: Holes,
+    x: Tensor,
+    budget: int,
+    monitor: Monitor,
+    fallback: SparseAperture | None = None,
+) -> tuple[SparseAperture, int]:
     """The best feasible mask reached from x (P, F) within `budget` evaluations of `criterion`, and their number.
 
     The multipliers of the augmented Lagrangian let the descents come to rest on the rules, not beyond them; the
-    last step projects what is left. Raises `Infeasible` if no projection succeeds.
+    last step projects what is left. If no projection succeeds the mask is `fallback`; without one, raises `Infeasible`.
     """
     merit = Merit(criterion, holes, PENALTY)
-    multipliers: Tensor | float = 0.0
-    n_rounds = max(1, (budget - len(x)) // len(x))
+    reserve = 2 * len(x)  # for the look at the multipliers that a round may take, and the comparison at the end
     descent = BatchedBFGS(x, first_step=0.003, tolerance=1e-8)
-    found = merit(descent.ask())
-    for _ in range(n_rounds):
-        descent.tell(found.merit, found.gradient)
-        if bool(descent.finished.all()):
-            rest = merit(descent.points, multipliers)
-            update = (torch.as_tensor(multipliers) - merit.weight * rest.margins).clamp(min=0)
-            if float((update - multipliers).abs().max()) < 1e-4 * float(update.max()):
-                break
-            multipliers = update
-            descent.restart(slice(None), descent.points.clone())
+    multipliers: Tensor | float = 0.0
+    while merit.evaluations + len(x) + reserve <= budget:
         points = descent.ask()
         found = merit(points, multipliers)
         monitor.update(merit.evaluations, found.merit, found.relative_mse, points)
-    candidates = []
-    for point in descent.points:
-        try:
-            candidates.append(holes.feasible(point))
-        except Infeasible as error:
-            failure = error
+        descent.tell(found.merit, found.gradient)
+        if bool(descent.finished.all()):
+            margins = merit(descent.points, multipliers).margins
+            update = (torch.as_tensor(multipliers) - merit.weight * margins).clamp(min=0)
+            if float((update - multipliers).abs().amax()) <= 1e-4 * float(update.max()):
+                break
+            multipliers = update
+            descent.restart(slice(None), descent.points.clone())
+    candidates, failure = _feasible(holes, descent.points)
     if not candidates:
-        raise failure
+        if fallback is None:
+            raise failure
+        candidates = [fallback]
     with torch.no_grad():
         values = torch.stack([criterion.relative(candidate) for candidate in candidates])
     best = int(values.argmin())
-    x = holes.coordinates(candidates[best].centers)[None]
-    monitor.update(merit.evaluations, values[best : best + 1].log() - 1e6, values[best : best + 1], x, last=True)
+    monitor.conclude(merit.evaluations + len(candidates), float(values[best]), candidates[best])
     return candidates[best], merit.evaluations + len(candidates)
+
+
+def _feasible(holes: Holes, x: Tensor) -> tuple[list[SparseAperture], Infeasible]:
+    """Those of x (P, F) that could be projected onto the rules, and why one of the others could not."""
+    masks, failure = [], Infeasible("no mask to project")
+    for point in x:
+        try:
+            masks.append(holes.feasible(point))
+        except Infeasible as error:
+            failure = error
+    return masks, failure
 
 
 def detached(aperture: SparseAperture) -> SparseAperture:

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 
 from torchmask.design.cma import evolve
-from torchmask.design.constraints import InsideDisc, NoOverlap
 from torchmask.design.feasibility import Constraint
-from torchmask.design.hybrid import coarse_criterion, explore
-from torchmask.design.merit import Criterion, Holes
+from torchmask.design.hybrid import coarse_criterion, hop
+from torchmask.design.merit import Criterion
 from torchmask.design.refine import Monitor, SearchResult, conclude, polish
-from torchmask.optics.aperture import SparseAperture
+from torchmask.design.room import require_room
 from torchmask.record import Callback
 
-METHODS = ("hybrid", "cma")
+DEFAULT_BUDGETS = {"hybrid": 100_000, "cma": 20_000}  # evaluations, up to N = 11
+METHODS = tuple(DEFAULT_BUDGETS)
+POLISH = 120  # evaluations of the gradient stage for each mask it starts from
 
 
 def search_mask(
@@ -66,29 +65,20 @@ def search_mask(
     """
     if method not in METHODS:
         raise ValueError(f"method is {method!r}: known methods are {', '.join(METHODS)}")
-    diameter = mask_diameter * math.sqrt(fill_factor / n_subapertures)
-    holes = Holes(
-        SparseAperture(torch.zeros(n_subapertures, 2, dtype=torch.float64), diameter, mask_diameter),
-        (InsideDisc(), NoOverlap(), *constraints),
-    )
-    seeds = np.random.SeedSequence(seed).spawn(1)
-    rng = np.random.default_rng(seeds[0])
-    if method == "cma":
-        budget = 20_000 if budget is None else budget
-        monitor = Monitor("design/cma", budget, holes, callback)
-        best, used = evolve(criterion, holes, budget, 32, rng, monitor)
-        starts = best[None]
-    else:
-        budget = 100_000 if budget is None else budget
-        monitor = Monitor("design/hybrid", budget, holes, callback)
-        starts, used = explore(coarse_criterion(criterion), holes, budget, rng, monitor)
+    if budget is None:
+        # the cost of an evaluation grows with N: about the same time for all
+        budget = int(DEFAULT_BUDGETS[method] * min(1.0, 11 / n_subapertures)) if n_subapertures > 0 else 1
+    if budget != int(budget) or budget < 1:
+        raise ValueError(f"budget is {budget}: it must be a whole number of evaluations, at least 1")
+    holes, fallback = require_room(n_subapertures, mask_diameter, fill_factor, constraints)
+    rng = np.random.default_rng(seed)
+    monitor = Monitor(f"design/{method}", budget, holes, callback)
+    explore = evolve if method == "cma" else hop
+    working = criterion if method == "cma" else coarse_criterion(criterion)
+    starts, used = explore(working, holes, budget, rng, monitor)
     history = monitor.history
-    if refine:
-        allowance = 400 * len(starts)
-        monitor = Monitor("design/refine", allowance, holes, callback)
-        aperture, polished = polish(criterion, holes, starts, allowance, monitor)
-        history |= monitor.history
-        used += polished
-    else:
-        aperture = holes.feasible(starts[0])
-    return conclude(criterion, aperture, constraints, used, history)
+    # One evaluation each is what it takes to compare the candidates once they are feasible: no gradient stage.
+    allowance = (POLISH if refine else 1) * len(starts)
+    monitor = Monitor("design/refine", allowance, holes, callback)
+    aperture, polished = polish(criterion, holes, starts, allowance, monitor, fallback)
+    return conclude(criterion, aperture, constraints, used + polished, history | monitor.history)
