@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from torchmask.design.criterion import AsymptoticMSE, wiener_mse
+from torchmask.design.feasibility import Infeasible
 from torchmask.design.psd import NoisePSD, PowerLawPSD
 from torchmask.design.space import DesignSpace
 from torchmask.design.table import design_table, measure
@@ -57,6 +58,7 @@ def test_errors_are_those_of_the_mask_at_its_own_flux(tmp_path):
     assert row.relative_mse == pytest.approx(float(criterion.relative(mask)), rel=1e-12)
     assert row.above_floor == pytest.approx(float(criterion.relative(mask) - floor), rel=1e-9)
     assert row.wiener_mse is None
+    assert mask.centers.tolist() == [list(center) for center in row.centers]
     assert mask.n_subapertures == 3
     assert mask.fill_factor == pytest.approx(0.06, rel=1e-12)
 
@@ -75,6 +77,25 @@ def test_holes_larger_than_the_turbulence_allows_are_rows_that_say_so(tmp_path):
         table.aperture(refused)
     largest = 3 * (1.0 / 6.0) ** 2  # d = r0: the largest that is allowed, rounding notwithstanding
     assert all(row.infeasible is None for row in replace(space, n_subapertures=(3,), fill_factor=(largest,)).designs())
+
+
+def test_holes_that_cannot_be_packed_are_rows_that_say_so():
+    space = replace(SMALL, n_subapertures=(7,), fill_factor=(0.7777, 0.78), diameter_over_r0=())
+    fits, crowded = space.designs()
+    assert fits.infeasible is None
+    assert crowded.infeasible is not None
+    assert "at most 0.77777" in crowded.infeasible  # six discs around one: 7/9
+
+
+def test_a_search_that_finds_no_room_is_a_row_that_says_so(tmp_path, monkeypatch):
+    def refuse(*_, **__):
+        raise Infeasible("no mask was found")
+
+    monkeypatch.setattr("torchmask.design.table.search_mask", refuse)
+    table = design_table(replace(SMALL, n_subapertures=(3,)), tmp_path, n_workers=1)
+    assert [row.infeasible for row in table.rows] == ["no mask was found"]
+    monkeypatch.undo()
+    assert design_table(replace(SMALL, n_subapertures=(3,)), tmp_path, n_workers=1) == table  # it is on disk too
 
 
 def test_a_space_without_any_design_is_refused_before_any_work(tmp_path):

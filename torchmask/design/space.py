@@ -10,6 +10,7 @@ from typing import Any
 
 from torchmask.design.search import METHODS
 from torchmask.grid import Grid
+from torchmask.optics.packing import hole_diameter
 
 _AXES = ("n_subapertures", "fill_factor", "n_photons", "n_frames", "diameter_over_r0", "seed")
 _WHOLE = ("n_subapertures", "n_frames", "seed", "n_pixels", "n_draws")
@@ -100,6 +101,10 @@ class DesignSpace:
             )
 
     def _obstacle(self, n: int, fill_factor: float, strength: float | None) -> str | None:
+        try:
+            hole_diameter(n, self.mask_diameter, fill_factor)
+        except ValueError as error:
+            return str(error)
         if strength is None:
             return None
         largest = n * (self.max_hole_over_r0 / strength) ** 2

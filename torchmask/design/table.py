@@ -44,7 +44,9 @@ class DesignTable:
         """The mask of a row. Raises ValueError if it is infeasible."""
         if row.infeasible is not None:
             raise ValueError(f"there is no mask in this row: {row.infeasible}")
-        return SparseAperture(torch.tensor(row.centers).double(), row.subaperture_diameter, self.space.mask_diameter)
+        return SparseAperture(
+            torch.tensor(row.centers, dtype=torch.float64), row.subaperture_diameter, self.space.mask_diameter
+        )
 
     def csv(self) -> str:
         """All but the centres, one line a row under a line of names; what is missing is left empty."""
@@ -173,7 +175,8 @@ def search(task: dict[str, Any]) -> dict[str, Any]:
 def measure(task: dict[str, Any]) -> dict[str, Any]:
     """The task of a measurement: mean and standard error of the relative `wiener_mse` of a mask under turbulence."""
     criterion = _criterion(task)
-    mask = SparseAperture(torch.tensor(task["centers"]).double(), task["subaperture_diameter"], task["mask_diameter"])
+    centers = torch.tensor(task["centers"], dtype=torch.float64)
+    mask = SparseAperture(centers, task["subaperture_diameter"], task["mask_diameter"])
     otf = OTF(mask, criterion.grid, task["oversampling"])
     samples = otf.samples()
     turbulence = TurbulencePhase(task["mask_diameter"] / task["diameter_over_r0"], task["outer_scale"])
