@@ -136,7 +136,7 @@ def mfbd(observation: Observation, config: Config) -> Iterator[Candidate]:
 
 
 def _run_mfbd(observation: Observation, settings: MFBDSettings, iterations: int) -> dict[float, Tensor]:
-    import torchmfbd
+    import torchmfbd  # pyright: ignore[reportMissingImports] -- only in the bench extra
 
     aperture, grid = observation.aperture, observation.grid
     deconvolution = torchmfbd.Deconvolution(
