@@ -61,3 +61,37 @@ def test_impossible_numbers_are_refused(arguments, message):
 def test_nyquist_refuses_impossible_numbers(diameter, oversampling):
     with pytest.raises(ValueError, match=r"diameter|oversampling"):
         Grid.nyquist(diameter, 1e-6, 64, oversampling)
+
+
+def rows_of(table):
+    return {row.split(" | ")[0].removeprefix("| "): row for row in table.splitlines()}
+
+
+def test_the_table_says_what_is_nyquist_and_what_aliases():
+    diameter, hole = 1.25, 0.03
+    critical = rows_of(Grid.nyquist(diameter, 1e-6, (64, 48)).describe(diameter, hole))
+    assert "2 pixels" in critical["wavelength / diameter"]
+    assert "0.5 cycles/pixel | at most 1/2: nothing aliases" in critical["cut-off frequency"]
+    assert f"{diameter} m" in critical["largest aperture without aliasing"]
+    assert "64 x 48 pixels" in critical["field"]
+    # period 2.5 m: rows of 2.5 / 64 m, columns of 2.5 / 48 m, and 0.576 of the coarser across a hole
+    assert "0.03906 x 0.05208 m" in critical["one pupil sample"]
+    assert "0.576 | below 2: oversample by 4" in critical["samples across a hole"]
+    # A quarter wider than Nyquist allows: frequency 1 - 0.625 is where the folded spectrum begins.
+    aliased = rows_of(Grid.nyquist(diameter / 1.25, 1e-6, 64).describe(diameter))
+    assert "0.625 cycles/pixel | above 1/2: frequencies beyond 0.375" in aliased["cut-off frequency"]
+    assert "hole" not in aliased
+
+
+def test_the_table_agrees_with_what_is_refused():
+    grid = Grid(64, 2.75e-7, 550e-9)
+    for diameter in (0.5, 1.0, 1.0 + 1e-12, 1.001, 4.0):
+        try:
+            grid.require_sampling(diameter)
+            refused = False
+        except ValueError:
+            refused = True
+        assert ("aliased light" in grid.describe(diameter)) == refused
+    for arguments in ((0.0,), (math.inf,), (1.0, -0.1)):
+        with pytest.raises(ValueError, match="finite and positive, in m"):
+            grid.describe(*arguments)

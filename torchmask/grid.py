@@ -94,9 +94,82 @@ class Grid:
         nu_x = torch.fft.fftfreq(width, dtype=dtype, device=device)
         return nu_y[:, None], nu_x[None, :]
 
+    def describe(self, diameter: float, subaperture_diameter: float | None = None) -> str:
+        """What an aperture becomes on this grid, as a table (Markdown): angles, pupil samples, Nyquist, what aliases.
+
+        Parameters
+        ----------
+        diameter : float
+            Of the aperture, outer edge to outer edge (`aperture.extent`) [m].
+        subaperture_diameter : float, optional
+            Of one hole [m].
+
+        Raises
+        ------
+        ValueError
+            If a diameter is not finite and positive.
+
+        Examples
+        --------
+        >>> grid = Grid(n_pixels=128, pixel_scale=2.75e-7, wavelength=550e-9)
+        >>> print(grid.describe(diameter=1.0, subaperture_diameter=0.117))
+        | quantity | value | how |
+        | --- | --- | --- |
+        | pixel | 2.75e-07 rad = 0.05672 arcsec | pixel_scale |
+        | field | 128 x 128 pixels = 7.261 x 7.261 arcsec | n_pixels, rows x columns |
+        | one cycle/pixel in the pupil | 2 m | wavelength / pixel_scale |
+        | one pupil sample | 0.01562 x 0.01562 m | that / n_pixels |
+        | largest aperture without aliasing | 1 m | half of it |
+        | aperture | 1 m | diameter |
+        | wavelength / diameter | 2 pixels | Nyquist: 2 or more |
+        | cut-off frequency | 0.5 cycles/pixel | at most 1/2: nothing aliases |
+        | hole | 0.117 m | subaperture_diameter |
+        | samples across a hole | 7.488 | 2 or more: can be sampled |
+        | pixels across the image of a hole | 41.71 | 2.44 wavelength / subaperture_diameter |
+        """
+        for name, value in (("diameter", diameter), ("subaperture_diameter", subaperture_diameter)):
+            if value is not None and not (math.isfinite(value) and value > 0):
+                raise ValueError(f"{name} is {value}: it must be finite and positive, in m")
+        (height, width), arcsec = self.shape, math.degrees(self.pixel_scale) * 3600
+        cutoff = self.cutoff(diameter)
+        if self._aliases(diameter):
+            clean = max(0.0, 1 - cutoff)
+            verdict = f"above 1/2: frequencies beyond {clean:.4g} cycles/pixel hold aliased light"
+        else:
+            verdict = "at most 1/2: nothing aliases"
+        rows = [
+            ("quantity", "value", "how"),
+            ("---", "---", "---"),
+            ("pixel", f"{self.pixel_scale:.4g} rad = {arcsec:.4g} arcsec", "pixel_scale"),
+            (
+                "field",
+                f"{height} x {width} pixels = {height * arcsec:.4g} x {width * arcsec:.4g} arcsec",
+                "n_pixels, rows x columns",
+            ),
+            ("one cycle/pixel in the pupil", f"{self.period:.4g} m", "wavelength / pixel_scale"),
+            ("one pupil sample", f"{self.period / height:.4g} x {self.period / width:.4g} m", "that / n_pixels"),
+            ("largest aperture without aliasing", f"{self.period / 2:.4g} m", "half of it"),
+            ("aperture", f"{diameter:.4g} m", "diameter"),
+            ("wavelength / diameter", f"{1 / cutoff:.4g} pixels", "Nyquist: 2 or more"),
+            ("cut-off frequency", f"{cutoff:.4g} cycles/pixel", verdict),
+        ]
+        if subaperture_diameter is not None:
+            across = subaperture_diameter * min(height, width) / self.period
+            verdict = "2 or more: can be sampled" if across >= 2 else f"below 2: oversample by {math.ceil(2 / across)}"
+            image = 2.44 * self.period / subaperture_diameter  # first dark ring of the Airy pattern
+            rows += [
+                ("hole", f"{subaperture_diameter:.4g} m", "subaperture_diameter"),
+                ("samples across a hole", f"{across:.4g}", verdict),
+                ("pixels across the image of a hole", f"{image:.4g}", "2.44 wavelength / subaperture_diameter"),
+            ]
+        return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+    def _aliases(self, diameter: float) -> bool:
+        return self.cutoff(diameter) > 0.5 * (1 + _ROUNDING)
+
     def require_sampling(self, diameter: float) -> None:
         """Raise ValueError unless the image of an aperture of `diameter` [m] is sampled without aliasing."""
-        if self.cutoff(diameter) > 0.5 * (1 + _ROUNDING):
+        if self._aliases(diameter):
             # rounded down, so that the printed value is accepted
             needed = self.wavelength / (2 * diameter) * (1 - 5e-5)
             raise ValueError(
