@@ -2,13 +2,15 @@
 
 The object lives on a field somewhat wider than the frames (the margin), so that light may come from outside the
 field and leave it; only the pixels of the frames are compared. Aberrations are given in a linear parametrisation
-`z` of the phase, usually the whitened Zernike coefficients.
+`z` of the phase, usually the whitened Zernike coefficients. A broad band is a few wavelengths, whose PSFs on the same
+pixels of the sky add up.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -30,7 +32,7 @@ class Misfit(NamedTuple):
 
 
 class ExposureModel(nn.Module):
-    """Frames y_t = window(h_t * o), h_t = |FFT(P exp(i B z_t))|^2 with unit sum.
+    """Frames y_t = window(h_t * o), h_t = sum_w weight_w |FFT(P_w exp(i B_w z_t))|^2 with unit sum.
 
     Parameters
     ----------
@@ -44,12 +46,23 @@ class ExposureModel(nn.Module):
         (N J, K): coefficients = mixing @ z, sub-aperture by sub-aperture. None means the coefficients themselves.
     margin : float
         The object's field is at least (1 + margin) times as wide as the frames.
+    wavelengths, weights : sequence of float, optional
+        [m], and the share of the light of each (any positive numbers; None: equal). None: that of the grid alone.
+        Aberrations are path differences: coefficients are rad at the wavelength of the grid.
+    n_static : int
+        The last `n_static` of the K aberrations are common to all frames: those who fit z keep them equal.
+
+    Raises
+    ------
+    ValueError
+        If `weights` do not belong to `wavelengths`, one of either is not finite and positive, or the shortest
+        wavelength undersamples the image.
 
     Notes
     -----
     `forward(object, z)` takes an object (H', W') on `field` and z (T, K), and returns frames (T, H, W), differentiable
-    by autograd. `misfit` compares with given frames at the cost of six FFTs a frame and a memory that does not
-    grow with T; `weighted_misfit` is the same as a node of an autograd graph.
+    by autograd. `misfit` compares with given frames at the cost of six FFTs a frame (and two more for every further
+    wavelength) and a memory that does not grow with T; `weighted_misfit` is the same as a node of an autograd graph.
 
     The attenuation of the image by the cells of the pupil samples, which `PSF` divides out, is left in: on a field of
     this size it stands in for the light that leaves the field, and fits end-to-end simulations better.
@@ -60,6 +73,7 @@ class ExposureModel(nn.Module):
     basis: Tensor
     mixing: Tensor
     positions: Tensor
+    chromaticity: Tensor
 
     def __init__(
         self,
@@ -69,6 +83,9 @@ class ExposureModel(nn.Module):
         mixing: Tensor | None = None,
         margin: float = 0.25,
         *,
+        wavelengths: Sequence[float] | None = None,
+        weights: Sequence[float] | None = None,
+        n_static: int = 0,
         dtype: torch.dtype | None = None,
         device: torch.device | str | None = None,
     ) -> None:
@@ -76,24 +93,41 @@ class ExposureModel(nn.Module):
         self.grid = grid
         rows, columns = (fast_size(math.ceil(side * (1 + margin))) for side in grid.shape)
         self.field = Grid((rows, columns), grid.pixel_scale, grid.wavelength)
-        samples = aperture.samples(self.field)
-        basis = zernike_basis(samples, aperture, n_modes).detach()  # (N, P, J)
-        n_sub = basis.shape[0]
+        band = _band(grid, wavelengths, weights)
+        self.n_wavelengths, self.n_static = len(band), n_static
+        kwargs = {"dtype": dtype or aperture.centers.dtype, "device": device}
         if mixing is None:
-            mixing = torch.eye(n_sub * n_modes, dtype=basis.dtype, device=basis.device)
-        mixing = mixing.to(basis)
-        open_cell = samples.weights > 0
-        mixed = torch.einsum("npj,njk->npk", basis, mixing.unflatten(0, (n_sub, n_modes)))[open_cell]
-        weights = samples.weights.detach()[open_cell]
-        kwargs = {"dtype": dtype or basis.dtype, "device": device}
-        # Parseval: this makes the sum of every PSF 1, whatever the phase, as long as holes share no cell.
-        scale = float(weights.norm()) * math.prod(self.field.shape) ** 0.5
-        self.register_buffer("weights", (weights / scale).to(**kwargs))
-        self.register_buffer("index", samples.index[open_cell].to(device=device))
-        self.register_buffer("basis", mixed.to(**kwargs))
+            n = aperture.n_subapertures * n_modes
+            mixing = torch.eye(n, dtype=aperture.centers.dtype, device=aperture.centers.device)
         self.register_buffer("mixing", mixing.to(**kwargs))
-        positions = (samples.offsets + aperture.centers[:, None]).detach()[open_cell] / grid.period
-        self.register_buffer("positions", positions.to(**kwargs))  # (P, 2), (x, y) in cycles/pixel
+        # The samples of all wavelengths stand in one row, each indexing a raster of its own.
+        parts = [self._sample(aperture, n_modes, mixing, wavelength) for wavelength, _ in band]
+        amplitudes = [math.sqrt(share) * amplitude for (_, share), (amplitude, *_) in zip(band, parts, strict=True)]
+        indices = [part[1] + number * rows * columns for number, part in enumerate(parts)]
+        self.register_buffer("weights", torch.cat(amplitudes).to(**kwargs))
+        self.register_buffer("index", torch.cat(indices).to(device=device))
+        self.register_buffer("basis", torch.cat([part[2] for part in parts]).to(**kwargs))
+        self.register_buffer("positions", torch.cat([part[3] for part in parts]).to(**kwargs))  # (P, 2), cycles/pixel
+        ratios = [
+            part[0].new_full((len(part[0]),), grid.wavelength / w) for (w, _), part in zip(band, parts, strict=True)
+        ]
+        self.register_buffer("chromaticity", torch.cat(ratios).to(**kwargs))  # (P,), phase of a path of 1 rad
+
+    def _sample(
+        self, aperture: Aperture, n_modes: int, mixing: Tensor, wavelength: float
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Amplitude, index, basis and position (x, y) [cycles/pixel] of the open samples at one wavelength."""
+        field = replace(self.field, wavelength=wavelength)
+        samples = aperture.samples(field)
+        basis = zernike_basis(samples, aperture, n_modes).detach()  # (N, P, J)
+        open_cell = samples.weights > 0
+        mixing = mixing.to(basis).unflatten(0, (len(basis), n_modes))
+        mixed = torch.einsum("npj,njk->npk", basis, mixing)[open_cell]
+        weights = samples.weights.detach()[open_cell]
+        # Parseval: this makes the sum of every PSF 1, whatever the phase, as long as holes share no cell.
+        scale = float(weights.norm()) * math.prod(field.shape) ** 0.5
+        positions = (samples.offsets + aperture.centers[:, None]).detach()[open_cell] / field.period
+        return weights / scale, samples.index[open_cell], mixed * (self.grid.wavelength / wavelength), positions
 
     @property
     def n_parameters(self) -> int:
@@ -102,7 +136,7 @@ class ExposureModel(nn.Module):
 
     def chunks(self, n_frames: int) -> Iterator[slice]:
         """Slices of the frames whose work arrays stay small."""
-        size = max(1, _CHUNK // math.prod(self.field.shape))
+        size = max(1, _CHUNK // (self.n_wavelengths * math.prod(self.field.shape)))
         return (slice(start, min(start + size, n_frames)) for start in range(0, n_frames, size))
 
     def _pupil(self, z: Tensor) -> Tensor:
@@ -111,14 +145,14 @@ class ExposureModel(nn.Module):
         return torch.complex(self.weights * phase.cos(), self.weights * phase.sin())  # faster than torch.polar
 
     def _amplitude(self, field: Tensor) -> Tensor:
-        """Focal amplitude (T, H', W') of a pupil field (T, P)."""
-        pupil = field.new_zeros(len(field), math.prod(self.field.shape)).index_add(1, self.index, field)
-        return torch.fft.fft2(pupil.unflatten(1, self.field.shape))
+        """Focal amplitude (T, wavelength, H', W') of a pupil field (T, P)."""
+        rasters = (self.n_wavelengths, *self.field.shape)
+        pupil = field.new_zeros(len(field), math.prod(rasters)).index_add(1, self.index, field)
+        return torch.fft.fft2(pupil.unflatten(1, rasters))
 
     def psf(self, z: Tensor) -> Tensor:
         """PSFs (T, H', W') of unit sum, origin at [0, 0], for z (T, K)."""
-        amplitude = self._amplitude(self._pupil(z))
-        return amplitude.real**2 + amplitude.imag**2
+        return _intensity(self._amplitude(self._pupil(z)))
 
     def forward(self, image: Tensor, z: Tensor) -> Tensor:
         """Frames (T, H, W) of the object `image` (H', W') through the aberrations z (T, K)."""
@@ -157,7 +191,7 @@ class ExposureModel(nn.Module):
         values, slopes = [], []
         for part in self.chunks(len(z)):
             amplitude = self._amplitude(pupil[part])
-            transfer = torch.fft.rfft2(amplitude.real**2 + amplitude.imag**2)
+            transfer = torch.fft.rfft2(_intensity(amplitude))
             model = torch.fft.irfft2(transfer * spectrum, s=shape)
             error = model[:, : self.grid.shape[0], : self.grid.shape[1]] - frames[part]
             residual = error * (precision[part] if len(precision) > 1 else precision)
@@ -178,7 +212,7 @@ class ExposureModel(nn.Module):
 
     def _pull_back(self, field: Tensor, amplitude: Tensor, psf_gradient: Tensor) -> Tensor:
         """Gradient with respect to the phase (T, P) from that with respect to the PSF (T, H', W')."""
-        back = torch.fft.ifft2(amplitude * psf_gradient, norm="forward").flatten(1).index_select(1, self.index)
+        back = torch.fft.ifft2(amplitude * psf_gradient[:, None], norm="forward").flatten(1).index_select(1, self.index)
         return 2 * (back.imag * field.real - back.real * field.imag)
 
     @torch.no_grad()
@@ -202,9 +236,34 @@ class ExposureModel(nn.Module):
                 back = torch.fft.irfft2(torch.fft.rfft2(noise, s=shape) * conjugate, s=shape)
                 gradient = self._pull_back(field, amplitude, back) @ self.basis
                 total += (gradient**2).sum(0).to(z.dtype) / 4
-            energy = ((amplitude.real**2 + amplitude.imag**2) ** 2).sum((1, 2))
+            energy = (_intensity(amplitude) ** 2).sum((1, 2))
             pixel += float((energy * weight.mean((1, 2))).sum())
         return total / len(z), pixel
+
+
+def _intensity(amplitude: Tensor) -> Tensor:
+    """(T, H', W') of amplitudes (T, wavelength, H', W')."""
+    power = amplitude.real**2 + amplitude.imag**2
+    return power[:, 0] if power.shape[1] == 1 else power.sum(1)
+
+
+def _band(
+    grid: Grid, wavelengths: Sequence[float] | None, weights: Sequence[float] | None
+) -> list[tuple[float, float]]:
+    """Wavelengths [m] with their shares of the light, which sum to 1."""
+    if wavelengths is None:
+        if weights is not None:
+            raise ValueError("weights are given without wavelengths: give both")
+        return [(grid.wavelength, 1.0)]
+    shares = [1.0] * len(wavelengths) if weights is None else [float(weight) for weight in weights]
+    if not len(wavelengths) or len(shares) != len(wavelengths):
+        raise ValueError(
+            f"{len(wavelengths)} wavelengths have {len(shares)} weights: as many, and at least 1, are needed"
+        )
+    for name, values in (("wavelengths", wavelengths), ("weights", shares)):
+        if not all(math.isfinite(value) and value > 0 for value in values):
+            raise ValueError(f"{name} are {list(values)}: they must be finite and positive")
+    return [(float(wavelength), share / sum(shares)) for wavelength, share in zip(wavelengths, shares, strict=True)]
 
 
 class _WeightedMisfit(torch.autograd.Function):
