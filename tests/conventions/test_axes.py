@@ -1,0 +1,75 @@
+"""Rows are y, columns are x, and centres are (x, y). docs/conventions.md, "Axes"."""
+
+import math
+
+import pytest
+import torch
+
+import torchmask as tm
+from torchmask.optics.otf import psf_from_samples
+
+GRID = tm.Grid.nyquist(diameter=1.0, wavelength=550e-9, n_pixels=64)
+
+
+def pair(x, y):
+    """Two holes whose separation is (x, y) [m]."""
+    return tm.SparseAperture([[x / 2, y / 2], [-x / 2, -y / 2]], subaperture_diameter=0.1, mask_diameter=1.0)
+
+
+@pytest.mark.parametrize(("x", "y"), [(0.5, 0.0), (0.0, 0.5)])
+def test_a_baseline_along_x_is_a_peak_along_the_columns(x, y):
+    modulus = tm.OTF(pair(x, y), GRID)().abs()
+    row, column = round(64 * y / GRID.period), round(64 * x / GRID.period)
+    assert float(modulus[row, column]) == pytest.approx(0.5, abs=0.02)  # two of the four pairs, on top of each other
+    assert float(modulus[column, row]) < 0.02
+
+
+def test_a_hole_to_the_right_lies_on_columns_of_positive_frequency():
+    mask = tm.SparseAperture([[0.4, -0.1], [-0.4, -0.1]], 0.1, 1.0)
+    samples = mask.samples(GRID)
+    columns, rows = samples.index[0] % 64, samples.index[0] // 64  # of the hole at x = +0.4 m, y = -0.1 m
+    heavy = samples.weights[0] > 0.5
+    assert bool(heavy.any())
+    assert int(columns[heavy].max()) < 32  # positive x comes first in FFT order
+    assert int(rows[heavy].min()) > 32  # negative y comes last
+
+
+def test_grids_and_images_give_rows_first():
+    grid = tm.Grid((6, 9), 1e-7, 550e-9)
+    nu_y, nu_x = grid.frequencies()
+    assert grid.shape == (6, 9)
+    assert (tuple(nu_y.shape), tuple(nu_x.shape)) == ((6, 1), (1, 9))
+
+
+def test_leading_axes_are_free_and_frames_come_before_sub_apertures_and_modes():
+    mask = pair(0.5, 0.2)
+    layer = tm.ZernikePhase(mask, GRID, n_modes=3)
+    phase = layer(torch.zeros(4, 7, 2, 3, dtype=torch.float64))  # (batch, frame, sub-aperture, mode)
+    assert tm.PSF(mask, GRID)(phase).shape == (4, 7, 64, 64)
+
+
+def test_wind_to_the_right_carries_the_phase_to_the_right():
+    samples = tm.FullAperture(1.0).samples(GRID)
+    wind = tm.TurbulencePhase(0.1, 20.0, wind=(4 * samples.step[1], 0.0), frame_interval=1.0)
+    first, later = wind(samples, 2, torch.Generator().manual_seed(0))[:, 0]
+    rows, columns = samples.index[0] // 64, samples.index[0] % 64
+    place = {(int(r), (int(c) + 32) % 64): k for k, (r, c) in enumerate(zip(rows, columns, strict=True))}
+    moved = [(k, place[r, c + 4]) for (r, c), k in place.items() if (r, c + 4) in place]
+    source, target = (torch.tensor(part) for part in zip(*moved, strict=True))
+    assert len(moved) > 500
+    torch.testing.assert_close(later[target], first[source], rtol=0, atol=1e-5 * float(first.std()))
+
+
+def test_the_sky_seen_through_a_phase_is_not_turned():
+    """A quarter turn of pupil and phase is a quarter turn of the image: nothing is mirrored on the way."""
+    generator = torch.Generator().manual_seed(1)
+    centers = torch.tensor([[0.31, 0.02], [-0.12, 0.27], [-0.2, -0.3]], dtype=torch.float64)
+    pistons = torch.rand(3, 1, generator=generator, dtype=torch.float64) * 2 * math.pi
+    turned = centers.flip(-1) * torch.tensor([-1.0, 1.0])  # (x, y) -> (-y, x)
+    images = []
+    for c in (centers, turned):
+        samples = tm.SparseAperture(c, 0.2, 1.0).samples(GRID)
+        images.append(psf_from_samples(samples, pistons.expand_as(samples.weights)))
+    # In an array a turn from x to y takes (row, column) = (y, x) to (x, -y); the origin stays at [0, 0].
+    expected = images[0].T.flip(1).roll(1, 1)
+    torch.testing.assert_close(images[1], expected, rtol=0, atol=1e-12)
