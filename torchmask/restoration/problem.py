@@ -26,7 +26,7 @@ class State:
     """What goes on from one restart to the next.
 
     image : (H', W') object in units of the stack's mean pixel
-    z : (T, K) aberrations
+    z : (T, K) aberrations, the last `model.n_static` of them the same in every frame
     gains : (T,) transmission of the frames, 1 on average
     prior : weight of ||z||^2 / 2, which follows the strength of the turbulence
     excess : (T,) variance of a frame's residuals over that of its noise, at least 1
@@ -45,6 +45,7 @@ class JointProblem:
 
     frames : (T, H, W) in units of their mean; precision : (T or 1, H or 1, W or 1)
     free : which of "object" and "aberrations" may change
+    static : whether those aberrations may change that are common to all frames
     """
 
     model: ExposureModel
@@ -52,11 +53,21 @@ class JointProblem:
     precision: Tensor
     tv_weight: float
     free: tuple[str, ...] = ("object", "aberrations")
+    static: bool = True
 
     def scaled_data(self, state: State) -> tuple[Tensor, Tensor]:
         """Frames and precision with the gains divided out of the model: (frames / g, precision g^2 / excess)."""
         gains = state.gains[:, None, None].to(self.frames)
         return self.frames / gains, self.precision * (gains**2 / state.excess[:, None, None].to(gains))
+
+    def prior(self, state: State) -> float | Tensor:
+        """Weight of z^2 / 2 of every frame: common aberrations do not follow the turbulence, and count once."""
+        n_static = self.model.n_static
+        if not n_static:
+            return state.prior
+        weight = torch.full_like(state.z[0], state.prior)
+        weight[-n_static:] = 1 / len(state.z) if state.prior else 0.0
+        return weight
 
     def scales(self, state: State) -> tuple[Tensor, Tensor]:
         """Units in which the diagonal of the Hessian is about one, for image (H', W') and z (K,).
@@ -66,7 +77,7 @@ class JointProblem:
         """
         generator = torch.Generator().manual_seed(_PROBE_SEED)
         curvature, pixel = self.model.curvature(state.image, state.z, self.scaled_data(state)[1], generator)
-        curvature = curvature + state.prior
+        curvature = curvature + self.prior(state)
         z_scale = curvature.clamp(min=_LEAST_CURVATURE * float(curvature.max())).rsqrt()
         image_curvature = pixel + self.tv_weight * total_variation_curvature(state.image)
         return _OBJECT_STEP * image_curvature.rsqrt(), z_scale
@@ -77,20 +88,23 @@ class JointProblem:
         by_object, by_aberrations = ("object" in self.free), ("aberrations" in self.free)
         misfit = self.model.misfit(image, z, frames, precision, want_object=by_object, want_aberrations=by_aberrations)
         variation, slope = total_variation(image)
-        value = misfit.value.sum() + self.tv_weight * variation + 0.5 * state.prior * (z**2).sum()
+        value = misfit.value.sum() + self.tv_weight * variation + 0.5 * (self.prior(state) * z**2).sum()
         image_gradient = torch.zeros_like(image)
         z_gradient = torch.zeros_like(z)
         if misfit.object_gradient is not None:
             image_gradient = misfit.object_gradient + self.tv_weight * slope
         if misfit.aberration_gradient is not None:
-            z_gradient = misfit.aberration_gradient + state.prior * z
+            z_gradient = misfit.aberration_gradient + self.prior(state) * z
+            if self.model.n_static:  # of a function of their mean, which keeps equal what is equal
+                common = z_gradient[:, -self.model.n_static :]
+                common[:] = common.mean(0) if self.static else 0.0
         return value, image_gradient, z_gradient
 
     def frame_costs(self, state: State) -> Tensor:
         """Misfit and prior of each frame, (T,)."""
         frames, precision = self.scaled_data(state)
         misfit = self.model.misfit(state.image, state.z, frames, precision, want_object=False, want_aberrations=False)
-        return misfit.value.to(state.z) + 0.5 * state.prior * (state.z**2).sum(1)
+        return misfit.value.to(state.z) + 0.5 * (self.prior(state) * state.z**2).sum(1)
 
     def descend(self, state: State, n_iterations: int, progress: Callable[[float, int, Any], None]) -> State:
         """L-BFGS-B from `state`; `progress(cost, evaluations, function giving (image, z))` after every iteration."""

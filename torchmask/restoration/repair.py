@@ -32,6 +32,7 @@ def repair(problem: JointProblem, state: State, excess: Tensor, seed: int) -> tu
         frames=problem.frames[bad],
         precision=precision[bad] if len(precision) > 1 else precision,
         free=("aberrations",),
+        static=False,
     )
     generator = torch.Generator().manual_seed(seed)
     n_evaluations = 0

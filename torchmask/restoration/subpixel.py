@@ -11,9 +11,9 @@ import math
 from dataclasses import replace
 
 import torch
-from scipy.optimize import Bounds, minimize
 from torch import Tensor
 
+from torchmask.restoration.lbfgsb import minimize_bounded
 from torchmask.restoration.model import ExposureModel
 from torchmask.restoration.priors import total_variation, total_variation_curvature
 from torchmask.restoration.problem import JointProblem, State
@@ -26,7 +26,7 @@ def tilt(model: ExposureModel, offset: tuple[float, float]) -> Tensor:
     """The aberrations (K,) that move every image by `offset` (dy, dx) pixels, as closely as the modes can."""
     phase = 2 * math.pi * (model.positions * model.positions.new_tensor([offset[1], offset[0]])).sum(-1)
     # A constant phase does nothing; it may take up the mean piston, which the modes need not contain.
-    modes = torch.cat([model.basis, torch.ones_like(model.basis[:, :1])], dim=1).double()
+    modes = torch.cat([model.basis, model.chromaticity[:, None]], dim=1).double()
     q, r = torch.linalg.qr(modes)
     return torch.linalg.lstsq(r.cpu(), (q.T @ phase.double()).cpu()[:, None], driver="gelsd").solution[:-1, 0].to(q)
 
@@ -58,7 +58,7 @@ def centre_on_pixels(problem: JointProblem, state: State) -> State:
             if (trial := settle(offset))[0] < best[0]:
                 best, place = trial, offset
     z = state.z - tilt(problem.model, place).to(state.z)
-    gain = stay[0] - best[0] + 0.5 * state.prior * float((state.z**2).sum() - (z**2).sum())
+    gain = stay[0] - best[0] + 0.5 * float((problem.prior(state) * (state.z**2 - z**2)).sum())
     return replace(state, image=best[1], z=z) if gain > 0 else state
 
 
@@ -67,23 +67,17 @@ def _settle(centre: Tensor, gradient: Tensor, power: Tensor, tv_weight: float) -
     start = centre.clamp(min=0)
     scale = (power.mean() + tv_weight * total_variation_curvature(start)).rsqrt()
 
-    def cost(x: object) -> tuple[float, object]:
-        image = torch.as_tensor(x).to(centre).view_as(centre) * scale
+    def cost(x: Tensor) -> tuple[float, Tensor]:
+        image = x.view_as(centre) * scale
         change = image - centre
         curved = torch.fft.irfft2(torch.fft.rfft2(change) * power, s=change.shape)
         variation, slope = total_variation(image)
         value = (change * (gradient + 0.5 * curved)).sum() + tv_weight * variation
-        return float(value), ((gradient + curved + tv_weight * slope) * scale).flatten().cpu().numpy()
+        return float(value), ((gradient + curved + tv_weight * slope) * scale).flatten()
 
-    result = minimize(
-        cost,
-        (start / scale).flatten().cpu().numpy(),
-        jac=True,
-        method="L-BFGS-B",
-        bounds=Bounds(0.0),
-        options={"maxiter": _ITERATIONS, "maxfun": 2 * _ITERATIONS},
-    )
-    return float(result.fun), torch.as_tensor(result.x).to(centre).view_as(centre) * scale
+    x = (start / scale).flatten()
+    found = minimize_bounded(cost, x, torch.zeros_like(x), max_iterations=_ITERATIONS)
+    return found.value, found.x.view_as(centre) * scale
 
 
 def shift(image: Tensor, offset: tuple[float, float]) -> Tensor:
