@@ -95,6 +95,7 @@ class ExposureModel(nn.Module):
         self.field = Grid((rows, columns), grid.pixel_scale, grid.wavelength)
         band = _band(grid, wavelengths, weights)
         self.n_wavelengths, self.n_static = len(band), n_static
+        self.shortest_wavelength = min(wavelength for wavelength, _ in band)
         kwargs = {"dtype": dtype or aperture.centers.dtype, "device": device}
         if mixing is None:
             n = aperture.n_subapertures * n_modes

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -44,6 +45,13 @@ class MyopicDeconvolution(nn.Module):
         Of the turbulence [m]. None: r0 is estimated from the restored aberrations; 20 mask diameters.
     readout_noise : float, optional
         [electrons rms per pixel]. None: the noise is measured beyond the cut-off frequency.
+    wavelengths, weights : sequence of float, optional
+        A broad band as a few wavelengths [m], and the share of the light of each (any positive numbers; None: equal).
+        Coefficients are rad at the wavelength of the grid, and path differences the same for all. None: only that.
+    static_modes : int
+        Zernike modes per sub-aperture, Noll 1 to static_modes, of aberrations common to all frames, such as those of the
+        telescope, besides the `n_modes` of each frame. Their prior is turbulence as strong as a hole is wide, whatever
+        `r0`. Coefficients then have max(n_modes, static_modes) modes, and are the sum of both.
     tv_weight : float
         mu.
     aberration_prior : bool
@@ -81,6 +89,9 @@ class MyopicDeconvolution(nn.Module):
         outer_scale: float | None = None,
         readout_noise: float | None = None,
         *,
+        wavelengths: Sequence[float] | None = None,
+        weights: Sequence[float] | None = None,
+        static_modes: int = 0,
         tv_weight: float = 1.0,
         aberration_prior: bool = True,
         max_iterations: int = 1000,
@@ -102,8 +113,10 @@ class MyopicDeconvolution(nn.Module):
             raise ValueError(
                 f"max_iterations is {max_iterations} and tolerance {tolerance}: they must be at least 1 and at least 0"
             )
+        if static_modes < 0:
+            raise ValueError(f"static_modes is {static_modes}: it must be at least 0")
         symmetric = aperture.n_subapertures == 1
-        self.n_modes = n_modes or (231 if symmetric else 6)
+        n_modes = n_modes or (231 if symmetric else 6)
         self.known_r0 = r0 is not None
         # Masks are made for holes of about r0; a full pupil that needs a restoration spans several.
         self.r0 = r0 or aperture.subaperture_diameter / (7 if symmetric else 1)
@@ -115,8 +128,28 @@ class MyopicDeconvolution(nn.Module):
         self.tolerance = tolerance
         self.aperture = aperture
         self.grid = grid
-        mixing = whitening(aperture, self.n_modes, self.r0, self.outer_scale) if aberration_prior else None
-        self.model = ExposureModel(aperture, grid, self.n_modes, mixing, dtype=dtype, device=device)
+        self.n_modes = max(n_modes, static_modes)
+
+        def mixing(modes: int, r0: float) -> Tensor:
+            """Coefficients (N J) of the modes 1 to `modes` from their parameters."""
+            n_sub = aperture.n_subapertures
+            columns = whitening(aperture, modes, r0, self.outer_scale) if aberration_prior else torch.eye(n_sub * modes)
+            rows = columns.unflatten(0, (n_sub, modes))
+            return nn.functional.pad(rows, (0, 0, 0, self.n_modes - modes)).flatten(0, 1)
+
+        columns = mixing(n_modes, self.r0)
+        static = mixing(static_modes, aperture.subaperture_diameter) if static_modes else columns[:, :0]
+        self.model = ExposureModel(
+            aperture,
+            grid,
+            self.n_modes,
+            torch.cat([columns, static.to(columns)], dim=1),
+            wavelengths=wavelengths,
+            weights=weights,
+            n_static=static.shape[1],
+            dtype=dtype,
+            device=device,
+        )
 
     def restore(
         self,

@@ -56,7 +56,8 @@ class Restoration:
     def __init__(self, method: MyopicDeconvolution, frames: Tensor, valid: Tensor, callback: Callback | None) -> None:
         self.method, self.model, self.callback = method, method.model, callback
         self.unit = float(frames.mean())
-        self.variance = expected_variance(frames, method.grid, method.aperture, method.readout_noise)
+        bluest = replace(method.grid, wavelength=self.model.shortest_wavelength)
+        self.variance = expected_variance(frames, bluest, method.aperture, method.readout_noise)
         if border_brightness(frames) > _BRIGHT_BORDER:
             warnings.warn("the frames are bright at the border: does the object reach beyond the field?", stacklevel=3)
         basis = self.model.basis
@@ -131,7 +132,9 @@ class Restoration:
         state = replace(state, excess=state.excess.mean().expand_as(state.excess).clone())
         if self.method.known_r0 or not self.method.aberration_prior or "aberrations" not in self.problem.free:
             return state
-        strength = turbulence_strength(self._coefficients(state.z), self.model.mixing)
+        own = self.model.n_parameters - self.model.n_static
+        mixing = self.model.mixing[:, :own]
+        strength = turbulence_strength(self._coefficients(state.z[:, :own], mixing), mixing)
         return state if strength is None else replace(state, prior=1 / strength)
 
     def _begin(
@@ -144,6 +147,8 @@ class Restoration:
             # Zero is a saddle point there: the sign of the even modes of a point-symmetric pupil cannot be seen.
             noise = torch.randn(shape, dtype=z.dtype, generator=torch.Generator().manual_seed(_SEED))
             z = noise.to(z) * (_START if self.method.aberration_prior else _START / 7)
+            own = self.model.n_parameters - self.model.n_static
+            z[:, own:] = z[0, own:]
         if coefficients is not None:
             expected = (len(z), self.method.aperture.n_subapertures, self.method.n_modes)
             if tuple(coefficients.shape) != expected:
@@ -187,6 +192,7 @@ class Restoration:
                 frames=self.frames[known:],
                 precision=precision[known:] if len(precision) > 1 else precision,
                 free=("aberrations",),
+                static=False,
             )
 
             def count(cost: float, evaluations: int, variables: Any) -> None:
@@ -207,18 +213,25 @@ class Restoration:
         scalars = {"cost": progress.costs[-1]}
         self.callback(Record("restoration", step, self.method.max_iterations, scalars, arrays))
 
-    def _coefficients(self, z: Tensor) -> Tensor:
-        flat = z @ self.model.mixing.to(z).T
+    def _coefficients(self, z: Tensor, mixing: Tensor | None = None) -> Tensor:
+        flat = z @ (self.model.mixing if mixing is None else mixing).to(z).T
         return flat.unflatten(1, (self.method.aperture.n_subapertures, self.method.n_modes))
 
     def _whiten(self, coefficients: Tensor) -> Tensor:
-        """z (T, K) whose coefficients come closest to (T, N, J); exact but for the mean piston."""
-        mixing = self.model.mixing.double()
-        return coefficients.to(mixing).flatten(1) @ torch.linalg.pinv(mixing).T
+        """z (T, K) whose coefficients come closest to (T, N, J); exact but for the mean piston.
+
+        What is common to all frames goes to the common aberrations as far as they reach, which makes those equal.
+        """
+        own, common = self.model.mixing.double().tensor_split([self.model.n_parameters - self.model.n_static], dim=1)
+        flat = coefficients.to(own).flatten(1)
+        static = flat.mean(0) @ torch.linalg.pinv(common).T
+        z = (flat - static @ common.T) @ torch.linalg.pinv(own).T
+        return torch.cat([z, static.expand(len(z), -1)], dim=1)
 
     def _fingerprint(self) -> str:
         """Tells whether a checkpoint belongs to these frames and settings."""
         digest = hashlib.sha256(self.frames.cpu().numpy().tobytes() + self.model.basis.cpu().numpy().tobytes())
+        digest.update(self.model.weights.cpu().numpy().tobytes())
         digest.update(self.problem.precision.cpu().numpy().tobytes())
         digest.update(repr((self.problem.free, self.method.tv_weight, self.method.aberration_prior)).encode())
         return digest.hexdigest()
