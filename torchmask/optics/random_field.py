@@ -11,7 +11,7 @@ is von Karman's to 0.3 %, 0.2 % for outer scales up to 20 times the field, from 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from scipy.fft import next_fast_len
@@ -25,6 +25,7 @@ _STEEPNESS = 6  # of the windows exp(-x^6)
 _NEGLIGIBLE = 1.55  # their x where they end
 _ALIASES = 1  # of the frequencies beyond Nyquist, on either side, that are told apart
 COMPLEX = {torch.float32: torch.complex64, torch.float64: torch.complex128}
+_HOST: dict[str, Any] = {"dtype": torch.float64, "device": "cpu"}  # small arrays that are always made there
 
 
 class Band(NamedTuple):
@@ -47,22 +48,23 @@ def split_spectrum(
 
     sizes = [int(next_fast_len(math.ceil((e + margin) / s)) or 0) for e, s in zip(extent, step, strict=True)]
     # The spectrum is even, so one quadrant tells all.
-    fy, fx = (torch.arange(n // 2 + 1, dtype=torch.float64) / (n * s) for n, s in zip(sizes, step, strict=True))
-    density = torch.full((len(fy), len(fx)), _beyond(step, r0, outer_scale), dtype=torch.float64)
+    fy, fx = (torch.arange(n // 2 + 1, **_HOST) / (n * s) for n, s in zip(sizes, step, strict=True))
+    density = torch.full((len(fy), len(fx)), _beyond(step, r0, outer_scale), **_HOST)
     for alias_y in range(-_ALIASES, _ALIASES + 1):
         for alias_x in range(-_ALIASES, _ALIASES + 1):
             f = torch.hypot(fy[:, None] + alias_y / step[0], fx + alias_x / step[1])
             density += von_karman_psd(f, r0, outer_scale) * (1 - below(f, 0))
     density /= sizes[0] * step[0] * sizes[1] * step[1]
-    fy, fx = (torch.fft.fftfreq(n, s, dtype=torch.float64) for n, s in zip(sizes, step, strict=True))
-    rows, columns = (torch.minimum(torch.arange(n), n - torch.arange(n)) for n in sizes)
+    fy, fx = (torch.fft.fftfreq(n, s, **_HOST) for n, s in zip(sizes, step, strict=True))
+    places = (torch.arange(n, device="cpu") for n in sizes)
+    rows, columns = (torch.minimum(k, len(k) - k) for k in places)
     bands = [Band(fy, fx, density.sqrt()[rows][:, columns])]
 
     levels = max(1, math.ceil(math.log(2 * outer_scale / margin, _RATIO)))  # until the lattice resolves 1 / L0
     for level in range(1, levels + 1):
         periods = [e + margin * _RATIO**level for e in extent]
         counts = [math.ceil(_NEGLIGIBLE * cutoff / _RATIO ** (level - 1) * p) for p in periods]
-        fy, fx = (torch.arange(-n, n + 1, dtype=torch.float64) / p for n, p in zip(counts, periods, strict=True))
+        fy, fx = (torch.arange(-n, n + 1, **_HOST) / p for n, p in zip(counts, periods, strict=True))
         f = torch.hypot(fy[:, None], fx)
         share = below(f, level - 1) - (below(f, level) if level < levels else 0)
         density = von_karman_psd(f, r0, outer_scale) * share / (periods[0] * periods[1])
@@ -77,7 +79,7 @@ def _beyond(step: tuple[float, float], r0: float, outer_scale: float) -> float:
     one is a mean over a quarter turn.
     """
     n = 64
-    angle = math.pi / (2 * n) * (torch.arange(n, dtype=torch.float64) + 0.5)
+    angle = math.pi / (2 * n) * (torch.arange(n, **_HOST) + 0.5)
     edge = (_ALIASES + 0.5) * torch.minimum(1 / (step[0] * angle.sin()), 1 / (step[1] * angle.cos()))
     power = 1.2 * math.pi * PSD_CONSTANT * r0 ** (-5 / 3) * (edge**2 + outer_scale**-2) ** (-5 / 6)
     return float(power.mean()) * step[0] * step[1]
@@ -99,7 +101,7 @@ class RandomField:
         self.kind = {"dtype": COMPLEX[dtype], "device": device}
         # randn gives complex numbers a mean square of 1: half of it for each of the two fields
         self.amplitudes = [(math.sqrt(2) * band.amplitude).to(device, dtype) for band in bands]
-        places = [torch.arange(n, dtype=torch.float64) * s for n, s in zip(shape, step, strict=True)]
+        places = [torch.arange(n, **_HOST) * s for n, s in zip(shape, step, strict=True)]
         self.waves = [
             (_phasor(places[0][:, None] * fy).to(**self.kind), _phasor(fx[:, None] * places[1]).to(**self.kind))
             for fy, fx, _ in bands[1:]

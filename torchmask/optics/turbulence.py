@@ -97,8 +97,8 @@ def frozen_flow(
     span = path.cummax(0).values - path.cummin(0).values  # up to each frame
     own = (shape[0] * step[0], shape[1] * step[1])
     margin = _margin(own, step)
-    extents = span + torch.tensor(own, dtype=torch.float64)
-    fits = ((extents + margin) / torch.tensor(step, dtype=torch.float64)).prod(-1) <= _MAX_SAMPLES
+    extents = span + path.new_tensor(own)
+    fits = ((extents + margin) / path.new_tensor(step)).prod(-1) <= _MAX_SAMPLES
     if not bool(fits.all()):
         raise ValueError(
             f"the wind carries the screen {float(span[-1, 1]):.4g} m by {float(span[-1, 0]):.4g} m (x, y) in "
@@ -171,8 +171,8 @@ class TurbulencePhase(nn.Module):
         if self.wind is None or self.frame_interval is None:
             screens = phase_screens(shape, samples.step, self.r0, self.outer_scale, n_frames, **like)
         else:
-            time = torch.arange(n_frames, dtype=torch.float64) * self.frame_interval
-            path = time[:, None] * torch.tensor(self.wind, dtype=torch.float64)
+            time = torch.arange(n_frames, dtype=torch.float64, device="cpu") * self.frame_interval
+            path = time[:, None] * time.new_tensor(self.wind)
             screens = frozen_flow(shape, samples.step, self.r0, self.outer_scale, path, **like)
         return screens.flatten(1)[:, place]
 

@@ -19,7 +19,7 @@ def check_frames(frames: Tensor, valid: Tensor | None, grid: Grid) -> tuple[Tens
 
     Raises ValueError if a shape is wrong, a valid pixel is not finite, or a frame holds no light.
     """
-    frames = torch.as_tensor(frames)
+    frames = frames if isinstance(frames, Tensor) else torch.as_tensor(frames)  # which also moves to a default device
     if frames.ndim != 3 or tuple(frames.shape[1:]) != grid.shape or not len(frames):
         raise ValueError(
             f"frames has shape {tuple(frames.shape)}: it must be (n_frames, {grid.shape[0]}, {grid.shape[1]}), with "

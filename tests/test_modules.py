@@ -1,0 +1,234 @@
+"""Laws that every nn.Module of the library obeys, whatever it computes."""
+
+import copy
+import importlib
+import inspect
+import io
+import pickle
+import pkgutil
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+import torchmask
+from torchmask.design.criterion import AsymptoticMSE
+from torchmask.design.psd import NoisePSD, PowerLawPSD
+from torchmask.grid import Grid
+from torchmask.optics.aperture import Aperture, FullAperture, SparseAperture
+from torchmask.optics.detector import Detector
+from torchmask.optics.otf import OTF, PSF
+from torchmask.optics.turbulence import TurbulencePhase
+from torchmask.optics.zernike import ZernikePhase
+from torchmask.restoration.model import ExposureModel
+from torchmask.restoration.myopic import MyopicDeconvolution
+
+GRID = Grid.nyquist(1.0, 550e-9, 32)
+CENTERS = torch.tensor([[0.02, 0.31], [0.3, -0.21], [-0.29, -0.18]], dtype=torch.float64)
+DTYPES = (torch.float32, torch.float64)
+
+
+def mask(shape="disc", centers=CENTERS):
+    return SparseAperture(centers, 0.2, 1.0, shape)
+
+
+def moved(shape="disc"):
+    """The mirror image: it has other values and as many open pupil samples."""
+    return mask(shape, CENTERS * torch.tensor([-1.0, 1.0]))
+
+
+def criterion(n_photons=1e7):
+    return AsymptoticMSE(GRID, PowerLawPSD(1.5, n_photons), NoisePSD(n_photons), n_frames=20)
+
+
+def seeded():
+    return torch.Generator("cpu").manual_seed(0)
+
+
+def random(*shape, dtype):
+    return torch.rand(*shape, generator=seeded(), dtype=torch.float64, device="cpu").to(dtype)
+
+
+def restored(module: MyopicDeconvolution, dtype: torch.dtype) -> Tensor:
+    frames = torch.zeros(2, 32, 32, dtype=dtype, device="cpu")
+    frames[:, 10:22, 10:22] = torch.ceil(1e4 * random(2, 12, 12, dtype=dtype))
+    result = module.restore(frames)
+    return torch.cat([result.object.flatten(), result.coefficients.flatten()])
+
+
+@dataclass(frozen=True)
+class Entry:
+    """How to make a module, the same with another state (or None: it has none), and how to call it."""
+
+    make: Callable[[], nn.Module]
+    call: Callable[[nn.Module, torch.dtype], Tensor]
+    other: Callable[[], nn.Module] | None = None
+    result: torch.dtype | None = None  # where it is not the dtype of the input
+
+
+def samples(module: nn.Module, dtype: torch.dtype) -> Tensor:
+    return module.samples(GRID, 2).weights
+
+
+def blurred(module: PSF, dtype: torch.dtype) -> Tensor:
+    return module(random(2, *module.samples().weights.shape, dtype=dtype)).abs()
+
+
+def turbulent(module: TurbulencePhase, dtype: torch.dtype) -> Tensor:
+    pupil = mask().to(dtype).samples(GRID)
+    return module(pupil, 2, generator=seeded())
+
+
+def exposed(module: ExposureModel, dtype: torch.dtype) -> Tensor:
+    return module(random(*module.field.shape, dtype=dtype), random(2, module.n_parameters, dtype=dtype))
+
+
+MODULES: dict[str, Entry] = {
+    "mask of discs": Entry(mask, samples, moved),
+    "mask of hexagons": Entry(lambda: mask("hexagon"), samples, lambda: moved("hexagon")),
+    "full pupil": Entry(lambda: FullAperture(0.9, 0.2), samples),
+    "Zernike phase": Entry(
+        lambda: ZernikePhase(mask(), GRID, 4),
+        lambda module, dtype: module(random(2, 3, 4, dtype=dtype)),
+        lambda: ZernikePhase(moved(), GRID, 4),
+    ),
+    "turbulence": Entry(lambda: TurbulencePhase(0.15, 20.0), turbulent),
+    "frozen flow": Entry(lambda: TurbulencePhase(0.15, 20.0, wind=(3.0, 1.0), frame_interval=0.01), turbulent),
+    "PSF": Entry(lambda: PSF(mask(), GRID), blurred, lambda: PSF(moved(), GRID)),
+    "OTF": Entry(lambda: OTF(mask(), GRID), blurred, lambda: OTF(moved(), GRID)),
+    "criterion": Entry(criterion, lambda module, dtype: module(mask().to(dtype)), lambda: criterion(1e6)),
+    "detector": Entry(
+        lambda: Detector(1.5),
+        lambda module, dtype: module(1e3 * random(8, 8, dtype=dtype), seeded()),
+    ),
+    "exposure model": Entry(lambda: ExposureModel(mask(), GRID, 4), exposed, lambda: ExposureModel(moved(), GRID, 4)),
+    "myopic deconvolution": Entry(
+        lambda: MyopicDeconvolution(mask(), GRID, 3, max_iterations=3),
+        restored,
+        lambda: MyopicDeconvolution(moved(), GRID, 3, max_iterations=3),
+        result=torch.float64,
+    ),
+}
+each_module = pytest.mark.parametrize("entry", MODULES.values(), ids=MODULES)
+
+
+def test_the_registry_is_complete():
+    classes = set()
+    for found in pkgutil.walk_packages(torchmask.__path__, "torchmask."):
+        if not found.name.startswith("torchmask.interop."):
+            for _, value in inspect.getmembers(importlib.import_module(found.name), inspect.isclass):
+                if issubclass(value, nn.Module) and value.__module__.startswith("torchmask."):
+                    classes.add(value)
+    assert classes - {Aperture} == {type(entry.make()) for entry in MODULES.values()}
+
+
+@each_module
+def test_state_dict_round_trip(entry):
+    source = entry.make()
+    if entry.other is None:
+        target = entry.make()
+    else:
+        target = entry.other()
+        assert not torch.equal(entry.call(target, torch.float64), entry.call(source, torch.float64))
+    file = io.BytesIO()
+    torch.save(source.state_dict(), file)
+    file.seek(0)
+    target.load_state_dict(torch.load(file, weights_only=True))
+    assert torch.equal(entry.call(target, torch.float64), entry.call(source, torch.float64))
+
+
+@each_module
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda m: pickle.loads(pickle.dumps(m))], ids=["deepcopy", "pickle"])
+def test_copies_do_the_same_and_share_nothing(entry, copied):
+    source = entry.make()
+    expected = entry.call(source, torch.float64)
+    twin = copied(source)
+    assert torch.equal(entry.call(twin, torch.float64), expected)
+    with torch.no_grad():
+        for tensor in [*twin.parameters(), *twin.buffers()]:
+            tensor.zero_()
+    assert torch.equal(entry.call(source, torch.float64), expected)
+
+
+@each_module
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_the_dtype_follows_the_inputs(entry, dtype):
+    """Whatever torch's default is: the numbers are those of float64 up to float32's rounding."""
+    module = entry.make().to(dtype)
+    default = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64 if dtype == torch.float32 else torch.float32)
+    try:
+        result = entry.call(module, dtype)
+    finally:
+        torch.set_default_dtype(default)
+    assert result.dtype == (entry.result or dtype)
+    assert bool(torch.isfinite(result).all())
+
+
+@each_module
+def test_the_device_follows_the_inputs(entry):
+    """Every array made inside is made where the inputs are: on another default device nothing goes there."""
+    module = entry.make()
+    expected = entry.call(module, torch.float64)
+    with torch.device("meta"):
+        result = entry.call(module, torch.float64)
+    assert torch.equal(result, expected)
+
+
+@each_module
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_a_module_moves_to_a_gpu(entry):
+    module = entry.make().cuda()
+    assert all(tensor.is_cuda for tensor in [*module.parameters(), *module.buffers()])
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda aperture: aperture,
+        lambda aperture: ZernikePhase(aperture, GRID, 3),
+        lambda aperture: PSF(aperture, GRID),
+        lambda aperture: OTF(aperture, GRID),
+        lambda aperture: MyopicDeconvolution(aperture, GRID, 3),
+    ],
+    ids=["mask", "Zernike phase", "PSF", "OTF", "myopic deconvolution"],
+)
+def test_a_parameter_stays_that_very_object(make):
+    centers = nn.Parameter(CENTERS.clone())
+    module = make(SparseAperture(centers, 0.2, 1.0))
+    assert [parameter is centers for parameter in module.parameters()] == [True]
+    plain = make(SparseAperture(CENTERS, 0.2, 1.0))
+    assert list(plain.parameters()) == []
+
+
+def value_and_gradient(function, aperture, phase):
+    aperture.centers.grad = None
+    value = function(aperture) if phase is None else (function(phase) * random(32, 32, dtype=torch.float64)).sum()
+    value.backward()
+    return value.detach(), aperture.centers.grad.clone()
+
+
+@pytest.mark.filterwarnings("ignore:.*should not be instantiated:DeprecationWarning")  # torch does so itself
+@pytest.mark.filterwarnings(
+    "ignore:The .grad attribute of a Tensor that is not a leaf"
+)  # likewise, after a graph break
+@pytest.mark.filterwarnings("ignore:Torchinductor does not support code generation for complex")
+@pytest.mark.parametrize("backend", ["aot_eager", pytest.param("inductor", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["PSF", "criterion"])
+def test_compiled_modules_do_what_eager_ones_do(name, backend):
+    """Also after an optimiser has moved the holes: nothing of the first call is frozen into the graph."""
+    aperture = SparseAperture(nn.Parameter(CENTERS.clone()), 0.2, 1.0)
+    module = PSF(aperture, GRID) if name == "PSF" else criterion()
+    phase = random(2, *aperture.samples(GRID).weights.shape, dtype=torch.float64) if name == "PSF" else None
+    torch.compiler.reset()
+    compiled = torch.compile(module, backend=backend)
+    for step in (0.0, 0.013):
+        with torch.no_grad():
+            aperture.centers += step * CENTERS
+        expected, gradient = value_and_gradient(module, aperture, phase)
+        value, compiled_gradient = value_and_gradient(compiled, aperture, phase)
+        # reordered sums of at most 32 x 32 x 2 terms
+        torch.testing.assert_close(value, expected, rtol=1e-12, atol=0)
+        torch.testing.assert_close(compiled_gradient, gradient, rtol=1e-10, atol=1e-12 * float(gradient.abs().max()))
