@@ -174,12 +174,21 @@ def wiener_mse(otfs: Tensor, object_psd: PSD, noise_psd: PSD) -> Tensor:
 
     Returns
     -------
-    (...) mean over nu of S_o S_n / (S_o sum_k |h_k|^2 + S_n). Its average over random pistons is at least MSE_a.
+    Tensor
+        (...) mean over nu of S_o S_n / (S_o sum_k |h_k|^2 + S_n). Its average over random pistons is at least MSE_a.
 
     Raises
     ------
     ValueError, TypeError
         For OTFs without a frame axis, and for PSDs of a wrong shape, sign or type.
+
+    Examples
+    --------
+    One exposure through nothing: the object as it is, with its noise.
+
+    >>> perfect = torch.ones(1, 8, 8, dtype=torch.float64)
+    >>> round(float(wiener_mse(perfect, torch.tensor(100.0), torch.tensor(1.0))), 4)  # S_o S_n / (S_o + S_n)
+    0.9901
     """
     if otfs.ndim < 3:
         raise ValueError(f"otfs has shape {tuple(otfs.shape)}: it must be (..., frame, H, W)")

@@ -80,6 +80,13 @@ class NoisePSD:
     ------
     ValueError
         If a number is not finite or out of range.
+
+    Examples
+    --------
+    >>> from torchmask.grid import Grid
+    >>> psd = NoisePSD(n_photons=1e6, readout_noise=2.0)
+    >>> float(psd(Grid.nyquist(diameter=1.0, wavelength=550e-9, n_pixels=100))[0, 0])  # 1e6 + 100^2 2^2
+    1040000.0
     """
 
     n_photons: float

@@ -28,6 +28,15 @@ class SearchResult:
     evaluations : masks whose error was computed
     history : for each stage (evaluations so far, best relative MSE so far) (n, 2); a stage that works on a coarse grid
         or with penalties reports the values it sees there
+
+    Examples
+    --------
+    >>> aperture = SparseAperture([[-0.4, 0.0], [0.4, 0.0]], 0.2, 1.0)
+    >>> history = {"design/hybrid": torch.tensor([[10.0, 0.4], [20.0, 0.3]])}
+    >>> found = SearchResult(aperture, mse=3e9, relative_mse=0.3, evaluations=20, history=history)
+    >>> found  # prints what matters
+    SearchResult(aperture=SparseAperture((2, 2) disc, subaperture_diameter=0.2, mask_diameter=1), mse=3000000000.0, \
+    relative_mse=0.3, evaluations=20)
     """
 
     aperture: SparseAperture
@@ -96,10 +105,27 @@ def refine_mask(
     callback : callable, optional
         Gets a `Record` now and then; its centres may still break a rule by a little.
 
+    Returns
+    -------
+    SearchResult
+        Feasible to 1e-9 of the mask's diameter.
+
     Raises
     ------
     ValueError
         For a population, or if no feasible mask is found near the given one.
+
+    Examples
+    --------
+    >>> from torchmask.design.criterion import AsymptoticMSE
+    >>> from torchmask.design.psd import NoisePSD, PowerLawPSD
+    >>> from torchmask.grid import Grid
+    >>> grid = Grid.nyquist(diameter=1.0, wavelength=550e-9, n_pixels=64)
+    >>> criterion = AsymptoticMSE(grid, PowerLawPSD(1.5, 1e7), NoisePSD(1e7), n_frames=20)
+    >>> golay = SparseAperture.from_catalog("golay6", mask_diameter=1.0, fill_factor=0.15)
+    >>> better = refine_mask(criterion, golay, budget=60)
+    >>> better.relative_mse < float(criterion.relative(golay))
+    True
     """
     if aperture.centers.ndim != 2:
         raise ValueError(f"centers has shape {tuple(aperture.centers.shape)}: refine_mask takes one mask, (N, 2)")

@@ -58,10 +58,28 @@ def search_mask(
     callback : callable, optional
         Gets a `Record` now and then, with the best centres so far, which may still break a rule by a little.
 
+    Returns
+    -------
+    SearchResult
+        Feasible to 1e-9 of the mask's diameter, its error measured on the grid of `criterion` at this very mask.
+
     Raises
     ------
     ValueError
         For a request that no mask fulfils.
+
+    Examples
+    --------
+    A small search on a coarse grid; leave `budget` out for a result to quote.
+
+    >>> from torchmask.design.criterion import AsymptoticMSE
+    >>> from torchmask.design.psd import NoisePSD, PowerLawPSD
+    >>> from torchmask.grid import Grid
+    >>> grid = Grid.nyquist(diameter=1.0, wavelength=550e-9, n_pixels=64)
+    >>> criterion = AsymptoticMSE(grid, PowerLawPSD(1.5, 1e7), NoisePSD(1e7), n_frames=20)
+    >>> found = search_mask(criterion, n_subapertures=3, mask_diameter=1.0, fill_factor=0.1, seed=0, budget=300)
+    >>> found.aperture.centers.shape, found.relative_mse < 0.5
+    (torch.Size([3, 2]), True)
     """
     if method not in METHODS:
         raise ValueError(f"method is {method!r}: known methods are {', '.join(METHODS)}")

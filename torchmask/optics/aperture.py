@@ -291,6 +291,12 @@ class SparseAperture(Aperture):
         ------
         ValueError
             If the holes cannot be packed; the message says the largest fill factor that can.
+
+        Examples
+        --------
+        >>> mask = SparseAperture.random(7, 1.0, 0.15, torch.Generator().manual_seed(0))
+        >>> mask.centers.shape, round(mask.subaperture_diameter, 4)
+        (torch.Size([7, 2]), 0.1464)
         """
         diameter = hole_diameter(n_subapertures, mask_diameter, fill_factor)
         centers = random_packing(n_subapertures, mask_diameter, fill_factor, generator)
@@ -322,6 +328,12 @@ class FullAperture(Aperture):
     ------
     ValueError
         If `diameter` is not finite and positive, or `central_obstruction` lies outside [0, 1).
+
+    Examples
+    --------
+    >>> telescope = FullAperture(2.0, central_obstruction=0.25)
+    >>> round(telescope.area, 4), telescope.extent, telescope.n_subapertures
+    (2.9452, 2.0, 1)
     """
 
     def __init__(

@@ -21,8 +21,9 @@ def image_formation(scene: Tensor, psfs: Tensor) -> Tensor:
 
     Returns
     -------
-    (..., H, W) tensor, the scene's field. Negative values are rounding errors of the FFT, not clipped, so that the
-    function stays linear. Differentiable in both arguments.
+    Tensor
+        (..., H, W), the scene's field. Negative values are rounding errors of the FFT, not clipped, so that the
+        function stays linear. Differentiable in both arguments.
 
     Raises
     ------

@@ -136,6 +136,16 @@ class PSF(nn.Module):
     `forward(phase)` takes the phase [rad] on `samples()`, (..., N, P), as `ZernikePhase` and `TurbulencePhase` give
     it, or None for a perfect wavefront, and returns (..., H, W). A phase 2 pi s x pixel_scale / wavelength moves
     the image by +s pixels.
+
+    Examples
+    --------
+    >>> from torchmask.optics.aperture import SparseAperture
+    >>> mask = SparseAperture([[0.0, 0.3], [0.3, -0.2], [-0.3, -0.2]], 0.2, 1.0)
+    >>> psf = PSF(mask, Grid.nyquist(1.0, 550e-9, 64))
+    >>> piston = torch.rand(5, 3, 1, dtype=torch.float64)  # [rad], five frames
+    >>> images = psf(piston.expand(-1, -1, psf.samples().weights.shape[-1]))
+    >>> images.shape, bool(torch.isclose(images.sum(), torch.tensor(5.0, dtype=torch.float64)))
+    (torch.Size([5, 64, 64]), True)
     """
 
     def __init__(self, aperture: Aperture, grid: Grid, oversampling: int = 1) -> None:
@@ -156,7 +166,16 @@ class PSF(nn.Module):
 class OTF(PSF):
     """Optical transfer functions, complex, in FFT order with value 1 at zero frequency: the DFT of `PSF`.
 
-    Same arguments as `PSF`; `forward(phase)` returns (..., H, W).
+    Same arguments and errors as `PSF`; `forward(phase)` returns (..., H, W), frequencies in cycles/pixel as in
+    `grid.frequencies`.
+
+    Examples
+    --------
+    >>> from torchmask.optics.aperture import FullAperture
+    >>> grid = Grid.nyquist(1.0, 550e-9, 64)
+    >>> otf = OTF(FullAperture(1.0), grid, oversampling=4)()
+    >>> float(otf[0, 0].real), round(float(otf[0, 16].real), 2)  # at half the cut-off the closed form is 0.391
+    (1.0, 0.39)
     """
 
     def forward(self, phase: Tensor | None = None) -> Tensor:

@@ -30,6 +30,19 @@ class RestorationResult:
     converged, message : whether and why it stopped
     n_evaluations : of cost and gradient
     seconds : wall time
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from torchmask.grid import Grid
+    >>> from torchmask.optics.aperture import SparseAperture
+    >>> from torchmask.restoration.myopic import MyopicDeconvolution
+    >>> mask = SparseAperture([[0.0, 0.3], [-0.3, -0.2], [0.3, -0.2]], 0.2, 1.0)
+    >>> method = MyopicDeconvolution(mask, Grid.nyquist(1.0, 550e-9, 32), n_modes=3, max_iterations=3)
+    >>> result = method.restore(torch.rand(4, 32, 32, generator=torch.Generator().manual_seed(0)))
+    >>> result.chi_square.shape, result.converged
+    (torch.Size([4]), False)
+    >>> result.save(f"{tempfile.mkdtemp()}/result.npz")  # and RestorationResult.load reads it
     """
 
     object: Tensor

@@ -27,6 +27,13 @@ class SceneOptions:
     """Which target, and how it is seen.
 
     Raises ValueError if `size` lies outside (0, 1]; the rest is checked by `make_scene`.
+
+    Examples
+    --------
+    >>> small, turned = SceneOptions(size=0.3), SceneOptions(attitude=(0.0, 90.0, 0.0))
+    >>> scene = make_scene((64, 64), n_photons=1e7, options=small)
+    >>> max(int((scene > 0).any(axis).sum()) for axis in (0, 1))  # rows or columns it reaches into: 0.3 x 64
+    20
     """
 
     path: Path | None = None
@@ -36,8 +43,8 @@ class SceneOptions:
     """Degrees by which the target is turned about the axes to the right, then up, then towards the viewer. By default
     a mesh is seen obliquely, at 25 -30 15, and an image upright; an image turns about the last axis only."""
     sun: tuple[float, float, float] | None = None
-    """Direction in which the sun stands: right, up, towards the viewer, of any length; by default -0.5 0.6 0.7. Images
-    bring their own light."""
+    """Direction in which the sun stands, as (right, up, towards the viewer) of any length; by default -0.5 0.6 0.7.
+    Images bring their own light."""
     size: float = 0.7
     """Larger side of the target as a fraction of the field."""
 
@@ -66,7 +73,8 @@ def make_scene(
 
     Returns
     -------
-    (rows, columns) tensor, non-negative, background exactly 0, row 0 at the top; the target's outline is centred.
+    Tensor
+        (rows, columns), non-negative, background exactly 0, row 0 at the top; the target's outline is centred.
 
     Raises
     ------

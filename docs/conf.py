@@ -1,0 +1,81 @@
+"""Configuration of the manual. Build it with `make docs`."""
+
+import re
+from importlib import metadata
+
+import torchmask
+
+project = "torchmask"
+author = "The torchmask authors"
+project_copyright = author
+release = metadata.version("torchmask")
+
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.mathjax",
+    "sphinx.ext.viewcode",
+]
+
+# Notebooks are shown with the outputs they were committed with: `make notebooks` renews those.
+nb_execution_mode = "off"
+myst_enable_extensions = ["amsmath", "attrs_inline", "colon_fence", "deflist", "dollarmath"]
+myst_heading_anchors = 3
+
+autodoc_typehints = "signature"
+autodoc_member_order = "bysource"
+napoleon_google_docstring = False
+napoleon_use_rtype = False
+napoleon_use_ivar = True
+add_module_names = False
+python_use_unqualified_type_names = True
+python_display_short_literal_types = True
+maximum_signature_line_length = 88
+
+html_theme = "furo"
+html_title = f"torchmask {release}"
+html_static_path = ["_static"]
+html_css_files = ["tables.css"]
+exclude_patterns = ["_build", "**.ipynb_checkpoints", "notebooks/*.md"]
+
+
+PUBLIC = {name: f"{getattr(torchmask, name).__module__}.{name}" for name in torchmask.__all__}
+
+
+def plain_text(app, what, name, obj, options, lines):
+    """Docstrings are written to be read as they are: formulas hold bars and asterisks, dataclasses list their fields.
+
+    So outside of code a bar is a bar and an asterisk an asterisk; what stands in backticks is code, and a link if it is
+    a public name or a module; and lines "field : what it is" before the first section are parameters of the class.
+    """
+    if what == "class":
+        lines[:] = _fields(lines)
+    for number, line in enumerate(lines):
+        if line.lstrip().startswith((">>>", "...")):
+            continue
+        parts = re.split(r"(``.*?``|`.*?`)", line)
+        parts[::2] = [re.sub(r"[|*]", r"\\\g<0>", part) for part in parts[::2]]
+        parts[1::2] = [_code(part.strip("`")) for part in parts[1::2]]
+        lines[number] = "".join(parts)
+
+
+def _fields(lines):
+    headings = (k - 1 for k, line in enumerate(lines) if k and re.fullmatch(r"-{3,}", line))
+    end = next(headings, len(lines))
+    introduction = re.sub(r"(?<=\S)\n {4}(?=\S)", " ", "\n".join(lines[:end]))  # one line a field
+    parsed = []
+    for line in introduction.split("\n"):
+        field = re.match(r"([a-z]\w*(?:, [a-z]\w*)*) : (.*)", line)
+        parsed += [f":param {name}: {field[2]}" for name in field[1].split(", ")] if field else [line]
+    return parsed + lines[end:]
+
+
+def _code(text):
+    if text in PUBLIC:
+        return f":py:obj:`{text} <{PUBLIC[text]}>`"
+    return f":py:obj:`{text}`" if re.fullmatch(r"torchmask(\.\w+)+", text) else f"``{text}``"
+
+
+def setup(app):
+    app.connect("autodoc-process-docstring", plain_text, priority=400)  # before napoleon
