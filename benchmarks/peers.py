@@ -271,7 +271,7 @@ def known_psfs(observation: Observation, config: Config) -> Iterator[Candidate]:
     for exponent in (1.0, 1.5, 2.0, 2.5, 3.0, 3.5):
         started = time.perf_counter()
         otfs = torch.fft.fft2(observation.psfs.double().roll(middle, dims=(-2, -1)))
-        object_psd, noise_psd = PowerLawPSD(exponent, photons), NoisePSD(photons, observation.readout_noise)
+        object_psd, noise_psd = PowerLawPSD(exponent, photons), NoisePSD(photons, observation.readout_noise or 0.0)
         image = multiframe_wiener(frames, otfs, object_psd, noise_psd)
         yield Candidate(f"exponent {exponent:g}", image, time.perf_counter() - started)
 

@@ -8,8 +8,10 @@ leaves the field is lost.
 from __future__ import annotations
 
 import copy
+import json
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +29,9 @@ from torchmask.record import Callback, Record
 _OVERSAMPLING = 4  # of the pupil: the field of the PSFs beside that of the image
 _CHUNK = 2**21  # pixels of unfolded PSFs held at once
 
-_NEEDED_NUMBERS = ("subaperture_diameter", "mask_diameter", "pixel_scale", "wavelength", "readout_noise")
-_NUMBERS = (*_NEEDED_NUMBERS, "orientation", "central_obstruction", "r0", "outer_scale", "n_photons")
+_NEEDED_NUMBERS = ("subaperture_diameter", "mask_diameter", "pixel_scale", "wavelength")
+_NUMBERS = (*_NEEDED_NUMBERS, "readout_noise", "orientation", "central_obstruction", "r0", "outer_scale", "n_photons")
+_IMAGES = ("object", "psfs", "valid", "errors")
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,25 +40,31 @@ class Observation:
 
     frames : (T, H, W) electrons
     aperture, grid : what they were taken through
-    readout_noise : electrons rms per pixel and frame
+    readout_noise : electrons rms per pixel and frame; None where nobody knows it: the restoration measures it then
     object : (H, W) the scene in expected electrons per frame, on the frames' pixels
     psfs : (T, H, W) centred on pixel [H // 2, W // 2] and cropped to the field, not renormalised: what is missing to a
         sum of 1 fell outside
     r0, outer_scale : of the turbulence [m]
     n_photons : electrons per frame, before the field was cropped
+    valid : (H, W) or (T, H, W) bool, False where a pixel is dead or saturated; None: all are valid
+    errors : (T, H, W) electrons rms of each pixel, or None
+    header : FITS cards that go with the frames: sky coordinates, target, telescope, filter, date
 
-    The last five are None where nobody knows them, as in a real observation.
+    The truth (object, psfs, r0, outer_scale, n_photons) is None where nobody knows it, as in a real observation.
     """
 
     frames: Tensor
     aperture: Aperture
     grid: Grid
-    readout_noise: float
+    readout_noise: float | None
     object: Tensor | None = None
     psfs: Tensor | None = None
     r0: float | None = None
     outer_scale: float | None = None
     n_photons: float | None = None
+    valid: Tensor | None = None
+    errors: Tensor | None = None
+    header: Mapping[str, str | int | float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.frames.ndim != 3 or self.frames.shape[-2:] != self.grid.shape or not len(self.frames):
@@ -63,12 +72,101 @@ class Observation:
                 f"frames has shape {tuple(self.frames.shape)}: it must be (n_frames, {self.grid.shape[0]}, "
                 f"{self.grid.shape[1]}), with at least one frame"
             )
-        if not (math.isfinite(self.readout_noise) and self.readout_noise >= 0):
-            raise ValueError(f"readout_noise is {self.readout_noise}: it must be finite and not negative")
-        for name, shape in (("object", self.grid.shape), ("psfs", tuple(self.frames.shape))):
+        noise = self.readout_noise
+        if noise is not None and not (math.isfinite(noise) and noise >= 0):
+            raise ValueError(f"readout_noise is {noise}: it must be finite and not negative")
+        for name, shape in (("object", self.grid.shape), ("psfs", self.frames.shape), ("errors", self.frames.shape)):
             values = getattr(self, name)
-            if values is not None and tuple(values.shape) != shape:
-                raise ValueError(f"{name} has shape {tuple(values.shape)}: it must be {shape}")
+            if values is not None and tuple(values.shape) != tuple(shape):
+                raise ValueError(f"{name} has shape {tuple(values.shape)}: it must be {tuple(shape)}")
+        valid = self.valid
+        if valid is not None and (
+            valid.dtype != torch.bool or tuple(valid.shape) not in (self.grid.shape, tuple(self.frames.shape))
+        ):
+            raise ValueError(
+                f"valid is {valid.dtype} of shape {tuple(valid.shape)}: it must be bool, (H, W) or (T, H, W)"
+            )
+
+    @classmethod
+    def from_fits(
+        cls,
+        paths: str | Path | Sequence[str | Path],
+        aperture: Aperture,
+        *,
+        wavelength: float | None = None,
+        pixel_scale: float | None = None,
+        unit: str | None = None,
+        gain: float | None = None,
+        exposure_time: float | None = None,
+        readout_noise: float | None = None,
+        dark: Any = None,
+        flat: Any = None,
+        bad_pixels: Any = None,
+        crop: int | None = None,
+        target: tuple[int, int] | None = None,
+        keep: float | None = None,
+        keep_by: str = "sharpness",
+    ) -> Observation:
+        """Read a telescope's exposures: a cube (T, H, W), an image, or a list of such files, in that order.
+
+        An option left at None is taken from the header; what is given wins over it. Needs astropy (extra `data`).
+
+        Parameters
+        ----------
+        paths : path or sequence of paths
+            FITS files of one filter, pixel scale and orientation. The SCI extension is read, or else the first image;
+            ERR becomes `errors`, DQ marks pixels that are not valid.
+        aperture : Aperture
+            That they were taken through, in metres on the pupil, x and y along the image's columns and rows.
+        wavelength : float, optional
+            [m]. Header: WAVELEN, or the FILTER of a known instrument.
+        pixel_scale : float, optional
+            [rad]. Header: PIXELSCL [arcsec], or CD, PC or CDELT.
+        unit : str, optional
+            Unit of the pixels, such as "adu", "electron / s" or "250 electron". Header: BUNIT; without it the pixels
+            are in adu where a gain is known, and in electrons where none is.
+        gain : float, optional
+            Electrons per adu (DN, count). Header: EGAIN, GAIN.
+        exposure_time : float, optional
+            Of one frame [s], for units per second. Header: XPOSURE, EXPTIME; EFFINTTM for cubes of JWST.
+        readout_noise : float, optional
+            [electrons rms]. Header: RDNOISE, READNOIS. It may remain unknown.
+        dark, flat, bad_pixels : path or (H, W) array, optional
+            In the units of the file; of any scale; not 0 where bad. Of a cube the median is used.
+        crop : int, optional
+            Side of the field that is cut out around the target, which comes to pixel [crop // 2, crop // 2]: the same
+            in all frames of a file, found afresh in every file. The sky coordinates move with it.
+        target : (row, column), optional
+            Pixel of the target in every file, counted from 0. None: where the mean frame is brightest.
+        keep : float, optional
+            Fraction of the frames to keep: those of highest `keep_by`, "sharpness" or "flux".
+
+        Raises
+        ------
+        ValueError
+            If a file is missing or damaged, a keyword that is needed is missing (the message names it and the option
+            that stands for it), the files mix filters, pixel scales, shapes or orientations, or an option is wrong.
+        """
+        from torchmask.data.observe import observation_fields
+
+        fields = observation_fields(
+            paths,
+            aperture,
+            wavelength=wavelength,
+            pixel_scale=pixel_scale,
+            unit=unit,
+            gain=gain,
+            exposure_time=exposure_time,
+            readout_noise=readout_noise,
+            dark=dark,
+            flat=flat,
+            bad_pixels=bad_pixels,
+            crop=crop,
+            target=target,
+            keep=keep,
+            keep_by=keep_by,
+        )
+        return cls(**fields)
 
     def save(self, path: str | Path) -> None:
         """Write everything to a new .npz file (compressed, without pickle; the format of `load`).
@@ -78,7 +176,6 @@ class Observation:
         aperture, grid = self.aperture, self.grid
         values = {
             "frames": self.frames,
-            "readout_noise": self.readout_noise,
             "pixel_scale": grid.pixel_scale,
             "wavelength": grid.wavelength,
             "centers": aperture.centers,
@@ -88,15 +185,17 @@ class Observation:
             "orientation": aperture.orientation,
             "central_obstruction": aperture.central_obstruction,
         }
-        truth = {name: getattr(self, name) for name in ("object", "psfs", "r0", "outer_scale", "n_photons")}
-        save_npz(path, values | {name: value for name, value in truth.items() if value is not None})
+        optional = {name: getattr(self, name) for name in ("readout_noise", *_IMAGES, "r0", "outer_scale", "n_photons")}
+        if self.header:
+            optional["header"] = json.dumps(dict(self.header))
+        save_npz(path, values | {name: value for name, value in optional.items() if value is not None})
 
     @classmethod
     def load(cls, path: str | Path) -> Observation:
         """Read what `save` wrote, or any .npz file with its keys.
 
-        `shape`, `orientation`, `central_obstruction` and the truth may be missing. One centred disc is a full pupil
-        of its own diameter, whatever `mask_diameter` says.
+        Of an aperture, `shape`, `orientation` and `central_obstruction` may be missing, of an observation all that may
+        be None. One centred disc is a full pupil of its own diameter, whatever `mask_diameter` says.
 
         Raises
         ------
@@ -121,9 +220,11 @@ class Observation:
         frames = torch.from_numpy(stored["frames"])
         height, width = frames.shape[-2:]
         grid = Grid(height if height == width else (height, width), number["pixel_scale"], number["wavelength"])
-        truth: dict[str, Any] = {n: torch.from_numpy(stored[n]) for n in ("object", "psfs") if n in stored}
-        truth |= {name: number[name] for name in ("r0", "outer_scale", "n_photons") if name in number}
-        return cls(frames, aperture, grid, number["readout_noise"], **truth)
+        optional: dict[str, Any] = {name: torch.from_numpy(stored[name]) for name in _IMAGES if name in stored}
+        optional |= {name: number[name] for name in ("r0", "outer_scale", "n_photons") if name in number}
+        if "header" in stored:
+            optional["header"] = json.loads(str(stored["header"]))
+        return cls(frames, aperture, grid, number.get("readout_noise"), **optional)
 
 
 def simulate_observation(

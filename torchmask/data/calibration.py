@@ -1,0 +1,146 @@
+"""From raw images to frames: dark, flat, bad pixels, the target's place, the best frames, drift.
+
+All functions take and return NumPy arrays, frames (T, H, W) and `valid` (T, H, W), True where a pixel can be trusted.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+SELECTIONS = ("sharpness", "flux")
+
+
+def calibrate(
+    values: np.ndarray,
+    valid: np.ndarray,
+    dark: np.ndarray | None = None,
+    flat: np.ndarray | None = None,
+    bad_pixels: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(values - dark) / flat, the flat divided by its median over good pixels.
+
+    Parameters
+    ----------
+    values, valid : (T, H, W)
+    dark, flat : (H, W), optional
+        In the units of `values`; any scale.
+    bad_pixels : (H, W), optional
+        Not 0 where a pixel is bad.
+
+    Returns
+    -------
+    values, valid, sensitivity
+        `values` is 0 where it is not finite; `sensitivity` (H, W) is what values were divided by.
+
+    Raises
+    ------
+    ValueError
+        If a shape differs from that of the frames, or the flat is nowhere positive.
+    """
+    for name, image in (("dark", dark), ("flat", flat), ("bad_pixels", bad_pixels)):
+        if image is not None and image.shape != values.shape[1:]:
+            raise ValueError(f"{name} has shape {image.shape}: it must be that of the images, {values.shape[1:]}")
+    good = np.ones(values.shape[1:], dtype=bool) if bad_pixels is None else bad_pixels == 0
+    sensitivity = np.ones(values.shape[1:])
+    if dark is not None:
+        good &= np.isfinite(dark)
+        values = values - np.nan_to_num(dark)
+    if flat is not None:
+        lit = np.isfinite(flat) & (flat > 0)
+        good &= lit
+        if not good.any():
+            raise ValueError("flat is positive on no good pixel")
+        sensitivity = np.where(lit, flat, 1.0) / np.median(flat[good])
+        values = values / sensitivity
+    return np.where(np.isfinite(values), values, 0.0), valid & good, sensitivity
+
+
+def fill(frames: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Frames whose invalid pixels are the mean of the valid ones around them, weighted by a Gaussian of 1 pixel."""
+    from scipy.ndimage import gaussian_filter
+
+    if valid.all():
+        return frames
+    sigma = (0, 1, 1)
+    weight = gaussian_filter(valid.astype(float), sigma, mode="nearest")
+    around = gaussian_filter(np.where(valid, frames, 0.0), sigma, mode="nearest")
+    return np.where(valid, frames, around / np.maximum(weight, 1e-6))
+
+
+def find_target(frames: np.ndarray, valid: np.ndarray, blur: float) -> tuple[int, int]:
+    """(row, column) where the mean frame, blurred by a Gaussian of `blur` pixels rms, is brightest."""
+    from scipy.ndimage import gaussian_filter
+
+    mean = gaussian_filter(fill(frames, valid).mean(0), blur, mode="nearest")
+    # a group of pixels without any neighbour to fill them from is not the target
+    mean[~valid.any(0)] = -np.inf
+    row, column = np.unravel_index(mean.argmax(), mean.shape)
+    return int(row), int(column)
+
+
+def crop_corner(shape: tuple[int, int], target: tuple[int, int], size: int) -> tuple[int, int]:
+    """First (row, column) of a field of `size` x `size` with `target` on its pixel [size // 2, size // 2].
+
+    Raises ValueError if the field reaches beyond the image; the message says the largest that does not.
+    """
+    corner = (target[0] - size // 2, target[1] - size // 2)
+    if min(corner) < 0 or corner[0] + size > shape[0] or corner[1] + size > shape[1]:
+        # `before` pixels lie on one side, `after` on the other, the target's own counted there
+        before = min(target)
+        after = min(shape[0] - target[0], shape[1] - target[1])
+        largest = min(2 * before + 1, 2 * after)
+        raise ValueError(
+            f"crop is {size}, but the target at row {target[0]}, column {target[1]} of an image of {shape[0]} x "
+            f"{shape[1]} pixels leaves at most {largest}"
+        )
+    return corner
+
+
+def frame_flux(frames: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Sum of the valid pixels of each frame, (T,)."""
+    return np.where(valid, frames, 0.0).sum((1, 2))
+
+
+def frame_sharpness(frames: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Sum of squares over square of sum of the valid pixels of each frame, (T,) (S1 of Muller & Buffington 1974)."""
+    lit = np.where(valid, frames, 0.0)
+    return (lit**2).sum((1, 2)) / lit.sum((1, 2)) ** 2
+
+
+def best_frames(frames: np.ndarray, valid: np.ndarray, keep: float, keep_by: str = "sharpness") -> np.ndarray:
+    """Indices, in their order in time, of the fraction `keep` of frames with the highest flux or sharpness.
+
+    At least one is kept. Raises ValueError if `keep` is not in (0, 1] or `keep_by` is not known.
+    """
+    if keep_by not in SELECTIONS:
+        raise ValueError(f"keep_by is {keep_by!r}: it must be {' or '.join(SELECTIONS)}")
+    if not 0 < keep <= 1:
+        raise ValueError(f"keep is {keep}: it must be a fraction of the frames, above 0 and at most 1")
+    score = (frame_flux if keep_by == "flux" else frame_sharpness)(frames, valid)
+    count = max(1, round(keep * len(frames)))
+    return np.sort(np.argsort(-score, kind="stable")[:count])
+
+
+def frame_drift(frames: np.ndarray, valid: np.ndarray | None = None, upsampling: int = 100) -> np.ndarray:
+    """How far each frame has moved from the first, (T, 2) in pixels, (x, y), by cross-correlation.
+
+    Parameters
+    ----------
+    frames, valid : (T, H, W)
+    upsampling : int
+        The answer is a multiple of 1 / upsampling pixels (Guizar-Sicairos et al. 2008, as in scikit-image).
+
+    Notes
+    -----
+    The correlation is periodic: what enters and leaves the field biases it, so the target should lie within.
+    """
+    from skimage.registration import phase_cross_correlation
+
+    frames = np.asarray(frames, dtype=float)
+    filled = frames if valid is None else fill(frames, np.asarray(valid, dtype=bool))
+    shifts = [
+        phase_cross_correlation(filled[0], frame, upsample_factor=upsampling, normalization=None)[0] for frame in filled
+    ]
+    return -np.array(shifts)[:, ::-1] + 0.0  # no negative zeros

@@ -1,0 +1,104 @@
+"""FITS files: one file in, as arrays and a header; one restored image out."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class FITSImages:
+    """The images of one file, in its own units.
+
+    path : where they come from
+    values : (T, H, W) float64
+    errors : (T, H, W) or None, from an ERR extension
+    valid : (T, H, W) bool: finite, and not marked in a DQ extension
+    header : the image's cards, and behind them those of the primary header
+    is_cube : whether the file itself has a time axis
+    """
+
+    path: Path
+    values: np.ndarray
+    errors: np.ndarray | None
+    valid: np.ndarray
+    header: Any
+    is_cube: bool
+
+
+def read_fits(path: str | Path) -> FITSImages:
+    """Read an image (H, W) or a cube (T, H, W): the SCI extension, or else the first image in the file.
+
+    A pixel is not valid where a value or error is not finite, or where DQ is set: for JWST its lowest bit, DO_NOT_USE
+    (the others tell what was done to a pixel that is good), for others any bit.
+
+    Raises
+    ------
+    ValueError
+        If the file is missing, is no FITS, is truncated or fails its checksum, holds no image of 2 or 3 axes or
+        several that could be meant, or its extensions disagree in shape.
+    """
+    from astropy.io import fits
+
+    path = Path(path)
+    if not path.is_file():
+        raise ValueError(f"there is no file {path} (needed: a FITS file)")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # astropy only warns of truncated files and wrong checksums
+            warnings.simplefilter("ignore", fits.verify.VerifyWarning)  # unusual cards do no harm
+            with fits.open(path, memmap=False, checksum=True) as hdus:
+                return _images(path, hdus)
+    except _Refused as error:
+        raise ValueError(f"{path} {error}") from None
+    except (OSError, TypeError, ValueError, KeyError, IndexError, EOFError, Warning) as error:
+        raise ValueError(f"{path} is no FITS file, or is damaged: {' '.join(str(error).split())}") from error
+
+
+class _Refused(Exception):
+    """A sound FITS file that does not hold what is needed."""
+
+
+def _images(path: Path, hdus: Any) -> FITSImages:
+    science = [hdu for hdu in hdus if hdu.is_image and hdu.name == "SCI"]
+    images = science or [hdu for hdu in hdus if hdu.is_image and hdu.header.get("NAXIS", 0) > 0]
+    if not images:
+        raise _Refused("holds no image")
+    if len(science) > 1:
+        raise _Refused(f"holds {len(science)} SCI extensions: write the one to use to a file of its own")
+    values = images[0].data
+    if values is None or values.ndim not in (2, 3) or 0 in values.shape:
+        shape = None if values is None else values.shape
+        raise _Refused(f"holds an array of shape {shape}: it must be an image (H, W) or a cube (T, H, W)")
+    header = images[0].header.copy()
+    header.extend(hdus[0].header, unique=True)
+    errors, quality = (_extension(hdus, name, values.shape) for name in ("ERR", "DQ"))
+    valid = np.isfinite(values)
+    if errors is not None:
+        valid &= np.isfinite(errors)
+    if quality is not None:
+        jwst = str(header.get("TELESCOP", "")).strip().upper() == "JWST"
+        valid &= (quality & 1 if jwst else quality) == 0
+    cube = (-1, *values.shape[-2:])
+    return FITSImages(
+        path,
+        values.astype(np.float64).reshape(cube),
+        None if errors is None else errors.astype(np.float64).reshape(cube),
+        valid.reshape(cube),
+        header,
+        values.ndim == 3,
+    )
+
+
+def _extension(hdus: Any, name: str, shape: tuple[int, ...]) -> np.ndarray | None:
+    """The data of a companion extension, one image for all frames if it is flat; None if there is none."""
+    if name not in hdus or hdus[name].data is None:
+        return None
+    data = hdus[name].data
+    if data.shape not in (shape, shape[-2:]):
+        raise _Refused(f"has {name} of shape {data.shape}, and images of shape {shape}: they must agree")
+    return np.broadcast_to(data, shape)

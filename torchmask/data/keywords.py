@@ -1,0 +1,207 @@
+"""What the cards of a FITS header mean: pixel scale, wavelength, time, gain, read-out noise and units.
+
+An option that the caller gives always wins over the header; where both are missing, the error names both.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import warnings
+from typing import Any
+
+import numpy as np
+
+ARCSEC = math.pi / 180 / 3600
+
+# Effective wavelength and width [m]. Source: table of the aperture-masking filters in AMICAL (Soulain et al. 2020,
+# SPIE 11446, 1144611), after STScI's NIRISS documentation.
+FILTERS = {
+    ("NIRISS", "F277W"): (2.776e-6, 0.715e-6),
+    ("NIRISS", "F380M"): (3.828e-6, 0.205e-6),
+    ("NIRISS", "F430M"): (4.286e-6, 0.202e-6),
+    ("NIRISS", "F480M"): (4.817e-6, 0.298e-6),
+}
+
+_CELESTIAL = re.compile(
+    r"WCSAXES|CRPIX[12]|CRVAL[12]|CTYPE[12]|CUNIT[12]|CDELT[12]|CROTA[12]|CD[12]_[12]|PC[12]_[12]|P[VS][12]_\d+"
+    r"|LONPOLE|LATPOLE|RADESYS|EQUINOX|[AB]P?_(ORDER|DMAX|\d+_\d+)"
+)
+_ABOUT = ("OBJECT", "TARGNAME", "TARG_RA", "TARG_DEC", "RA", "DEC", "TELESCOP", "INSTRUME", "FILTER", "DATE-OBS")
+_ABOUT += ("TIME-OBS", "MJD-OBS", "MJD-AVG", "OBSERVER")
+
+
+def missing(path: Any, keywords: str, option: str) -> ValueError:
+    """The error for a number that neither the header nor the caller supplies."""
+    return ValueError(f"{path} has no {keywords}: give {option}")
+
+
+def number(header: Any, names: tuple[str, ...], path: Any) -> float | None:
+    """The first of these cards that is there, as a positive number.
+
+    Raises ValueError if it is there and is none.
+    """
+    for name in names:
+        value = header.get(name)
+        if value is None or value == "":
+            continue
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value < 0:
+            raise ValueError(f"{path}: {name} is {value!r}, which is no positive number")
+        return float(value)
+    return None
+
+
+def pixel_matrix(header: Any) -> np.ndarray | None:
+    """(2, 2) matrix from pixels (x, y) to the sky [deg], from CD, PC and CDELT, or CROTA and CDELT; None without."""
+    from astropy.wcs import WCS
+
+    if not any(name in header for name in ("CD1_1", "CD1_2", "CDELT1")):
+        return None
+    cards = celestial_cards(header)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # astropy's corrections of old-fashioned cards
+        wcs = WCS(_as_header(cards), naxis=2)
+        units = [str(unit) for unit in wcs.wcs.cunit]
+        if not all(units):  # plain pixel coordinates, which say nothing of the sky
+            return None
+        scale = [unit.to("deg") if unit.is_equivalent("deg") else math.nan for unit in wcs.wcs.cunit]
+        matrix = np.diag(scale) @ wcs.pixel_scale_matrix
+    return matrix if np.isfinite(matrix).all() and np.linalg.det(matrix) != 0 else None
+
+
+def pixel_scale(header: Any, path: Any, given: float | None) -> float:
+    """Angle of a pixel [rad]: PIXELSCL or PIXSCALE [arcsec], else the root of the area of a pixel by the WCS.
+
+    Raises ValueError if nothing tells it, or if pixels are oblong by more than 2 %.
+    """
+    if given is not None:
+        return given
+    arcsec = number(header, ("PIXELSCL", "PIXSCALE"), path)
+    if arcsec:
+        return arcsec * ARCSEC
+    matrix = pixel_matrix(header)
+    if matrix is None:
+        raise missing(path, "PIXELSCL, CDELT or CD matrix in an angle", "pixel_scale [rad]")
+    sides = np.linalg.norm(matrix, axis=0)
+    if sides.max() / sides.min() > 1.02:
+        raise ValueError(f"{path}: pixels of {sides[0] * 3600:.4g} x {sides[1] * 3600:.4g} arcsec are not square")
+    return math.radians(math.sqrt(abs(np.linalg.det(matrix))))
+
+
+def wavelength(header: Any, path: Any, given: float | None) -> float:
+    """Wavelength [m]: WAVELEN or WAVELNTH, else the FILTER of a known INSTRUME (`FILTERS`).
+
+    Raises ValueError if nothing tells it, or the card can not be in metres.
+    """
+    if given is not None:
+        return given
+    value = number(header, ("WAVELEN", "WAVELNTH"), path)
+    if value is not None:
+        if not 1e-8 < value < 1e-2:
+            raise ValueError(f"{path}: WAVELEN is {value:g}, which is no wavelength in metres: give wavelength [m]")
+        return value
+    name = (str(header.get("INSTRUME", "")).strip().upper(), str(header.get("FILTER", "")).strip().upper())
+    if name in FILTERS:
+        return FILTERS[name][0]
+    known = ", ".join(f"{instrument} {band}" for instrument, band in FILTERS)
+    what = f" (FILTER is {name[1]!r} of INSTRUME {name[0]!r}; known: {known})" if name[1] else ""
+    raise missing(path, "WAVELEN, nor a FILTER that is known", f"wavelength [m]{what}")
+
+
+def electrons_per_unit(
+    header: Any, path: Any, is_cube: bool, unit: str | None, gain: float | None, exposure_time: float | None
+) -> float:
+    """Electrons in a frame for one unit of the file.
+
+    `unit` or BUNIT: electrons or photons; adu, DN or counts (times GAIN [electrons]); any of them per second (times
+    the exposure time of a frame [s]); MJy/sr (through JWST's PHOTMJSR). Without either: adu if a gain is known, else
+    electrons.
+
+    Raises ValueError if the unit is not known or what its conversion needs is missing.
+    """
+    from astropy import units
+
+    text = unit or str(header.get("BUNIT", "")).strip()
+    gain = number(header, ("EGAIN", "GAIN"), path) if gain is None else gain
+    if not text:
+        return 1.0 if gain is None else gain
+
+    def electrons(counted: Any) -> float:
+        if counted in (units.electron, units.photon):
+            return 1.0
+        if gain is None:
+            raise missing(path, f"GAIN or EGAIN, which its unit {text} needs", "gain [electrons per adu]")
+        return gain
+
+    def seconds() -> float:
+        names = ("EFFINTTM",) * is_cube + ("XPOSURE", "EXPTIME", "EFFEXPTM")
+        time = number(header, names, path) if exposure_time is None else exposure_time
+        if not time:
+            raise missing(path, f"XPOSURE or EXPTIME, which its unit {text} needs", "exposure_time [s]")
+        return time
+
+    measured = _parse_unit(text, path)
+    radiance = units.MJy / units.sr
+    if measured.is_equivalent(radiance):
+        per_dn = number(header, ("PHOTMJSR",), path)
+        if not per_dn:
+            raise missing(path, f"PHOTMJSR, which its unit {text} needs", "unit, such as '250 electron'")
+        return measured.to(radiance) / per_dn * seconds() * electrons(units.DN)
+    for counted in (units.electron, units.photon, units.adu, units.DN, units.count):
+        if measured.is_equivalent(counted):
+            return measured.to(counted) * electrons(counted)
+        if measured.is_equivalent(counted / units.s):
+            return measured.to(counted / units.s) * seconds() * electrons(counted)
+    raise _unknown_unit(text, path)
+
+
+def _parse_unit(text: str, path: Any) -> Any:
+    from astropy import units
+
+    plain = re.sub(r"(electron|count|photon|adu)s\b", r"\1", text.lower())
+    plain = re.sub(r"\be-(?=\W|$)", "electron", plain)
+    plain = re.sub(r"/\s*sec\w*", "/s", plain)
+    for candidate in (text, plain):
+        try:
+            return units.Unit(candidate)
+        except (ValueError, TypeError):
+            continue
+    raise _unknown_unit(text, path)
+
+
+def _unknown_unit(text: str, path: Any) -> ValueError:
+    return ValueError(
+        f"{path}: BUNIT is {text!r}; known are electron, photon, adu, DN, count, each also per s, and MJy/sr: give unit"
+    )
+
+
+def celestial_cards(header: Any) -> dict[str, Any]:
+    """The cards of the two sky axes of a header, as they are."""
+    cards = {name: header[name] for name in header if _CELESTIAL.fullmatch(name)}
+    if "WCSAXES" in cards:
+        cards["WCSAXES"] = 2  # a cube's third axis is left behind
+    return cards
+
+
+def kept_cards(header: Any) -> dict[str, Any]:
+    """The cards that go with an observation: sky coordinates, target, telescope, filter and date."""
+    about = {name: header[name] for name in _ABOUT if name in header}
+    return celestial_cards(header) | {name: value for name, value in about.items() if value not in (None, "")}
+
+
+def shift_cards(cards: dict[str, Any], x: int, y: int) -> dict[str, Any]:
+    """The cards of an image that begins at pixel (x, y), counted from 0, of the old one."""
+    moved = dict(cards)
+    for name, offset in (("CRPIX1", x), ("CRPIX2", y)):
+        if name in cards:
+            moved[name] = float(cards[name]) - offset
+    return moved
+
+
+def _as_header(cards: dict[str, Any]) -> Any:
+    from astropy.io.fits import Header
+
+    header = Header()
+    for name, value in cards.items():
+        header[name] = value
+    return header

@@ -1,0 +1,184 @@
+"""An observation from FITS files: read, checked, calibrated, cropped, selected and put into electrons."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from torchmask.data import keywords
+from torchmask.data.calibration import SELECTIONS, best_frames, calibrate, crop_corner, find_target
+from torchmask.data.fits import FITSImages, read_fits
+from torchmask.grid import Grid
+from torchmask.optics.aperture import Aperture
+
+PathLike = str | Path
+
+
+def observation_fields(
+    paths: PathLike | Sequence[PathLike],
+    aperture: Aperture,
+    *,
+    wavelength: float | None = None,
+    pixel_scale: float | None = None,
+    unit: str | None = None,
+    gain: float | None = None,
+    exposure_time: float | None = None,
+    readout_noise: float | None = None,
+    dark: Any = None,
+    flat: Any = None,
+    bad_pixels: Any = None,
+    crop: int | None = None,
+    target: tuple[int, int] | None = None,
+    keep: float | None = None,
+    keep_by: str = "sharpness",
+) -> dict[str, Any]:
+    """The fields of the Observation that `Observation.from_fits` documents."""
+    _check_options(wavelength, pixel_scale, gain, exposure_time, readout_noise, crop, keep, keep_by)
+    files = [read_fits(path) for path in ([paths] if isinstance(paths, str | Path) else list(paths))]
+    if not files:
+        raise ValueError("paths is empty: give at least one FITS file")
+    lengths = [keywords.wavelength(file.header, file.path, wavelength) for file in files]
+    scales = [keywords.pixel_scale(file.header, file.path, pixel_scale) for file in files]
+    _check_alike(files, lengths, scales)
+    options = (unit, gain, exposure_time)
+    factors = [keywords.electrons_per_unit(f.header, f.path, f.is_cube, *options) for f in files]
+    noises = [keywords.number(file.header, ("RDNOISE", "READNOIS"), file.path) for file in files]
+    images = [_image(source, name) for source, name in ((dark, "dark"), (flat, "flat"), (bad_pixels, "bad_pixels"))]
+
+    blur = max(1.0, lengths[0] / aperture.extent / scales[0] / 2)
+    stacks, headers = [], []
+    for file, factor in zip(files, factors, strict=True):
+        stack, header = _stack(file, factor, images, crop, target, blur)
+        stacks.append(stack)
+        headers.append(header)
+    frames = np.concatenate([stack[0] for stack in stacks])
+    valid = np.concatenate([stack[2] for stack in stacks])
+    errors = _joined([stack[1] for stack in stacks])
+    _check_rotation(files, frames.shape[-1])
+    lit = valid.any((1, 2))
+    if not lit.all():
+        raise ValueError(f"frames {np.flatnonzero(~lit).tolist()} have no valid pixel: leave their files out")
+    if keep is not None:
+        kept = best_frames(frames, valid, keep, keep_by)
+        frames, valid, errors = frames[kept], valid[kept], None if errors is None else errors[kept]
+    known = [noise for noise in noises if noise is not None]
+    if readout_noise is None and len(known) == len(files):
+        readout_noise = math.sqrt(sum(noise**2 for noise in known) / len(known))
+    side = frames.shape[-1] if frames.shape[-1] == frames.shape[-2] else frames.shape[-2:]
+    return {
+        "frames": torch.from_numpy(frames),
+        "aperture": aperture,
+        "grid": Grid(side, scales[0], lengths[0]),
+        "readout_noise": readout_noise,
+        "valid": torch.from_numpy(valid),
+        "errors": None if errors is None else torch.from_numpy(errors),
+        "header": headers[0],
+    }
+
+
+def _check_options(
+    wavelength: float | None,
+    pixel_scale: float | None,
+    gain: float | None,
+    exposure_time: float | None,
+    readout_noise: float | None,
+    crop: int | None,
+    keep: float | None,
+    keep_by: str,
+) -> None:
+    positive = {
+        "wavelength": (wavelength, "m"),
+        "pixel_scale": (pixel_scale, "rad"),
+        "gain": (gain, "electrons per adu"),
+        "exposure_time": (exposure_time, "s"),
+    }
+    for name, (value, unit) in positive.items():
+        if value is not None and not (math.isfinite(value) and value > 0):
+            raise ValueError(f"{name} is {value}: it must be finite and positive, in {unit}")
+    if readout_noise is not None and not (math.isfinite(readout_noise) and readout_noise >= 0):
+        raise ValueError(f"readout_noise is {readout_noise}: it must be finite and at least 0, in electrons rms")
+    if crop is not None and (crop != int(crop) or crop < 2):
+        raise ValueError(f"crop is {crop}: it must be a whole number of pixels, at least 2")
+    if keep is not None and not 0 < keep <= 1:
+        raise ValueError(f"keep is {keep}: it must be a fraction of the frames, above 0 and at most 1")
+    if keep_by not in SELECTIONS:
+        raise ValueError(f"keep_by is {keep_by!r}: it must be {' or '.join(SELECTIONS)}")
+
+
+def _check_alike(files: Sequence[FITSImages], wavelengths: Sequence[float], scales: Sequence[float]) -> None:
+    """Raise ValueError unless all files have one filter, wavelength, pixel scale and shape."""
+    kinds: tuple[tuple[str, Sequence[Any], Any], ...] = (
+        ("filters", [str(file.header.get("FILTER", "")).strip() for file in files], str),
+        ("wavelengths", wavelengths, lambda value: f"{value:.5g} m"),
+        ("pixel scales", scales, lambda value: f"{value / keywords.ARCSEC:.5g} arcsec"),
+        ("image shapes", [file.values.shape[1:] for file in files], str),
+    )
+    for what, values, format_value in kinds:
+        for file, value in zip(files, values, strict=True):
+            alike = abs(value / values[0] - 1) < 1e-3 if isinstance(value, float) else value == values[0]
+            if not alike:
+                raise ValueError(
+                    f"the files mix {what}: {files[0].path} has {format_value(values[0])} and {file.path} "
+                    f"{format_value(value)}; give those of one kind"
+                )
+
+
+def _check_rotation(files: Sequence[FITSImages], size: int) -> None:
+    """Raise ValueError if files are turned or mirrored against the first by more than half a pixel at a corner."""
+    matrices = [keywords.pixel_matrix(file.header) for file in files]
+    first = matrices[0]
+    for file, matrix in zip(files, matrices, strict=True):
+        if first is None or matrix is None:
+            continue
+        moved = np.abs((np.linalg.inv(first) @ matrix - np.eye(2)) @ [[1, 1], [1, -1]]).max() * size / 2
+        if moved > 0.5:
+            raise ValueError(
+                f"the files mix orientations: the corner of {file.path} lies {moved:.1f} pixels from that of "
+                f"{files[0].path} on the sky; restore those of one orientation together"
+            )
+
+
+def _image(source: Any, name: str) -> np.ndarray | None:
+    """A calibration image (H, W) from an array, a tensor or a FITS file; the median of a cube."""
+    if source is None:
+        return None
+    if isinstance(source, str | Path):
+        file = read_fits(source)
+        values = np.where(file.valid, file.values, np.nan) if name != "bad_pixels" else file.values
+    else:
+        values = np.asarray(source, dtype=float)
+        values = values[None] if values.ndim == 2 else values
+    if values.ndim != 3:
+        raise ValueError(f"{name} has shape {values.shape}: it must be (H, W) or (T, H, W)")
+    return values[0] if len(values) == 1 else np.median(values, axis=0)
+
+
+def _stack(
+    file: FITSImages, factor: float, images: Sequence[np.ndarray | None], crop: int | None, target: Any, blur: float
+) -> tuple[tuple[np.ndarray, np.ndarray | None, np.ndarray], dict[str, Any]]:
+    """The frames [electrons], errors and valid pixels of one file, and the cards that go with them."""
+    try:
+        values, valid, sensitivity = calibrate(file.values, file.valid, *images)
+        errors = None if file.errors is None else np.nan_to_num(file.errors / sensitivity) * factor
+        header = keywords.kept_cards(file.header)
+        window = (slice(None), slice(None))
+        if crop is not None:
+            place = find_target(values, valid, blur) if target is None else target
+            row, column = crop_corner(values.shape[1:], place, crop)
+            window = (slice(row, row + crop), slice(column, column + crop))
+            header = keywords.shift_cards(header, column, row)
+    except ValueError as error:
+        raise ValueError(f"{file.path}: {error}") from None
+    cut = (slice(None), *window)
+    return (values[cut] * factor, None if errors is None else errors[cut], valid[cut].copy()), header
+
+
+def _joined(parts: Sequence[np.ndarray | None]) -> np.ndarray | None:
+    """All frames one after another; None if a file lacks them."""
+    there = [part for part in parts if part is not None]
+    return np.concatenate(there) if len(there) == len(parts) else None
