@@ -44,9 +44,11 @@ def repair(problem: JointProblem, state: State, excess: Tensor, seed: int) -> tu
     now = replace(state, z=state.z[bad], gains=state.gains[bad], excess=state.excess[bad])
     best, least = now.z, part.frame_costs(now)
     spread = float(state.z.square().mean().sqrt())
+    own = problem.model.n_parameters - problem.model.n_static
     for _ in range(_STARTS):
         noise = torch.randn(now.z.shape, dtype=now.z.dtype, generator=generator).to(now.z)
-        trial = part.descend(replace(now, z=spread * noise), _ITERATIONS, count)
+        fresh = torch.cat([spread * noise[:, :own], now.z[:, own:]], dim=1)  # what is common to all frames stays
+        trial = part.descend(replace(now, z=fresh), _ITERATIONS, count)
         costs = part.frame_costs(trial)
         best = torch.where((costs < least)[:, None], trial.z, best)
         least = torch.minimum(costs, least)

@@ -184,6 +184,8 @@ class Restoration:
             image = start.extended_object.to(image) / self.unit
         if "aberrations" in self.problem.free:
             z[:known] = self._whiten(start.coefficients)
+            own = self.model.n_parameters - self.model.n_static
+            z[known:, own:] = z[0, own:]
         progress = _Progress(replace(state, image=image, z=z), centrings=_CENTRINGS)
         if known < len(z) and "aberrations" in self.problem.free:
             precision = self.problem.precision
