@@ -1,0 +1,107 @@
+"""Options that several commands share. The text below each is its help."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from tyro.conf import FlagCreatePairsOff
+
+from torchmask.design.manufacture import load_mask
+from torchmask.optics import catalog
+from torchmask.optics.aperture import Aperture, FullAperture, SparseAperture
+
+ARCSEC = math.pi / (180 * 3600)  # rad
+FULL = "full"  # what stands for a full pupil among the names of masks
+MASK_SUFFIXES = (".json", ".dxf", ".fits")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CommonOptions:
+    """Where options come from, and how errors are shown."""
+
+    config: Path | None = None
+    """A config.yaml that an earlier run wrote: its values stand for all options not given here."""
+    debug: FlagCreatePairsOff[bool] = False
+    """Show where an error comes from, with its traceback."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(CommonOptions):
+    """Where results go."""
+
+    out: Path | None = None
+    """New folder for the results, for instance runs/first; None: runs/COMMAND-date-time."""
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """The search for the mask, and the criterion it minimises."""
+
+    n_subapertures: int = 11
+    """Number of holes, N."""
+    fill_factor: float = 0.15
+    """Collecting area N d^2 / D^2, of holes of diameter d in a mask of diameter D."""
+    method: Literal["cma", "hybrid"] = "cma"
+    """CMA-ES, or descents and basin hopping on a coarse grid, which finds better masks."""
+    refine: bool = True
+    """Refine the result by gradient descent through the same criterion."""
+    budget: int | None = None
+    """Evaluations of the criterion; None: the method's own default."""
+    n_frequencies: int = 256
+    """Frequency grid of the criterion, per side."""
+    exponent: float = 1.5
+    """Of the power-law power spectrum of the object."""
+    knee: float = 1 / 64
+    """Frequency below which that spectrum is flat [cycles/pixel]: one over the object's size in pixels."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaskOptions:
+    """The aperture."""
+
+    mask: str | None = None
+    """File that `torchmask design` wrote (.json, or .dxf or .fits), name from `torchmask masks`, or `full` for a full
+    pupil of diameter --mask-diameter."""
+    mask_diameter: float | None = None
+    """D, of a mask from the catalogue or of a full pupil [m]; None: as built."""
+    fill_factor: float | None = None
+    """Collecting area N d^2 / D^2 of a mask from the catalogue; None: as built. Arrays without a size of their own
+    (Golay) need both."""
+    mirrored: bool = False
+    """Reverse x of a mask from the catalogue, for instruments that look from the other side."""
+    central_obstruction: float = 0.0
+    """Diameter of the disc that is blocked in the middle of a full pupil [m]."""
+
+
+def load_aperture(options: MaskOptions) -> Aperture:
+    """The aperture that `options.mask` names, float64. Raises ValueError for what is unknown, missing or of no use."""
+    name = options.mask
+    if name is None:
+        raise ValueError(
+            f"--mask is missing: give a mask file ({', '.join(MASK_SUFFIXES)}), a name from `torchmask masks`, or "
+            f"{FULL}"
+        )
+    if name == FULL:
+        if options.mask_diameter is None:
+            raise ValueError("a full pupil needs --mask-diameter [m]")
+        FullAperture(options.mask_diameter)  # raises for a diameter that nothing can be divided by
+        return FullAperture(options.mask_diameter, options.central_obstruction / options.mask_diameter)
+    if options.central_obstruction:
+        raise ValueError("--central-obstruction is for a full pupil (--mask full); a mask has the holes that it has")
+    if Path(name).suffix.lower() in MASK_SUFFIXES or Path(name).is_file():
+        if options.mask_diameter is not None or options.fill_factor is not None or options.mirrored:
+            raise ValueError(
+                f"--mask-diameter, --fill-factor and --mirrored are for masks from the catalogue: {name} is a file"
+            )
+        return load_mask(name)
+    try:
+        return SparseAperture.from_catalog(name, options.mask_diameter, options.fill_factor, options.mirrored)
+    except ValueError as error:
+        try:
+            catalog.entry(name)
+        except ValueError:
+            raise ValueError(f"--mask is {name!r}, which is no file ({', '.join(MASK_SUFFIXES)}); {error}") from error
+        raise

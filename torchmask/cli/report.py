@@ -1,0 +1,73 @@
+"""What a run shows of its masks, exposures and restorations, in TensorBoard and as PNG."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from torchmask import _drawing as drawing
+from torchmask import viz
+from torchmask.design.search import SearchResult
+from torchmask.grid import Grid
+from torchmask.io import as_array
+from torchmask.optics.otf import analytic_otf
+from torchmask.simulation.observation import Observation
+from torchmask.tracking import RunLogger
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def log_design(design: SearchResult, grid: Grid, logger: RunLogger) -> None:
+    """The mask, the frequencies it passes, and how the search went."""
+    logger.figure("design/mask", viz.mask_figure(design.aperture))
+    logger.figure("design/uv_coverage", viz.uv_coverage_figure(design.aperture, grid))
+    logger.figure(
+        "design/history",
+        viz.history_figure(
+            {stage: best[:, 1].tolist() for stage, best in design.history.items()}, "relative MSE", "report"
+        ),
+    )
+    logger.scalar("design/relative_mse", design.relative_mse)
+
+
+def log_observation(name: str, observation: Observation, logger: RunLogger) -> None:
+    """PSFs with and without turbulence, their MTFs, and frames."""
+    assert observation.psfs is not None
+    grid = observation.grid
+    psfs = torch.fft.ifftshift(observation.psfs, dim=(-2, -1))
+    perfect = analytic_otf(observation.aperture, grid)
+    still = torch.fft.ifft2(perfect).real
+    logger.figure(f"{name}/psf", viz.psf_figure({"no turbulence": still, "first exposure": psfs[0]}, grid))
+    logger.figure(f"{name}/mtf", viz.mtf_figure({"no turbulence": perfect, "exposures": torch.fft.fft2(psfs)}, grid))
+    logger.figure(f"{name}/frames", viz.frames_figure(observation.frames, pixel_scale=grid.pixel_scale))
+    logger.image(f"{name}/first_frame", observation.frames[0])
+
+
+@drawing.styled
+def restored_figure(
+    image: Any, frames: Any | None = None, residuals: Any | None = None, pixel_scale: float | None = None
+) -> Figure:
+    """A restored image (H, W), beside it the first frame and the mean of `frames`, and the rms of `residuals`.
+
+    Light is shown with a square root, each image up to its own 99.5th percentile; residuals (T, H, W) are in units of
+    the noise, so that 1 is what noise alone leaves. `pixel_scale` [rad] labels the axes with angles.
+    """
+    restored = as_array(image)
+    lights = {"restored": restored}
+    if frames is not None:
+        stack = as_array(frames)
+        lights = {"first frame": stack[0], f"mean of {len(stack)} frames": stack.mean(0), **lights}
+    figure, axes = drawing.row_of_axes([1.0] * (len(lights) + (residuals is not None)), height=3.2)
+    unit, extent = drawing.sky_extent((restored.shape[0], restored.shape[1]), pixel_scale)
+    for ax, (title, values) in zip(axes, lights.items(), strict=False):
+        ax.imshow(viz.stretch(values), cmap="gray", vmin=0, vmax=1, extent=extent)
+        drawing.image_axes(ax, title, f"x [{unit}]", f"y [{unit}]" if ax is axes[0] else "")
+    if residuals is not None:
+        rms = np.sqrt((as_array(residuals) ** 2).mean(0))
+        axes[-1].imshow(rms, cmap="magma", vmin=0, vmax=max(2.0, float(np.percentile(rms, 99.5))), extent=extent)
+        drawing.image_axes(axes[-1], "rms residual", f"x [{unit}]", "")
+        drawing.colorbar(figure, axes[-1:], "noise")
+    return figure
