@@ -1,0 +1,76 @@
+"""A restored image as a FITS file."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from torchmask.data.keywords import ARCSEC
+from torchmask.io import as_array, atomic_write
+from torchmask.restoration.result import RestorationResult
+from torchmask.simulation.observation import Observation
+
+
+def save_restored(
+    path: str | Path, result: RestorationResult, observation: Observation, history: str | Sequence[str] = ()
+) -> None:
+    """Write the restored object to a new FITS file, with the observation's sky coordinates.
+
+    Parameters
+    ----------
+    path : str or Path
+        Ends in .fits. The file appears whole or not at all, and never replaces another.
+    result : RestorationResult
+    observation : Observation
+        Its header's cards (sky coordinates, target, telescope, filter) go with the image, which lies on the frames'
+        pixels. A shift that is common to all frames cannot be told from one of the object, so the coordinates are as
+        good as the frames' mean tilt.
+    history : str or sequence of str
+        What was done, one HISTORY card (or several, if it is long) each.
+
+    Raises
+    ------
+    ValueError
+        If the object does not lie on the frames' pixels, the file exists, its folder does not, or its name is wrong.
+
+    Notes
+    -----
+    The image is in electrons per pixel and frame (BUNIT). CHISQ is the mean over the frames of the mean square residual
+    in units of the noise, CHISQMAX that of the worst frame; CONVERGD says whether the restoration came to rest.
+    """
+    from astropy.io import fits
+
+    if Path(path).suffix != ".fits":
+        raise ValueError(f"{path} does not end in .fits")
+    if tuple(result.object.shape) != observation.grid.shape:
+        raise ValueError(
+            f"the object has shape {tuple(result.object.shape)} and the frames {observation.grid.shape}: give the "
+            "observation that it was restored from"
+        )
+    hdu = fits.PrimaryHDU(as_array(result.object).astype("float64"))
+    for name, value in observation.header.items():
+        if name not in hdu.header:
+            hdu.header[name] = value
+    cards = {
+        "BUNIT": ("electron", "per pixel and frame"),
+        "WAVELEN": (observation.grid.wavelength, "[m] wavelength"),
+        "PIXELSCL": (observation.grid.pixel_scale / ARCSEC, "[arcsec] side of a pixel"),
+        "NFRAMES": (len(observation.frames), "frames restored from"),
+        "NHOLES": (observation.aperture.n_subapertures, "sub-apertures of the mask"),
+        "NMODES": (result.coefficients.shape[-1], "Zernike modes per sub-aperture and frame"),
+        "CHISQ": (float(result.chi_square.mean()), "mean square residual over noise"),
+        "CHISQMAX": (float(result.chi_square.max()), "the same of the worst frame"),
+        "NOISE": (result.noise, "[electron] rms per pixel and frame"),
+        "TVWEIGHT": (result.tv_weight, "weight of the total variation"),
+        "R0": (result.r0, "[m] Fried parameter of the prior"),
+        "CONVERGD": (result.converged, "whether the restoration came to rest"),
+    }
+    for name, (value, comment) in cards.items():
+        if not isinstance(value, float) or math.isfinite(value):  # FITS knows no NaN in a card
+            hdu.header[name] = (value, comment)
+    lines = [history] if isinstance(history, str) else list(history)
+    for line in ["restored by torchmask.MyopicDeconvolution", *lines]:
+        hdu.header.add_history(line.encode("ascii", "replace").decode().replace("\n", " "))
+    with atomic_write(path) as file:
+        hdu.writeto(file, checksum=True)
