@@ -51,6 +51,14 @@ class Observation:
     header : FITS cards that go with the frames: sky coordinates, target, telescope, filter, date
 
     The truth (object, psfs, r0, outer_scale, n_photons) is None where nobody knows it, as in a real observation.
+
+    Examples
+    --------
+    >>> mask = SparseAperture([[0.0, 0.3], [0.3, -0.2], [-0.3, -0.2]], 0.2, 1.0)
+    >>> frames = torch.rand(5, 32, 32)
+    >>> observation = Observation(frames, mask, Grid.nyquist(1.0, 550e-9, 32), readout_noise=1.5)
+    >>> observation.object is None, len(observation.frames)
+    (True, 5)
     """
 
     frames: Tensor
