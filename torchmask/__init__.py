@@ -19,6 +19,7 @@ from torchmask.optics.zernike import ZernikePhase
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.result import RestorationResult
 from torchmask.restoration.wiener import multiframe_wiener
+from torchmask.simulation.dataset import StackDataset, StackRanges
 from torchmask.simulation.observation import Observation, simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
 from torchmask.tracking import RunLogger
@@ -41,6 +42,8 @@ __all__ = [
     "SceneOptions",
     "SearchResult",
     "SparseAperture",
+    "StackDataset",
+    "StackRanges",
     "TurbulencePhase",
     "ZernikePhase",
     "check",

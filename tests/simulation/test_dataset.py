@@ -1,0 +1,160 @@
+"""Stacks drawn by index: reproducible in any worker, within their ranges, and true to the simulation behind them."""
+
+import math
+
+import pytest
+import torch
+from torch import nn
+from torch.utils.data import DataLoader
+
+from torchmask.grid import Grid
+from torchmask.optics.aperture import SparseAperture
+from torchmask.simulation.dataset import StackDataset, StackRanges
+
+GRID = Grid.nyquist(1.0, 550e-9, 32)
+CENTERS = torch.tensor([[0.02, 0.31], [0.3, -0.21], [-0.29, -0.18]], dtype=torch.float64)
+MASK = SparseAperture(CENTERS, 0.2, 1.0)
+
+
+def stacks(length=4, mask=MASK, **options):
+    return StackDataset(mask, GRID, length, n_frames=3, **options)
+
+
+def equal(first, second):
+    assert first.keys() == second.keys()
+    return all(torch.equal(first[name], second[name]) for name in first)
+
+
+def test_an_item_is_a_stack_with_its_truth():
+    item = stacks(readout_noise=0.0)[1]
+    shapes = {name: tuple(tensor.shape) for name, tensor in item.items()}
+    assert shapes == {
+        "frames": (3, 32, 32),
+        "object": (32, 32),
+        "psfs": (3, 32, 32),
+        "n_photons": (),
+        "r0": (),
+        "attitude": (3,),
+        "sun": (3,),
+    }
+    assert {tensor.dtype for tensor in item.values()} == {torch.float32}
+    assert float(item["object"].sum()) == pytest.approx(float(item["n_photons"]), rel=1e-5)
+    # the truth through the true PSFs, on a field wide enough that nothing comes back, is what the frames scatter about
+    spectrum = torch.fft.rfft2(item["object"].double(), s=(64, 64)) * torch.fft.rfft2(item["psfs"].double(), s=(64, 64))
+    expected = torch.fft.irfft2(spectrum, s=(64, 64))[:, 16:48, 16:48]
+    # Noise is 1 % of these pixels, and what the crop of the PSFs loses of a frame's light is spread widely.
+    bright = expected > 0.2 * expected.amax()
+    deviation = (item["frames"] - expected)[bright] / expected[bright]
+    assert float(deviation.abs().max()) < 0.1
+
+
+def test_stacks_depend_on_seed_and_index_alone():
+    first = stacks(seed=5)
+    backwards = [first[i] for i in (3, 1, 0)]
+    again = stacks(length=100, seed=5)
+    assert all(equal(item, again[i]) for item, i in zip(backwards, (3, 1, 0), strict=True))
+    assert not torch.equal(first[0]["object"], first[1]["object"])
+    assert not torch.equal(first[0]["object"], stacks(seed=6)[0]["object"])
+    torch.manual_seed(0)
+    state = torch.get_rng_state()
+    first[2]
+    assert torch.equal(torch.get_rng_state(), state)  # nobody else's random numbers are used up
+
+
+@pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")  # from Python 3.12 on
+@pytest.mark.parametrize("start", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
+def test_workers_draw_the_same_stacks(start):
+    dataset = stacks(mask=SparseAperture(nn.Parameter(CENTERS.clone()), 0.2, 1.0))
+    loader = DataLoader(dataset, batch_size=2, num_workers=1 if start == "spawn" else 2, multiprocessing_context=start)
+    batches = list(loader)
+    assert [tuple(batch["frames"].shape) for batch in batches] == [(2, 3, 32, 32)] * 2
+    for k, batch in enumerate(batches):
+        for i in range(2):
+            assert equal({name: values[i] for name, values in batch.items()}, dataset[2 * k + i])
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_batches_go_to_a_gpu():
+    batch = next(iter(DataLoader(stacks(), batch_size=2, pin_memory=True)))
+    moved = {name: values.to("cuda", non_blocking=True) for name, values in batch.items()}
+    assert all(torch.equal(moved[name].cpu(), values) for name, values in batch.items())
+
+
+def test_conditions_lie_within_their_ranges_and_fill_them():
+    ranges = StackRanges(((-10, 10), (20, 30), (0, 0)), sun_angle=(15, 50), n_photons=(1e5, 1e7), r0=(0.1, 0.4))
+    items = list(stacks(24, ranges=ranges))
+    drawn = {name: torch.stack([item[name] for item in items]).double() for name in ("attitude", "n_photons", "r0")}
+    drawn["angle"] = torch.stack([torch.rad2deg(torch.acos(item["sun"][2].double())) for item in items])
+    bounds = {"angle": (15, 50), "n_photons": (1e5, 1e7), "r0": (0.1, 0.4)}
+    cases = [(drawn[name], *bounds[name], name != "angle") for name in bounds]
+    cases += [(drawn["attitude"][:, 0], -10, 10, False), (drawn["attitude"][:, 1], 20, 30, False)]
+    for values, low, high, logarithmic in cases:
+        share = (values - low) / (high - low)
+        if logarithmic:
+            share = torch.log(values / low) / math.log(high / low)
+        assert share.min() > -1e-5
+        assert share.max() < 1 + 1e-5
+        # the mean of 24 uniform numbers: 4.5 standard errors; both ends are reached (1 - 0.75^24 = 0.999)
+        assert abs(float(share.mean()) - 0.5) < 4.5 / math.sqrt(12 * 24)
+        assert share.min() < 0.25
+        assert share.max() > 0.75
+    assert not drawn["attitude"][:, 2].any()
+    assert float(torch.stack([item["sun"][:2] for item in items]).mean(0).norm()) < 0.4  # from all sides
+
+
+def test_a_mask_that_trains_on_does_not_change_the_stacks():
+    centers = nn.Parameter(CENTERS.clone())
+    dataset = stacks(mask=SparseAperture(centers, 0.2, 1.0))
+    before = dataset[0]
+    with torch.no_grad():
+        centers.mul_(0.8)
+    assert equal(dataset[0], before)
+    assert centers.requires_grad
+
+
+def test_a_double_precision_dataset_shows_the_same_targets():
+    item, fine = stacks()[2], stacks(dtype=torch.float64)[2]
+    assert fine["frames"].dtype == torch.float64
+    torch.testing.assert_close(
+        item["object"].double(), fine["object"], rtol=1e-6, atol=1e-6 * float(fine["object"].max())
+    )
+
+
+def test_the_sequence_ends():
+    dataset = stacks()
+    assert len(dataset) == len(list(iter(dataset))) == 4
+    with pytest.raises(IndexError, match="there are 4"):
+        dataset[4]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"length": 0}, "length is 0"),
+        ({"length": 2.5}, "length is 2.5"),
+        ({"seed": -1}, "seed is -1"),
+        ({"size": 1.2}, "size is 1.2"),
+        ({"path": "none.obj"}, "none.obj"),
+        ({"readout_noise": -1.0}, "readout_noise"),
+        ({"outer_scale": 0.0}, "outer_scale"),
+        ({"mask": SparseAperture(torch.stack([CENTERS, CENTERS]), 0.2, 1.0)}, "population"),
+    ],
+)
+def test_bad_input_is_refused_when_it_is_made(options, message):
+    with pytest.raises(ValueError, match=message):
+        stacks(**options)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"n_photons": (0.0, 1e6)},
+        {"r0": (0.2, 0.1)},
+        {"r0": (0.1, math.inf)},
+        {"sun_angle": (-5.0, 40.0)},
+        {"attitude": ((0, 1), (0, math.nan), (0, 1))},
+    ],
+)
+def test_bad_ranges_are_refused(bad):
+    with pytest.raises(ValueError, match=next(iter(bad))):
+        StackRanges(**bad)
