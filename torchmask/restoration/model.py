@@ -19,8 +19,9 @@ from torch import Tensor, nn
 from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.zernike import zernike_basis
+from torchmask.restoration.parallel import Map
 
-_CHUNK = 2**17  # pixels of one complex work array: it stays in a core's cache
+_CHUNK = 2**16  # pixels of one complex work array: it stays in a core's cache
 
 
 class Misfit(NamedTuple):
@@ -171,6 +172,7 @@ class ExposureModel(nn.Module):
         *,
         want_object: bool = True,
         want_aberrations: bool = True,
+        parallel: Map = map,
     ) -> Misfit:
         """1/2 sum precision (forward - frames)^2 of every frame, and its gradients.
 
@@ -183,31 +185,35 @@ class ExposureModel(nn.Module):
             Inverse noise variance of each pixel, 0 where a pixel is not valid.
         want_object, want_aberrations : bool
             Which gradients to compute.
+        parallel : callable
+            Goes over the frames, a few at a time, as `map` does.
         """
         shape = self.field.shape
         spectrum = torch.fft.rfft2(image.to(self.basis.dtype))
         conjugate = spectrum.conj().resolve_conj()
-        object_gradient = torch.zeros_like(spectrum)
         pupil = self._pupil(z)
-        values, slopes = [], []
-        for part in self.chunks(len(z)):
+
+        @torch.no_grad()  # which holds for one thread only
+        def compare(part: slice) -> tuple[Tensor, Tensor | None, Tensor | None]:
             amplitude = self._amplitude(pupil[part])
             transfer = torch.fft.rfft2(_intensity(amplitude))
             model = torch.fft.irfft2(transfer * spectrum, s=shape)
             error = model[:, : self.grid.shape[0], : self.grid.shape[1]] - frames[part]
             residual = error * (precision[part] if len(precision) > 1 else precision)
-            values.append(0.5 * torch.linalg.vecdot(residual.flatten(1), error.flatten(1)).double())
+            value = 0.5 * torch.linalg.vecdot(residual.flatten(1), error.flatten(1)).double()
             if not (want_object or want_aberrations):
-                continue
+                return value, None, None
             back = torch.fft.rfft2(residual, s=shape)
-            if want_object:
-                object_gradient += (transfer.conj() * back).sum(0)
-            if want_aberrations:
-                psf_gradient = torch.fft.irfft2(back * conjugate, s=shape)
-                slopes.append(self._pull_back(pupil[part], amplitude, psf_gradient))
+            by_object = (transfer.conj() * back).sum(0) if want_object else None
+            if not want_aberrations:
+                return value, by_object, None
+            psf_gradient = torch.fft.irfft2(back * conjugate, s=shape)
+            return value, by_object, self._pull_back(pupil[part], amplitude, psf_gradient)
+
+        values, by_object, slopes = zip(*parallel(compare, self.chunks(len(z))), strict=True)
         return Misfit(
             torch.cat(values),
-            torch.fft.irfft2(object_gradient, s=shape).to(image.dtype) if want_object else None,
+            torch.fft.irfft2(sum(by_object[1:], by_object[0]), s=shape).to(image.dtype) if want_object else None,
             (torch.cat(slopes) @ self.basis).to(z.dtype) if want_aberrations else None,
         )
 
@@ -233,7 +239,10 @@ class ExposureModel(nn.Module):
             amplitude = self._amplitude(field)
             weight = (precision[part] if len(precision) > 1 else precision).expand(len(field), *self.grid.shape)
             for _ in range(4):
-                noise = torch.randn(weight.shape, dtype=weight.dtype, generator=generator).to(weight) * weight.sqrt()
+                noise = (
+                    torch.randn(weight.shape, dtype=weight.dtype, device="cpu", generator=generator).to(weight)
+                    * weight.sqrt()
+                )
                 back = torch.fft.irfft2(torch.fft.rfft2(noise, s=shape) * conjugate, s=shape)
                 gradient = self._pull_back(field, amplitude, back) @ self.basis
                 total += (gradient**2).sum(0).to(z.dtype) / 4

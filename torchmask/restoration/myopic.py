@@ -15,6 +15,7 @@ from torchmask.optics.aperture import Aperture
 from torchmask.record import Callback
 from torchmask.restoration.initialization import check_frames
 from torchmask.restoration.model import ExposureModel
+from torchmask.restoration.parallel import each_on_a_core
 from torchmask.restoration.priors import whitening
 from torchmask.restoration.result import RestorationResult
 from torchmask.restoration.run import Restoration
@@ -49,9 +50,9 @@ class MyopicDeconvolution(nn.Module):
         A broad band as a few wavelengths [m], and the share of the light of each (any positive numbers; None: equal).
         Coefficients are rad at the wavelength of the grid, and path differences the same for all. None: only that.
     static_modes : int
-        Zernike modes per sub-aperture, Noll 1 to static_modes, of aberrations common to all frames, such as those of the
-        telescope, besides the `n_modes` of each frame. Their prior is turbulence as strong as a hole is wide, whatever
-        `r0`. Coefficients then have max(n_modes, static_modes) modes, and are the sum of both.
+        Zernike modes per sub-aperture, Noll 1 to static_modes, of aberrations common to all frames, such as those of
+        the telescope, besides the `n_modes` of each frame. Their prior is turbulence as strong as a hole is wide,
+        whatever `r0`. Coefficients then have max(n_modes, static_modes) modes, and are the sum of both.
     tv_weight : float
         mu.
     aberration_prior : bool
@@ -133,7 +134,11 @@ class MyopicDeconvolution(nn.Module):
         def mixing(modes: int, r0: float) -> Tensor:
             """Coefficients (N J) of the modes 1 to `modes` from their parameters."""
             n_sub = aperture.n_subapertures
-            columns = whitening(aperture, modes, r0, self.outer_scale) if aberration_prior else torch.eye(n_sub * modes)
+            columns = (
+                whitening(aperture, modes, r0, self.outer_scale)
+                if aberration_prior
+                else torch.eye(n_sub * modes, device="cpu")
+            )
             rows = columns.unflatten(0, (n_sub, modes))
             return nn.functional.pad(rows, (0, 0, 0, self.n_modes - modes)).flatten(0, 1)
 
@@ -198,5 +203,6 @@ class MyopicDeconvolution(nn.Module):
         frames, valid = check_frames(frames, valid, self.grid)
         if coefficients is not None and known_object is not None:
             raise ValueError("coefficients and known_object are both given: nothing is left to restore")
-        run = Restoration(self, frames, valid, callback)
-        return run(coefficients, known_object, start, checkpoint, started)
+        with each_on_a_core(self.model.basis.device) as parallel:
+            run = Restoration(self, frames, valid, callback, parallel)
+            return run(coefficients, known_object, start, checkpoint, started)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import Any
 
-import numpy as np
 import torch
-from scipy.optimize import Bounds, minimize
 from torch import Tensor
 
+from torchmask.restoration.lbfgsb import minimize_bounded
 from torchmask.restoration.model import ExposureModel
+from torchmask.restoration.parallel import Map
 from torchmask.restoration.priors import total_variation, total_variation_curvature
 
 _CORRECTIONS = 20
@@ -46,6 +46,7 @@ class JointProblem:
     frames : (T, H, W) in units of their mean; precision : (T or 1, H or 1, W or 1)
     free : which of "object" and "aberrations" may change
     static : whether those aberrations may change that are common to all frames
+    parallel : how to go over the frames, as `map` does
     """
 
     model: ExposureModel
@@ -54,6 +55,7 @@ class JointProblem:
     tv_weight: float
     free: tuple[str, ...] = ("object", "aberrations")
     static: bool = True
+    parallel: Map = map
 
     def scaled_data(self, state: State) -> tuple[Tensor, Tensor]:
         """Frames and precision with the gains divided out of the model: (frames / g, precision g^2 / excess)."""
@@ -86,7 +88,15 @@ class JointProblem:
         """The cost with the gains and prior of `state`, and its gradients in image and z (zero where not free)."""
         frames, precision = self.scaled_data(state)
         by_object, by_aberrations = ("object" in self.free), ("aberrations" in self.free)
-        misfit = self.model.misfit(image, z, frames, precision, want_object=by_object, want_aberrations=by_aberrations)
+        misfit = self.model.misfit(
+            image,
+            z,
+            frames,
+            precision,
+            want_object=by_object,
+            want_aberrations=by_aberrations,
+            parallel=self.parallel,
+        )
         variation, slope = total_variation(image)
         value = misfit.value.sum() + self.tv_weight * variation + 0.5 * (self.prior(state) * z**2).sum()
         image_gradient = torch.zeros_like(image)
@@ -109,43 +119,27 @@ class JointProblem:
     def descend(self, state: State, n_iterations: int, progress: Callable[[float, int, Any], None]) -> State:
         """L-BFGS-B from `state`; `progress(cost, evaluations, function giving (image, z))` after every iteration."""
         image_scale, z_scale = self.scales(state)
-        n, evaluations = state.image.numel(), 0
+        n, seen = state.image.numel(), 0
 
-        def split(x: np.ndarray) -> tuple[Tensor, Tensor]:
-            flat = torch.from_numpy(x).to(state.image)
-            return flat[:n].view_as(state.image) * image_scale, flat[n:].view_as(state.z) * z_scale
+        def split(x: Tensor) -> tuple[Tensor, Tensor]:
+            return x[:n].view_as(state.image) * image_scale, x[n:].view_as(state.z) * z_scale
 
-        def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
-            nonlocal evaluations
-            evaluations += 1
+        def cost(x: Tensor) -> tuple[float, Tensor]:
             value, image_gradient, z_gradient = self.cost(state, *split(x))
-            gradient = torch.cat([(image_gradient * image_scale).flatten(), (z_gradient * z_scale).flatten()])
-            return float(value), gradient.cpu().numpy()
+            return float(value), torch.cat([(image_gradient * image_scale).flatten(), (z_gradient * z_scale).flatten()])
 
-        def after(intermediate_result: Any) -> None:
-            nonlocal evaluations
-            done, evaluations = evaluations, 0
-            progress(float(intermediate_result.fun), done, lambda: split(intermediate_result.x))
+        def after(x: Tensor, value: float, evaluations: int) -> None:
+            nonlocal seen
+            seen, new = evaluations, evaluations - seen
+            progress(value, new, lambda: split(x))
 
-        start = torch.cat([(state.image / image_scale).flatten(), (state.z / z_scale).flatten()]).cpu().numpy()
-        lower = np.full(len(start), -np.inf)
+        start = torch.cat([(state.image / image_scale).flatten(), (state.z / z_scale).flatten()])
+        lower = torch.full_like(start, -torch.inf)
         lower[:n] = 0
-        result = minimize(
-            cost,
-            start,
-            jac=True,
-            method="L-BFGS-B",
-            bounds=Bounds(cast(Any, lower), np.inf),  # its annotation knows numbers only
-            options={
-                "maxiter": n_iterations,
-                "maxfun": 4 * n_iterations,
-                "maxcor": _CORRECTIONS,
-                "ftol": 1e-12,
-                "gtol": 0,
-            },
-            callback=after,
+        found = minimize_bounded(
+            cost, start, lower, max_iterations=n_iterations, n_corrections=_CORRECTIONS, callback=after
         )
-        image, z = split(result.x)
+        image, z = split(found.x)
         return replace(state, image=image, z=z)
 
     def calibrate(self, state: State) -> State:

@@ -46,7 +46,7 @@ def repair(problem: JointProblem, state: State, excess: Tensor, seed: int) -> tu
     spread = float(state.z.square().mean().sqrt())
     own = problem.model.n_parameters - problem.model.n_static
     for _ in range(_STARTS):
-        noise = torch.randn(now.z.shape, dtype=now.z.dtype, generator=generator).to(now.z)
+        noise = torch.randn(now.z.shape, dtype=now.z.dtype, device="cpu", generator=generator).to(now.z)
         fresh = torch.cat([spread * noise[:, :own], now.z[:, own:]], dim=1)  # what is common to all frames stays
         trial = part.descend(replace(now, z=fresh), _ITERATIONS, count)
         costs = part.frame_costs(trial)

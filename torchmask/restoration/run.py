@@ -22,6 +22,7 @@ from torchmask.restoration.initialization import (
     mean_frame,
     turbulence_strength,
 )
+from torchmask.restoration.parallel import Map
 from torchmask.restoration.problem import JointProblem, State
 from torchmask.restoration.repair import repair
 from torchmask.restoration.result import RestorationResult
@@ -53,7 +54,9 @@ class _Progress:
 class Restoration:
     """Holds frames (T, H, W) in units of their mean pixel; calling it restores the object behind them."""
 
-    def __init__(self, method: MyopicDeconvolution, frames: Tensor, valid: Tensor, callback: Callback | None) -> None:
+    def __init__(
+        self, method: MyopicDeconvolution, frames: Tensor, valid: Tensor, callback: Callback | None, parallel: Map
+    ) -> None:
         self.method, self.model, self.callback = method, method.model, callback
         self.unit = float(frames.mean())
         bluest = replace(method.grid, wavelength=self.model.shortest_wavelength)
@@ -62,9 +65,9 @@ class Restoration:
             warnings.warn("the frames are bright at the border: does the object reach beyond the field?", stacklevel=3)
         basis = self.model.basis
         self.frames, self.valid = (frames / self.unit).to(basis), valid.to(basis.device)
-        weight = torch.ones(1, 1, 1) if bool(valid.all()) else valid
+        weight = valid.new_ones(1, 1, 1) if bool(valid.all()) else valid
         precision = weight.to(basis) * (self.unit**2 / self.variance)
-        self.problem = JointProblem(self.model, self.frames, precision, method.tv_weight)
+        self.problem = JointProblem(self.model, self.frames, precision, method.tv_weight, parallel=parallel)
         self._symmetric = method.aperture.n_subapertures == 1  # under point reflection, and of many modes
 
     def __call__(
@@ -145,7 +148,7 @@ class Restoration:
         z = torch.zeros(shape, dtype=torch.float64, device=image.device)
         if self._symmetric:
             # Zero is a saddle point there: the sign of the even modes of a point-symmetric pupil cannot be seen.
-            noise = torch.randn(shape, dtype=z.dtype, generator=torch.Generator().manual_seed(_SEED))
+            noise = torch.randn(shape, dtype=z.dtype, device="cpu", generator=torch.Generator().manual_seed(_SEED))
             z = noise.to(z) * (_START if self.method.aberration_prior else _START / 7)
             own = self.model.n_parameters - self.model.n_static
             z[:, own:] = z[0, own:]
@@ -276,7 +279,7 @@ class Restoration:
             tv_weight=method.tv_weight,
             r0=method.r0 * state.prior ** (3 / 5) if method.aberration_prior else math.nan,
             noise=self.variance**0.5,
-            cost=torch.tensor(progress.costs, dtype=torch.float64),
+            cost=torch.tensor(progress.costs, dtype=torch.float64, device="cpu"),
             converged=progress.message.startswith("converged"),
             message=progress.message,
             n_evaluations=progress.n_evaluations,

@@ -1,0 +1,31 @@
+"""Frames side by side on the processor's cores."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+
+Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
+
+
+@contextmanager
+def each_on_a_core(device: torch.device) -> Iterator[Map]:
+    """A `map` whose calls run on as many threads as torch may use, one core each.
+
+    The arrays of a few frames are too small to be shared between cores: torch's own threads then cost more than they
+    bring. For the time of the context torch uses one thread; results are the same for any number of them.
+    """
+    n_threads = torch.get_num_threads()
+    if device.type != "cpu" or n_threads == 1:
+        yield map
+        return
+    torch.set_num_threads(1)
+    try:
+        with ThreadPoolExecutor(n_threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+            yield pool.map
+    finally:
+        torch.set_num_threads(n_threads)
