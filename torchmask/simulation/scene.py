@@ -37,14 +37,11 @@ class SceneOptions:
     """
 
     path: Path | None = None
-    """A mesh (.obj, .stl, .ply, .glb ...) or an image (.npz with the key image, .png, .fits); without one, the packaged
-    satellite."""
+    """Mesh (.obj, .stl, .ply, .glb ...) or image (.npz with key image, .png, .fits); None: a packaged satellite."""
     attitude: tuple[float, float, float] | None = None
-    """Degrees by which the target is turned about the axes to the right, then up, then towards the viewer. By default
-    a mesh is seen obliquely, at 25 -30 15, and an image upright; an image turns about the last axis only."""
+    """Turn about the axes right, up, towards the viewer [degrees]; None: 25 -30 15, images upright, turned in plane."""
     sun: tuple[float, float, float] | None = None
-    """Direction in which the sun stands, as (right, up, towards the viewer) of any length; by default -0.5 0.6 0.7.
-    Images bring their own light."""
+    """Direction of the sun: right, up, towards the viewer, any length; None: -0.5 0.6 0.7; images bring their light."""
     size: float = 0.7
     """Larger side of the target as a fraction of the field."""
 
