@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from io import BytesIO
 from pathlib import Path
 
 from torchmask.data.keywords import ARCSEC
@@ -72,5 +73,7 @@ def save_restored(
     lines = [history] if isinstance(history, str) else list(history)
     for line in ["restored by torchmask.MyopicDeconvolution", *lines]:
         hdu.header.add_history(line.encode("ascii", "replace").decode().replace("\n", " "))
+    content = BytesIO()  # astropy does not know the mode that atomic_write opens files in
+    hdu.writeto(content, checksum=True)
     with atomic_write(path) as file:
-        hdu.writeto(file, checksum=True)
+        file.write(content.getvalue())
