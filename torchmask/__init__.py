@@ -3,6 +3,7 @@
 mask -> pupil field -> PSF / OTF -> short exposures -> restored object
 """
 
+from torchmask.data.restored import save_restored
 from torchmask.design.constraints import check
 from torchmask.design.criterion import AsymptoticMSE, wiener_mse
 from torchmask.design.manufacture import load_mask
@@ -52,6 +53,7 @@ __all__ = [
     "make_scene",
     "multiframe_wiener",
     "refine_mask",
+    "save_restored",
     "search_mask",
     "simulate_observation",
     "wiener_mse",
