@@ -175,6 +175,7 @@ def test_bad_input_is_refused():
         minimize_bounded(lambda x: (math.nan, x), torch.ones(3), torch.zeros(3), max_iterations=1)
 
 
+@pytest.mark.filterwarnings("ignore:the frames are bright")
 def test_restoration_is_the_same_on_any_number_of_cores():
     torch.manual_seed(0)
     frames = torch.poisson(1e3 * torch.ones(6, 32, 32)).double()
