@@ -74,8 +74,6 @@ def find_target(frames: np.ndarray, valid: np.ndarray, blur: float) -> tuple[int
     from scipy.ndimage import gaussian_filter
 
     mean = gaussian_filter(fill(frames, valid).mean(0), blur, mode="nearest")
-    # a group of pixels without any neighbour to fill them from is not the target
-    mean[~valid.any(0)] = -np.inf
     row, column = np.unravel_index(mean.argmax(), mean.shape)
     return int(row), int(column)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -43,20 +44,29 @@ def read_fits(path: str | Path) -> FITSImages:
         several that could be meant, or its extensions disagree in shape.
     """
     from astropy.io import fits
+    from astropy.io.fits.verify import VerifyWarning
+    from astropy.utils.exceptions import AstropyUserWarning
 
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"there is no file {path} (needed: a FITS file)")
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")  # astropy only warns of truncated files and wrong checksums
-            warnings.simplefilter("ignore", fits.verify.VerifyWarning)  # unusual cards do no harm
-            with fits.open(path, memmap=False, checksum=True) as hdus:
-                return _images(path, hdus)
+        with warnings.catch_warnings(record=True) as caught, open(path, "rb") as file:
+            warnings.simplefilter("always")
+            with fits.open(file, checksum=True) as hdus:
+                images = _images(path, hdus)
     except _Refused as error:
         raise ValueError(f"{path} {error}") from None
-    except (OSError, TypeError, ValueError, KeyError, IndexError, EOFError, Warning) as error:
-        raise ValueError(f"{path} is no FITS file, or is damaged: {' '.join(str(error).split())}") from error
+    except (OSError, TypeError, ValueError, LookupError, EOFError, zlib.error) as error:
+        raise _damaged(path, error) from error
+    for warning in caught:  # all that astropy says of a truncated file or a wrong checksum
+        if issubclass(warning.category, AstropyUserWarning) and not issubclass(warning.category, VerifyWarning):
+            raise _damaged(path, warning.message)
+    return images
+
+
+def _damaged(path: Path, why: Any) -> ValueError:
+    return ValueError(f"{path} is no FITS file, or is damaged: {' '.join(str(why).split())}")
 
 
 class _Refused(Exception):
