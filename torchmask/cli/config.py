@@ -20,7 +20,7 @@ T = TypeVar("T")
 
 _COMMAND = "command"  # the key that says which command a config file is for
 # Where results go and how errors are shown: no part of what is computed.
-_NOT_STORED = ("out", "name", "config", "debug")
+_NOT_STORED = ("out", "name", "runs", "config", "debug")
 _KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text", Path: "a path"}
 
 
@@ -41,7 +41,7 @@ def parse(options: type[T], command: str, argv: Sequence[str]) -> T:
 
 
 def save_config(path: str | Path, command: str, options: Any) -> None:
-    """Write the options that a result depends on, for `load_config`; paths are made absolute. The file must be new."""
+    """Write the options that a result depends on, for `load_config`; paths that exist become absolute. A new file."""
     import yaml
 
     values = {_COMMAND: command} | to_json(stored(options))
@@ -85,7 +85,7 @@ def stored(options: Any) -> dict[str, Any]:
             return stored(value)
         if isinstance(value, tuple):
             return [plain(item) for item in value]
-        return value.absolute() if isinstance(value, Path) else value
+        return value.absolute() if isinstance(value, Path) and value.exists() else value
 
     return {field.name: plain(getattr(options, field.name)) for field in _fields(type(options))}
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from tyro.conf import FlagCreatePairsOff
+import tyro
 
 from torchmask.design.manufacture import load_mask
-from torchmask.optics import catalog
 from torchmask.optics.aperture import Aperture, FullAperture, SparseAperture
 
 ARCSEC = math.pi / (180 * 3600)  # rad
@@ -24,7 +23,7 @@ class CommonOptions:
 
     config: Path | None = None
     """A config.yaml that an earlier run wrote: its values stand for all options not given here."""
-    debug: FlagCreatePairsOff[bool] = False
+    debug: tyro.conf.FlagCreatePairsOff[bool] = False
     """Show where an error comes from, with its traceback."""
 
 
@@ -62,14 +61,12 @@ class SearchOptions:
 class MaskOptions:
     """The aperture."""
 
-    mask: str | None = None
-    """File that `torchmask design` wrote (.json, or .dxf or .fits), name from `torchmask masks`, or `full` for a full
-    pupil of diameter --mask-diameter."""
+    mask: Annotated[Path | None, tyro.conf.arg(metavar="FILE|NAME|full")] = None
+    """Mask file (.json, .dxf, .fits), name from `torchmask masks`, or `full`: a full pupil of --mask-diameter."""
     mask_diameter: float | None = None
     """D, of a mask from the catalogue or of a full pupil [m]; None: as built."""
     fill_factor: float | None = None
-    """Collecting area N d^2 / D^2 of a mask from the catalogue; None: as built. Arrays without a size of their own
-    (Golay) need both."""
+    """Collecting area N d^2 / D^2 of a mask from the catalogue; None: as built. Golay arrays need both."""
     mirrored: bool = False
     """Reverse x of a mask from the catalogue, for instruments that look from the other side."""
     central_obstruction: float = 0.0
@@ -78,12 +75,12 @@ class MaskOptions:
 
 def load_aperture(options: MaskOptions) -> Aperture:
     """The aperture that `options.mask` names, float64. Raises ValueError for what is unknown, missing or of no use."""
-    name = options.mask
-    if name is None:
+    if options.mask is None:
         raise ValueError(
             f"--mask is missing: give a mask file ({', '.join(MASK_SUFFIXES)}), a name from `torchmask masks`, or "
             f"{FULL}"
         )
+    name = str(options.mask)
     if name == FULL:
         if options.mask_diameter is None:
             raise ValueError("a full pupil needs --mask-diameter [m]")
@@ -91,7 +88,7 @@ def load_aperture(options: MaskOptions) -> Aperture:
         return FullAperture(options.mask_diameter, options.central_obstruction / options.mask_diameter)
     if options.central_obstruction:
         raise ValueError("--central-obstruction is for a full pupil (--mask full); a mask has the holes that it has")
-    if Path(name).suffix.lower() in MASK_SUFFIXES or Path(name).is_file():
+    if options.mask.is_file() or options.mask.suffix.lower() in MASK_SUFFIXES:
         if options.mask_diameter is not None or options.fill_factor is not None or options.mirrored:
             raise ValueError(
                 f"--mask-diameter, --fill-factor and --mirrored are for masks from the catalogue: {name} is a file"
@@ -100,8 +97,4 @@ def load_aperture(options: MaskOptions) -> Aperture:
     try:
         return SparseAperture.from_catalog(name, options.mask_diameter, options.fill_factor, options.mirrored)
     except ValueError as error:
-        try:
-            catalog.entry(name)
-        except ValueError:
-            raise ValueError(f"--mask is {name!r}, which is no file ({', '.join(MASK_SUFFIXES)}); {error}") from error
-        raise
+        raise ValueError(f"--mask {name}: {error}") from error

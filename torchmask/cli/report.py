@@ -48,23 +48,27 @@ def log_observation(name: str, observation: Observation, logger: RunLogger) -> N
 
 @drawing.styled
 def restored_figure(
-    image: Any, frames: Any | None = None, residuals: Any | None = None, pixel_scale: float | None = None
+    image: Any,
+    frames: Any | None = None,
+    residuals: Any | None = None,
+    pixel_scale: float | None = None,
+    title: str = "restored",
 ) -> Figure:
-    """A restored image (H, W), beside it the first frame and the mean of `frames`, and the rms of `residuals`.
+    """A restored image (H, W), beside it the first and the mean of `frames` (T, H, W), and the rms of `residuals`.
 
     Light is shown with a square root, each image up to its own 99.5th percentile; residuals (T, H, W) are in units of
     the noise, so that 1 is what noise alone leaves. `pixel_scale` [rad] labels the axes with angles.
     """
     restored = as_array(image)
-    lights = {"restored": restored}
+    lights = {title: restored}
     if frames is not None:
         stack = as_array(frames)
         lights = {"first frame": stack[0], f"mean of {len(stack)} frames": stack.mean(0), **lights}
     figure, axes = drawing.row_of_axes([1.0] * (len(lights) + (residuals is not None)), height=3.2)
     unit, extent = drawing.sky_extent((restored.shape[0], restored.shape[1]), pixel_scale)
-    for ax, (title, values) in zip(axes, lights.items(), strict=False):
+    for ax, (name, values) in zip(axes, lights.items(), strict=False):
         ax.imshow(viz.stretch(values), cmap="gray", vmin=0, vmax=1, extent=extent)
-        drawing.image_axes(ax, title, f"x [{unit}]", f"y [{unit}]" if ax is axes[0] else "")
+        drawing.image_axes(ax, name, f"x [{unit}]", f"y [{unit}]" if ax is axes[0] else "")
     if residuals is not None:
         rms = np.sqrt((as_array(residuals) ** 2).mean(0))
         axes[-1].imshow(rms, cmap="magma", vmin=0, vmax=max(2.0, float(np.percentile(rms, 99.5))), extent=extent)

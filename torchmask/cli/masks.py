@@ -1,0 +1,116 @@
+"""`torchmask masks`: the catalogue."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from torchmask import viz
+from torchmask.cli.options import CommonOptions
+from torchmask.design.manufacture import save_dxf, save_fits, save_json, save_svg
+from torchmask.design.redundancy import analyse_redundancy
+from torchmask.io import atomic_write
+from torchmask.optics import catalog
+from torchmask.optics.aperture import SparseAperture
+
+_ANY_SIZE = (1.0, 0.1)  # mask diameter [m] and fill factor at which a mask without a size of its own is shown
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(CommonOptions):
+    """List the catalogue of masks, or show one of them, and write it to a file."""
+
+    name: tyro.conf.Positional[str | None] = None
+    """Mask to show; None: list all."""
+    mask_diameter: float | None = None
+    """D [m]; None: as built, or 1 m for a mask without a size of its own."""
+    fill_factor: float | None = None
+    """Collecting area N d^2 / D^2; None: as built, or 0.1 where no source gives the size of the holes."""
+    mirrored: bool = False
+    """Reverse x, for instruments that look from the other side."""
+    out: Path | None = None
+    """New file for the mask (.json, .dxf, .svg, .fits) or for its picture (.png)."""
+
+
+def run(options: Options) -> None:
+    """Print the list, or one mask."""
+    if options.name is not None:
+        show(options.name, options)
+        return
+    if options.out is not None:
+        raise ValueError("--out is for one mask: give its name")
+    print(listing())
+
+
+def listing() -> str:
+    """A line for each mask of the catalogue."""
+    rows = [("name", "holes", "shape", "hole [m]", "pupil [m]", "note")]
+    for name in catalog.names():
+        mask = catalog.entry(name)
+        hole, pupil = ("-" if size is None else f"{size:.4g}" for size in (mask.hole_diameter, mask.pupil_diameter))
+        note = textwrap.shorten(mask.note, 60, placeholder=" ...")
+        rows.append((name, f"{mask.n_subapertures}", mask.shape, hole, pupil, note))
+    widths = [max(len(row[column]) for row in rows) for column in range(5)]
+    align = ("<", ">", "<", ">", ">")
+    lines = [
+        "  ".join(f"{cell:{side}{width}}" for cell, side, width in zip(row, align, widths, strict=False))
+        + f"  {row[-1]}"
+        for row in rows
+    ]
+    return "\n".join([*lines, "", "`torchmask masks NAME` shows one; -: no size of its own, or none published"])
+
+
+def show(name: str, options: Options) -> None:
+    """Print what is known of a mask, and write it to a file if that is wanted."""
+    mask = catalog.entry(name)
+    diameter, fill = options.mask_diameter, options.fill_factor
+    if mask.pupil_diameter is None:
+        diameter, fill = diameter or _ANY_SIZE[0], fill or _ANY_SIZE[1]
+    elif mask.hole_diameter is None:
+        fill = fill or _ANY_SIZE[1]
+    aperture = SparseAperture.from_catalog(name, diameter, fill, options.mirrored)
+    if options.out is not None:
+        write(options.out, aperture)
+    print(describe(aperture, mask))
+    if options.out is not None:
+        print(f"written to {options.out}")
+
+
+def describe(aperture: SparseAperture, mask: catalog.CatalogEntry | None = None) -> str:
+    """Size, holes and baselines of a mask, and what the catalogue says of it."""
+    what = "discs" if aperture.shape == "disc" else "hexagons (flat to flat)"
+    lines = [
+        f"{'mask' if mask is None else mask.name}: {aperture.n_subapertures} {what} of "
+        f"{aperture.subaperture_diameter:.4g} m in {aperture.mask_diameter:.4g} m, fill factor "
+        f"{aperture.fill_factor:.4g}",
+    ]
+    if mask is not None:
+        sources = {"source": mask.source, "holes from": mask.hole_source, "note": mask.note}
+        lines += [textwrap.fill(f"{key}: {text}", 100, subsequent_indent="  ") for key, text in sources.items() if text]
+    if aperture.n_subapertures > 1:
+        lines += ["", str(analyse_redundancy(aperture))]
+    lines += ["", "centres (x, y) [m]", *(f"{x:11.6f} {y:11.6f}" for x, y in aperture.centers.tolist())]
+    return "\n".join(lines)
+
+
+def write(path: Path, aperture: SparseAperture) -> None:
+    """Write a mask, or its picture, to a new file of the kind that the suffix says."""
+    writers: dict[str, Callable[[Path, SparseAperture], None]] = {
+        ".json": save_json,
+        ".dxf": save_dxf,
+        ".svg": save_svg,
+        ".fits": save_fits,
+        ".png": _save_png,
+    }
+    if path.suffix.lower() not in writers:
+        raise ValueError(f"{path} does not end in one of {', '.join(writers)}")
+    writers[path.suffix.lower()](path, aperture)
+
+
+def _save_png(path: Path, aperture: SparseAperture) -> None:
+    with atomic_write(path) as file:
+        viz.mask_figure(aperture).savefig(file, format="png", dpi=160)

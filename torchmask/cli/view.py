@@ -1,0 +1,191 @@
+"""`torchmask view`: what a file or a run folder holds, as text and pictures."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import tyro
+
+from torchmask import viz
+from torchmask.cli.masks import describe
+from torchmask.cli.options import ARCSEC, CommonOptions
+from torchmask.cli.report import restored_figure
+from torchmask.data.fits import read_fits
+from torchmask.design.manufacture import load_mask
+from torchmask.io import atomic_write, load_npz, read_json
+from torchmask.optics.aperture import SparseAperture
+from torchmask.restoration.result import RestorationResult
+from torchmask.simulation.observation import Observation
+from torchmask.tracking import read_metrics
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_RESULTS = ("restored.npz", "result.npz", "stack.npz", "mask.json")  # of a run: the first of these that is there
+_NYQUIST = 0.5  # cycles/pixel, the cut-off of a codesign run
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(CommonOptions):
+    """Say what a file holds, and draw it: a mask, a stack, a restored image, a run folder or one of its checkpoints."""
+
+    path: tyro.conf.Positional[Path]
+    """Mask (.json, .dxf, .fits), stack or result (.npz), image or cube (.fits), or run folder."""
+    out: Path | None = None
+    """New .png file; None: the name of the input, in the current folder. Of a mask, NAME-uv.png has its baselines."""
+
+
+class View(NamedTuple):
+    """text : what is there; figures : by what is added to the name of their file."""
+
+    text: str
+    figures: dict[str, Figure]
+
+
+def run(options: Options) -> None:
+    """Print the text, write the figures."""
+    if options.out is not None and options.out.suffix.lower() != ".png":
+        raise ValueError(f"{options.out} does not end in .png")
+    view = view_path(options.path)
+    print(view.text)
+    base = options.out or Path(f"{options.path.resolve().stem}.png")
+    names = {suffix: base.with_name(f"{base.stem}{suffix}.png") for suffix in view.figures}
+    if options.out is None:
+        names = _free(names)
+    for suffix, figure in view.figures.items():
+        with atomic_write(names[suffix]) as file:
+            figure.savefig(file, format="png", dpi=160)
+        print(f"written to {names[suffix]}")
+
+
+def view_path(path: Path) -> View:
+    """Look into a file or folder. Raises ValueError for what is missing, damaged or unknown."""
+    if path.is_dir():
+        return _view_run(path)
+    viewers: dict[str, Callable[[Path], View]] = {
+        ".json": _view_mask,
+        ".dxf": _view_mask,
+        ".fits": _view_fits,
+        ".npz": _view_npz,
+    }
+    if not path.is_file():
+        raise ValueError(f"there is no file or folder {path}")
+    if path.suffix.lower() not in viewers:
+        raise ValueError(f"{path} is of an unknown kind: files that can be viewed end in {', '.join(viewers)}")
+    return viewers[path.suffix.lower()](path)
+
+
+def _view_mask(path: Path) -> View:
+    return _mask_view(load_mask(path))
+
+
+def _mask_view(mask: SparseAperture) -> View:
+    return View(describe(mask), {"": viz.mask_figure(mask), "-uv": viz.uv_coverage_figure(mask)})
+
+
+def _view_fits(path: Path) -> View:
+    from astropy.io import fits
+
+    try:
+        with fits.open(path) as content:
+            is_mask = "HOLES" in content
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path} is no FITS file, or is damaged: {error}") from error
+    if is_mask:
+        return _view_mask(path)
+    images = read_fits(path)
+    count, rows, columns = images.values.shape
+    lines = [
+        f"{count} image{'s' if count > 1 else ''} of {rows} x {columns} pixels, {100 * images.valid.mean():.4g} % of them valid"
+    ]
+    keys = ("OBJECT", "TELESCOP", "INSTRUME", "FILTER", "WAVELEN", "PIXELSCL", "BUNIT", "CHISQ", "NOISE")
+    lines += [f"{key} = {images.header[key]}" for key in keys if key in images.header]
+    lines += [f"HISTORY {line}" for line in images.header.get("HISTORY", [])]
+    scale = images.header.get("PIXELSCL")
+    angle = scale * ARCSEC if isinstance(scale, float) else None
+    if count == 1:
+        return View("\n".join(lines), {"": restored_figure(images.values[0], title="image", pixel_scale=angle)})
+    return View("\n".join(lines), {"": viz.frames_figure(images.values, pixel_scale=angle)})
+
+
+def _view_npz(path: Path) -> View:
+    stored = load_npz(path)
+    if {"object", "residuals", "coefficients"} <= stored.keys():
+        result = RestorationResult.load(path)
+        return View(result.summary(), {"": restored_figure(result.object, residuals=result.residuals)})
+    if "frames" in stored:
+        return _stack_view(Observation.load(path))
+    if {"scene", "mask_object", "full_object"} <= stored.keys():
+        return _codesign_view(stored)
+    image = stored.get("object", stored.get("image"))
+    if image is not None and image.ndim == 2:
+        step = f", step {stored['step']}" if "step" in stored else ""
+        return View(
+            f"image of {image.shape[0]} x {image.shape[1]} pixels{step}", {"": restored_figure(image, title="image")}
+        )
+    text = "\n".join(f"{name}: {array.dtype} {array.shape}" for name, array in stored.items())
+    return View(f"arrays that no figure is known for\n{text}", {})
+
+
+def _stack_view(observation: Observation) -> View:
+    frames, grid, aperture = observation.frames, observation.grid, observation.aperture
+    noise = observation.readout_noise
+    lines = [
+        f"{len(frames)} frames of {grid.shape[0]} x {grid.shape[1]} pixels of {grid.pixel_scale / ARCSEC:.4g} arcsec, "
+        f"{grid.wavelength:.4g} m",
+        f"{float(frames.sum((1, 2)).mean()):.4g} electrons per frame, read-out noise "
+        + ("unknown" if noise is None else f"{noise:.3g} electrons rms"),
+        f"{aperture.n_subapertures} {aperture.shape}s of {aperture.subaperture_diameter:.4g} m in "
+        f"{aperture.mask_diameter:.4g} m",
+    ]
+    if observation.r0 is not None:
+        lines.append(f"simulated, r0 {observation.r0:.4g} m, {observation.n_photons or 0:.4g} photons per frame")
+    return View(
+        "\n".join(lines),
+        {"": viz.frames_figure(frames, pixel_scale=grid.pixel_scale), "-mask": viz.mask_figure(aperture)},
+    )
+
+
+def _codesign_view(stored: dict[str, Any]) -> View:
+    names = ("mask", "full")
+    pictures = {name: (stored[f"{name}_frames"][0], stored[f"{name}_object"]) for name in names}
+    text = f"relative MSE of the mask {stored['relative_mse']:.5g}"
+    return View(text, {"": viz.comparison_figure(stored["scene"], pictures, _NYQUIST)})
+
+
+def _view_run(folder: Path) -> View:
+    """How a run ended, the last values of each stage, and its result, or else the last state it reached."""
+    rows = read_metrics(folder)  # raises where this is no run folder
+    status = read_json(folder / "status.json")
+    last: dict[str, dict[str, Any]] = {}
+    for row in rows:
+        before = last.get(row["stage"], row)
+        same = before["scalars"] if before["step"] == row["step"] else {}  # final values come one by one
+        last[row["stage"]] = row | {"scalars": same | row["scalars"]}
+    lines = [f"{folder}: {status['status']} after {status['seconds']:.0f} s"]
+    if status.get("error"):
+        lines.append(status["error"])
+    for stage, row in last.items():
+        budget = f"/{row['n_steps']}" if "n_steps" in row else ""
+        values = ", ".join(f"{name} {value:.5g}" for name, value in row["scalars"].items() if value is not None)
+        lines.append(f"  {stage} {row['step']}{budget}: {values}")
+    there = [folder / name for name in _RESULTS if (folder / name).is_file()]
+    there += sorted((folder / "checkpoints").glob("*.npz"), key=lambda path: path.stat().st_mtime, reverse=True)
+    if not there:
+        return View("\n".join([*lines, "it has no results yet"]), {})
+    result = view_path(there[0])
+    return View("\n".join([*lines, "", f"{there[0]}:", result.text]), result.figures)
+
+
+def _free(names: dict[str, Path]) -> dict[str, Path]:
+    """The same names, or those with the first number behind them that all are free with."""
+    for number in itertools.count(1):
+        tag = "" if number == 1 else f"-{number}"
+        numbered = {key: path.with_name(f"{path.stem}{tag}.png") for key, path in names.items()}
+        if not any(path.exists() for path in numbered.values()):
+            return numbered
+    raise AssertionError  # count never ends
