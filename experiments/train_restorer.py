@@ -1,0 +1,247 @@
+"""Train a small network on simulated stacks, and hold it against the best linear restoration.
+
+    python experiments/train_restorer.py               # a minute of training on one core, after half a minute of stacks
+    python experiments/train_restorer.py --smoke       # everything, tiny, in seconds
+
+Each stack of a `StackDataset` (the satellite in a random pose, sunlight, flux and turbulence) becomes its multi-frame
+Wiener estimate with the true PSFs and the mean power spectrum of the training objects. A few convolutions learn what
+to add to it. Scores on stacks that were never trained on: relative error up to the diffraction limit, 0 is perfect.
+Log, figure, network and scores go to a new folder, runs/<name>/.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from datetime import datetime
+from itertools import pairwise
+from pathlib import Path
+
+import torch
+import tyro
+from torch import Tensor, nn
+from torch.utils.data import DataLoader
+
+from torchmask import viz
+from torchmask.grid import Grid
+from torchmask.io import atomic_write, write_json
+from torchmask.metrics import lowpass, score
+from torchmask.optics.aperture import SparseAperture
+from torchmask.progress import Progress
+from torchmask.record import Callback, Record
+from torchmask.restoration.wiener import multiframe_wiener
+from torchmask.simulation.dataset import StackDataset, StackRanges
+from torchmask.tracking import RunLogger, fan_out
+
+DIAMETER = 1.0  # of the mask [m]
+WAVELENGTH = 550e-9
+READOUT_NOISE = 1.5  # electrons rms per pixel
+
+
+@dataclass(frozen=True)
+class Config:
+    """Everything a run depends on."""
+
+    mask: str = "golay9"
+    """A Golay array of the catalogue."""
+    fill_factor: float = 0.15
+    """Collecting area N d^2 / D^2."""
+    ranges: StackRanges = field(default_factory=StackRanges)
+    """What differs from stack to stack."""
+    n_pixels: int = 64
+    """Of the image, per side."""
+    n_frames: int = 8
+    """Short exposures in a stack."""
+    n_train: int = 256
+    """Stacks to train on."""
+    n_held_out: int = 32
+    """Stacks to be scored on."""
+    channels: int = 24
+    """Of the hidden layers."""
+    depth: int = 5
+    """Convolutions."""
+    epochs: int = 12
+    """Passes over the training stacks."""
+    batch_size: int = 8
+    """Stacks in a step of the optimiser."""
+    learning_rate: float = 2e-3
+    """Of Adam, at its highest."""
+    workers: int = 2
+    """Processes that draw stacks."""
+    seed: int = 0
+    """Of stacks, network and training."""
+    smoke: bool = False
+    """Everything tiny, to see that it runs."""
+    name: str | None = None
+    """Folder of the run below `runs`; None: date and time."""
+    runs: Path = Path("runs")
+    """Where run folders are made."""
+
+
+class Restorer(nn.Module):
+    """What to add to a linear estimate (B, 1, H, W), seen beside the mean frame: input (B, 2, H, W)."""
+
+    def __init__(self, channels: int, depth: int) -> None:
+        super().__init__()
+        sizes = [2, *[channels] * (depth - 1), 1]
+        layers: list[nn.Module] = []
+        for size, following in pairwise(sizes):
+            layers += [nn.Conv2d(size, following, 3, padding=1, padding_mode="replicate"), nn.SiLU()]
+        self.layers = nn.Sequential(*layers[:-1])
+        nn.init.zeros_(layers[-2].weight)  # type: ignore[arg-type]
+        nn.init.zeros_(layers[-2].bias)  # type: ignore[arg-type]
+
+    def forward(self, images: Tensor) -> Tensor:
+        return images[:, :1] + self.layers(images)
+
+
+def draw(stacks: StackDataset, workers: int, callback: Callback) -> dict[str, Tensor]:
+    """All stacks, one after another along the first axis."""
+    items = []
+    for item in DataLoader(stacks, batch_size=None, num_workers=workers):
+        items.append(item)
+        callback(Record("stacks", len(items), len(stacks), {"photons": float(item["n_photons"])}))
+    return {name: torch.stack([item[name] for item in items]) for name in items[0]}
+
+
+def linear_restorations(data: dict[str, Tensor], n_train: int, cutoff: float) -> tuple[Tensor, Tensor]:
+    """Inputs (B, 2, H, W), multi-frame Wiener estimate and mean frame, and targets (B, 1, H, W), of mean 1 each.
+
+    Of the PSFs what fell outside the field is missing; the object's power spectrum is the mean of the training objects.
+    """
+    photons = data["n_photons"][:, None, None]
+    pixels = math.prod(data["object"].shape[-2:])
+    unit = photons / pixels
+    truth = data["object"] / unit
+    power = (torch.fft.fft2(truth[:n_train]).abs() ** 2).mean(0)
+    otfs = torch.fft.fft2(torch.fft.ifftshift(data["psfs"], dim=(-2, -1)))
+    noise = (photons + pixels * READOUT_NOISE**2) / unit**2
+    frames = data["frames"] / unit[:, None]
+    stacks = zip(frames, otfs, noise, strict=True)
+    linear = torch.stack([multiframe_wiener(stack, transfer, power, level) for stack, transfer, level in stacks])
+    return torch.stack([linear, frames.mean(1)], dim=1), lowpass(truth, cutoff)[:, None]
+
+
+def turned(images: Tensor, targets: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """The same pairs turned by a random multiple of 90 degrees, and perhaps mirrored: eight times the stacks."""
+    quarter, mirror = (int(torch.randint(n, (), generator=generator)) for n in (4, 2))
+    both = torch.rot90(torch.cat([images, targets], dim=1), quarter, dims=(-2, -1))
+    both = both.flip(-1) if mirror else both
+    return both[:, :-1], both[:, -1:]
+
+
+def relative_error(estimate: Tensor, target: Tensor) -> Tensor:
+    """Mean over the batch of the squared error, as a share of the target's power."""
+    return (((estimate - target) ** 2).sum((1, 2, 3)) / (target**2).sum((1, 2, 3))).mean()
+
+
+def train(
+    network: Restorer,
+    training: tuple[Tensor, Tensor],
+    held_out: tuple[Tensor, Tensor],
+    config: Config,
+    callback: Callback,
+) -> None:
+    """Minimise the relative error by Adam; the one-cycle schedule ends at a vanishing learning rate."""
+    generator = torch.Generator().manual_seed(config.seed)
+    per_epoch = math.ceil(len(training[0]) / config.batch_size)
+    n_steps = config.epochs * per_epoch
+    optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, config.learning_rate, total_steps=n_steps)
+    for step in range(1, n_steps + 1):
+        if step % per_epoch == 1 or per_epoch == 1:
+            order = torch.randperm(len(training[0]), generator=generator).split(config.batch_size)
+        chosen = order[(step - 1) % per_epoch]
+        images, targets = turned(training[0][chosen], training[1][chosen], generator)
+        loss = relative_error(network(images), targets)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+        scalars, arrays = {"loss": loss.item()}, {}
+        if step % per_epoch == 0:
+            with torch.no_grad():
+                restored = network(held_out[0])
+            scalars["held_out_loss"] = relative_error(restored, held_out[1]).item()
+            arrays = {"linear": held_out[0][0, 0], "restored": restored[0, 0], "truth": held_out[1][0, 0]}
+        callback(Record("training", step, n_steps, scalars, arrays))
+
+
+def scores(images: Tensor, targets: Tensor, cutoff: float) -> list[float]:
+    """The library's score of each image (B, H, W)."""
+    return [score(image, target[0], cutoff) for image, target in zip(images, targets, strict=True)]
+
+
+def compare(
+    restored: Tensor, held_out: tuple[Tensor, Tensor], cutoff: float, log: Callable[[str, float], None]
+) -> dict[str, float]:
+    """Mean scores on the held-out stacks, and on how many of them the network beats its input."""
+    images = {"mean frame": held_out[0][:, 1], "Wiener": held_out[0][:, 0], "network": restored}
+    each = {name: scores(values, held_out[1], cutoff) for name, values in images.items()}
+    table = {name: sum(values) / len(values) for name, values in each.items()}
+    better = sum(a < b for a, b in zip(each["network"], each["Wiener"], strict=True))
+    for name, value in table.items():
+        log(f"comparison/{name.replace(' ', '_')}_score", value)
+    log("comparison/improved", better / len(restored))
+    print(*(f"{name:12s} {value:.4f}" for name, value in table.items()), sep="\n")
+    print(f"The network is better than its input on {better} of {len(restored)} stacks it was not trained on.")
+    return table | {"improved": better / len(restored)}
+
+
+def with_smoke(config: Config) -> Config:
+    """The config that runs: `smoke` replaces what takes time."""
+    if not config.smoke:
+        return config
+    return replace(config, n_pixels=32, n_frames=2, n_train=24, n_held_out=4, channels=8, depth=4, epochs=40, workers=0)
+
+
+def run(config: Config, logger: RunLogger, callback: Callback) -> dict[str, float]:
+    """Draw, train, score; returns the table."""
+    grid = Grid.nyquist(DIAMETER, WAVELENGTH, config.n_pixels)
+    mask = SparseAperture.from_catalog(config.mask, DIAMETER, config.fill_factor)
+    cutoff = grid.cutoff(DIAMETER)
+    count = config.n_train + config.n_held_out
+    stacks = StackDataset(
+        mask, grid, count, config.n_frames, config.ranges, readout_noise=READOUT_NOISE, seed=config.seed
+    )
+    data = draw(stacks, config.workers, callback)
+    images, targets = linear_restorations(data, config.n_train, cutoff)
+    training = images[: config.n_train], targets[: config.n_train]
+    held_out = images[config.n_train :], targets[config.n_train :]
+    torch.manual_seed(config.seed)
+    network = Restorer(config.channels, config.depth)
+    train(network, training, held_out, config, callback)
+    with torch.no_grad():
+        restored = network(held_out[0])[:, 0]
+    with atomic_write(logger.directory / "network.pt") as file:
+        torch.save(network.state_dict(), file)
+    exposure, truth = data["frames"][config.n_train, 0], data["object"][config.n_train]
+    pictures = {"Wiener": (exposure, held_out[0][0, 0]), "network": (exposure, restored[0])}
+    logger.figure("comparison", viz.comparison_figure(truth, pictures, cutoff, grid.pixel_scale))
+    table = compare(restored, held_out, cutoff, logger.scalar)
+    write_json(logger.directory / "scores.json", table)
+    return table
+
+
+def main(config: Config) -> int:
+    """Run in a new folder; an interrupted run leaves there what it reached."""
+    directory = config.runs / (config.name or datetime.now().strftime("train_restorer-%Y%m%d-%H%M%S"))
+    config = with_smoke(config)
+    try:
+        with RunLogger(directory, seed=config.seed) as logger, Progress() as progress:
+            logger.log_config(config)
+            run(config, logger, fan_out(logger, progress))
+    except KeyboardInterrupt:
+        print(f"\ninterrupted: what was reached is in {directory}", file=sys.stderr)
+        return 130
+    except ValueError as error:
+        print(f"train_restorer: {error}", file=sys.stderr)
+        return 2
+    print(f"written to {directory}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Config, description=__doc__)))
