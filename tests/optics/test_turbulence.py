@@ -224,6 +224,17 @@ def test_a_population_sees_the_same_screens():
     torch.testing.assert_close(phase[:, 0, 1], phase[:, 1, 0])
 
 
+def test_holes_that_train_see_the_phase_of_holes_that_rest():
+    """Without a gradient of its own, and without a warning (warnings are errors here)."""
+    grid = Grid.nyquist(1.2, WAVELENGTH, 32)
+    centers = torch.tensor([[0.0, 0.3], [0.2, -0.2]], dtype=torch.float64)
+    resting, training = (SparseAperture(c, 0.3, 1.2).samples(grid) for c in (centers, torch.nn.Parameter(centers)))
+    phase = TurbulencePhase(0.2, 20.0)(training, 2, seeded())
+    assert training.weights.requires_grad
+    assert not phase.requires_grad
+    assert torch.equal(phase, TurbulencePhase(0.2, 20.0)(resting, 2, seeded()))
+
+
 # ---- bad input
 
 

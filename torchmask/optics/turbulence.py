@@ -185,9 +185,10 @@ def _window(samples: PupilSamples) -> tuple[Tensor, tuple[int, int]]:
     """The smallest rectangle around a pupil that may lie across the raster's border: places in it, and its shape."""
     coordinates, shape = [], []
     places = (samples.index // samples.raster[1], samples.index % samples.raster[1])
+    weights = samples.weights.detach()  # holes may train: where they lie decides which samples to take, not more
     for place, size in zip(places, samples.raster, strict=True):
         angle = 2 * math.pi / size * place  # the middle of a pupil that spans at most half the raster is a mean angle
-        middle = torch.atan2((samples.weights * angle.sin()).sum(), (samples.weights * angle.cos()).sum())
+        middle = torch.atan2((weights * angle.sin()).sum(), (weights * angle.cos()).sum())
         local = (place - round(float(middle) * size / (2 * math.pi)) + size // 2) % size
         coordinates.append(local - local.min())
         shape.append(int(coordinates[-1].max()) + 1)
