@@ -73,6 +73,10 @@ class Options(MaskOptions, FITSOptions, RunOptions):
     """Of the turbulence [m]; None: as a simulated stack says, or else 20 mask diameters."""
     n_modes: int | None = None
     """Zernike modes per hole, Noll 1 (piston) to this; None: 6, or 231 for a full pupil."""
+    wavelengths: tuple[float, ...] = ()
+    """A broad band as a few wavelengths [m]; none: --wavelength alone."""
+    weights: tuple[float, ...] = ()
+    """Share of the light of each of them, any positive numbers; none: equal."""
     static_modes: int = 0
     """Zernike modes per hole of aberrations that all frames share, such as those of the telescope."""
     prior: bool = True
@@ -95,6 +99,8 @@ def run(options: Options) -> None:
         r0=observation.r0 if options.r0 is None else options.r0,
         outer_scale=observation.outer_scale if options.outer_scale is None else options.outer_scale,
         readout_noise=observation.readout_noise,
+        wavelengths=options.wavelengths or None,
+        weights=options.weights or None,
         static_modes=options.static_modes,
         tv_weight=options.tv_weight,
         aberration_prior=options.prior,
@@ -117,14 +123,7 @@ def load_observation(options: Options) -> Observation:
     if not stack:
         raise ValueError("there is no stack to restore: give an .npz file or FITS files")
     if stack[0].suffix.lower() != ".npz":
-        return Observation.from_fits(
-            stack,
-            load_aperture(options),
-            wavelength=options.wavelength,
-            pixel_scale=None if options.pixel_scale_arcsec is None else options.pixel_scale_arcsec * ARCSEC,
-            readout_noise=options.readout_noise,
-            **{item.name: getattr(options, item.name) for item in dataclasses.fields(FITSOptions)},
-        )
+        return _from_fits(stack, options)
     if len(stack) > 1:
         raise ValueError(f"{len(stack)} stacks are given: of .npz files one is restored at a time")
     for item in dataclasses.fields(FITSOptions):
@@ -142,6 +141,21 @@ def load_observation(options: Options) -> Observation:
     if options.readout_noise is not None:
         changes["readout_noise"] = options.readout_noise
     return dataclasses.replace(observation, **changes)
+
+
+def _from_fits(stack: list[Path], options: Options) -> Observation:
+    """Read FITS files; what their header lacks is named as the option of the command line that supplies it."""
+    aperture = load_aperture(options)
+    scale = options.pixel_scale_arcsec
+    given = {item.name: getattr(options, item.name) for item in dataclasses.fields(FITSOptions)}
+    given |= {"wavelength": options.wavelength, "readout_noise": options.readout_noise}
+    try:
+        return Observation.from_fits(stack, aperture, pixel_scale=None if scale is None else scale * ARCSEC, **given)
+    except ValueError as error:
+        message = str(error).replace("give pixel_scale [rad]", "give --pixel-scale-arcsec [arcsec]")
+        for name in given:
+            message = message.replace(f"give {name}", f"give --{name.replace('_', '-')}")
+        raise ValueError(message) from error
 
 
 def metrics(observation: Observation, result: RestorationResult) -> dict[str, Any]:

@@ -99,9 +99,8 @@ def _view_fits(path: Path) -> View:
         return _view_mask(path)
     images = read_fits(path)
     count, rows, columns = images.values.shape
-    lines = [
-        f"{count} image{'s' if count > 1 else ''} of {rows} x {columns} pixels, {100 * images.valid.mean():.4g} % of them valid"
-    ]
+    what = "image" if count == 1 else f"{count} images"
+    lines = [f"{what} of {rows} x {columns} pixels, {100 * images.valid.mean():.4g} % of them valid"]
     keys = ("OBJECT", "TELESCOP", "INSTRUME", "FILTER", "WAVELEN", "PIXELSCL", "BUNIT", "CHISQ", "NOISE")
     lines += [f"{key} = {images.header[key]}" for key in keys if key in images.header]
     lines += [f"HISTORY {line}" for line in images.header.get("HISTORY", [])]
