@@ -28,7 +28,7 @@ _CELESTIAL = re.compile(
     r"|LONPOLE|LATPOLE|RADESYS|EQUINOX|[AB]P?_(ORDER|DMAX|\d+_\d+)"
 )
 _ABOUT = ("OBJECT", "TARGNAME", "TARG_RA", "TARG_DEC", "RA", "DEC", "TELESCOP", "INSTRUME", "FILTER", "DATE-OBS")
-_ABOUT += ("TIME-OBS", "MJD-OBS", "MJD-AVG", "OBSERVER")
+_ABOUT += ("TIME-OBS", "MJD-OBS", "MJD-AVG", "OBSERVER", "XPOSURE", "EXPTIME")
 
 
 def missing(path: Any, keywords: str, option: str) -> ValueError:

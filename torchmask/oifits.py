@@ -1,0 +1,247 @@
+"""Visibilities and closure phases as an OIFITS file, which interferometry's own programs read.
+
+The second version of the standard (Duvert, Young & Hummel 2017, A&A 597, A8), one row of OI_ARRAY per hole.
+"""
+
+from __future__ import annotations
+
+import datetime
+import math
+from collections.abc import Mapping
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from torchmask.data.keywords import FILTERS
+from torchmask.data.visibilities import Observables
+from torchmask.io import as_array, atomic_write
+from torchmask.simulation.observation import Observation
+
+_ARRAY = "MASK"
+_ARCSEC = 180 * 3600 / math.pi
+
+
+def save_oifits(
+    path: str | Path, observables: Observables, observation: Observation, bandwidth: float | None = None
+) -> None:
+    """Write OI_TARGET, OI_ARRAY, OI_WAVELENGTH, OI_VIS, OI_VIS2 and OI_T3 to a new OIFITS file.
+
+    Parameters
+    ----------
+    path : str or Path
+        Ends in .fits or .oifits. The file appears whole or not at all, and never replaces another.
+    observables : Observables
+        From `frame_observables` or `restored_observables`.
+    observation : Observation
+        That they come from. Its header tells target, telescope, date and orientation; without sky coordinates u runs
+        along the columns and v along the rows of the image, and a COMMENT says so.
+    bandwidth : float, optional
+        Width of the band [m], EFF_BAND. None: that of the header's FILTER, if it is known.
+
+    Raises
+    ------
+    ValueError
+        If the band's width is neither given nor known, the observables belong to another mask, or the file exists,
+        its folder does not, or its name is wrong.
+
+    Notes
+    -----
+    Signs as in `torchmask.data.visibilities`. STA_INDEX counts holes from 1, in the order of `aperture.centers`;
+    U1COORD, V1COORD belong to the first pair of a triangle (i, j), U2COORD, V2COORD to the second (j, k). STAXYZ are
+    the holes' places in the pupil, towards east and north, FRAME = 'SKY'. What is not finite is flagged.
+    """
+    from astropy.io import fits
+
+    path = Path(path)
+    if path.suffix not in (".fits", ".oifits"):
+        raise ValueError(f"{path} ends neither in .fits nor in .oifits")
+    n = observation.aperture.n_subapertures
+    if len(observables.stations) != n:
+        raise ValueError(f"the observables are of {len(observables.stations)} holes and the observation's mask has {n}")
+    header = observation.header
+    if bandwidth is None:
+        name = (str(header.get("INSTRUME", "")).strip().upper(), str(header.get("FILTER", "")).strip().upper())
+        if name not in FILTERS:
+            raise ValueError("the width of the band is not known (no FILTER that is): give bandwidth [m]")
+        bandwidth = FILTERS[name][1]
+    if not (math.isfinite(bandwidth) and bandwidth > 0):
+        raise ValueError(f"bandwidth is {bandwidth}: it must be finite and positive, in m")
+
+    date, mjd = _date(header)
+    common = {"DATE-OBS": date[:10], "ARRNAME": _ARRAY, "INSNAME": _text(header, "INSTRUME")}
+    seconds = float(header.get("XPOSURE", header.get("EXPTIME", 0.0))) * len(observation.frames)
+    hdus = fits.HDUList([_primary(header, date)])
+    hdus.append(_target(header))
+    hdus.append(_array(observables, observation))
+    wave = {"EFF_WAVE": ("1E", "m", [observation.grid.wavelength]), "EFF_BAND": ("1E", "m", [bandwidth])}
+    hdus.append(_table("OI_WAVELENGTH", {"INSNAME": common["INSNAME"]}, wave))
+    for table in _measurements(observables, common, mjd, seconds):
+        hdus.append(table)
+    content = BytesIO()  # astropy does not know the mode that atomic_write opens files in
+    hdus.writeto(content, checksum=True)
+    with atomic_write(path) as file:
+        file.write(content.getvalue())
+
+
+def _measurements(observables: Observables, common: Mapping[str, str], mjd: float, seconds: float) -> list[Any]:
+    """OI_VIS, OI_VIS2 and, for three holes or more, OI_T3."""
+    values, errors = observables.visibilities, observables.visibility_errors
+    u, v = observables.baselines.T
+    uv = {"UCOORD": ("1D", "m", u), "VCOORD": ("1D", "m", v)}
+    pairs, triangles = observables.pairs, observables.triangles
+    vis = {
+        "VISAMP": ("1D", None, values.abs()),
+        "VISAMPERR": ("1D", None, errors),
+        "VISPHI": ("1D", "deg", values.angle().rad2deg()),
+        "VISPHIERR": ("1D", "deg", (errors / values.abs()).rad2deg()),
+    }
+    vis2 = {"VIS2DATA": ("1D", None, observables.squared), "VIS2ERR": ("1D", None, observables.squared_errors)}
+    absolute = {"AMPTYP": "absolute", "PHITYP": "absolute"}
+    tables = [
+        _table("OI_VIS", {**common, **absolute}, _rows(vis, uv, pairs, mjd, seconds)),
+        _table("OI_VIS2", common, _rows(vis2, uv, pairs, mjd, seconds)),
+    ]
+    if len(triangles):
+        i, j, k = (observables.stations[triangles[:, side]] for side in range(3))
+        sides = {"U1COORD": (j - i)[:, 0], "V1COORD": (j - i)[:, 1], "U2COORD": (k - j)[:, 0], "V2COORD": (k - j)[:, 1]}
+        t3 = {
+            "T3AMP": ("1D", None, observables.triple_amplitudes),
+            "T3AMPERR": ("1D", None, observables.triple_errors),
+            "T3PHI": ("1D", "deg", observables.closure_phases.rad2deg()),
+            "T3PHIERR": ("1D", "deg", observables.closure_errors.rad2deg()),
+        }
+        places = {name: ("1D", "m", side) for name, side in sides.items()}
+        tables.append(_table("OI_T3", common, _rows(t3, places, triangles, mjd, seconds)))
+    return tables
+
+
+def _rows(
+    measured: dict[str, Any], places: dict[str, Any], holes: Tensor, mjd: float, seconds: float
+) -> dict[str, Any]:
+    """The columns that all tables of measurements share, around their own."""
+    n = len(holes)
+    bad = ~np.all([np.isfinite(as_array(values)) for _, _, values in measured.values()], axis=0)
+    return {
+        "TARGET_ID": ("1I", None, np.ones(n, dtype=np.int16)),
+        "TIME": ("1D", "s", np.zeros(n)),
+        "MJD": ("1D", "day", np.full(n, mjd)),
+        "INT_TIME": ("1D", "s", np.full(n, seconds)),
+        **measured,
+        **places,
+        "STA_INDEX": (f"{holes.shape[1]}I", None, as_array(holes).astype(np.int16) + 1),
+        "FLAG": ("1L", None, bad),
+    }
+
+
+def _table(name: str, cards: Mapping[str, Any], columns: Mapping[str, tuple[str, str | None, Any]]) -> Any:
+    """A binary table from {column: (format, unit, values)}, of the second revision."""
+    from astropy.io import fits
+
+    table = fits.BinTableHDU.from_columns(
+        [
+            fits.Column(name=column, format=code, unit=unit, array=as_array(values))
+            for column, (code, unit, values) in columns.items()
+        ],
+        name=name,
+    )
+    for card, value in {"OI_REVN": 2, **cards}.items():
+        table.header[card] = value
+    return table
+
+
+def _primary(header: Mapping[str, Any], date: str) -> Any:
+    from astropy.io import fits
+
+    hdu = fits.PrimaryHDU()
+    cards = {
+        "ORIGIN": "torchmask",
+        "DATE": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%S"),
+        "DATE-OBS": date,
+        "CONTENT": "OIFITS2",
+        "TELESCOP": _text(header, "TELESCOP"),
+        "INSTRUME": _text(header, "INSTRUME"),
+        "OBSERVER": _text(header, "OBSERVER"),
+        "OBJECT": _target_name(header),
+        "INSMODE": "NRM",
+        "PROCSOFT": "torchmask",
+        "FILT": _text(header, "FILTER"),
+    }
+    for name, value in cards.items():
+        hdu.header[name] = value
+    if "CTYPE1" not in header:
+        hdu.header.add_comment("no sky coordinates are known: u runs along the columns of the image, v along its rows")
+    if not any(name in header for name in ("MJD-AVG", "MJD-OBS", "DATE-OBS")):
+        hdu.header.add_comment("the date is not known")
+    return hdu
+
+
+def _target(header: Mapping[str, Any]) -> Any:
+    sky = str(header.get("CTYPE1", "")).startswith("RA")
+    place = []
+    for names in (("TARG_RA", "RA", "CRVAL1" if sky else ""), ("TARG_DEC", "DEC", "CRVAL2" if sky else "")):
+        numbers = [header[name] for name in names if isinstance(header.get(name), int | float)]
+        place.append(float(numbers[0]) if numbers else 0.0)
+    numbers = {"RAEP0": place[0], "DECEP0": place[1]}
+    zero = dict.fromkeys(("RA_ERR", "DEC_ERR"), 0.0)
+    motion = dict.fromkeys(("PMRA", "PMDEC", "PMRA_ERR", "PMDEC_ERR"), 0.0)
+    columns = {"TARGET_ID": ("1I", None, [1]), "TARGET": ("32A", None, [_target_name(header)])}
+    columns |= {name: ("1D", "deg", [value]) for name, value in numbers.items()}
+    columns["EQUINOX"] = ("1E", "yr", [2000.0])
+    columns |= {name: ("1D", "deg", [value]) for name, value in zero.items()}
+    columns["SYSVEL"] = ("1D", "m/s", [0.0])
+    columns |= {name: ("8A", None, ["UNKNOWN"]) for name in ("VELTYP", "VELDEF")}
+    columns |= {name: ("1D", "deg/yr", [value]) for name, value in motion.items()}
+    columns |= {name: ("1E", "deg", [0.0]) for name in ("PARALLAX", "PARA_ERR")}
+    columns["SPECTYP"] = ("32A", None, ["UNKNOWN"])
+    columns["CATEGORY"] = ("3A", None, ["SCI"])
+    return _table("OI_TARGET", {}, columns)
+
+
+def _array(observables: Observables, observation: Observation) -> Any:
+    """One row per hole; the field of view is the width of a hole's diffraction pattern."""
+    n, aperture = len(observables.stations), observation.aperture
+    names = [f"H{index + 1}" for index in range(n)]
+    places = np.concatenate([as_array(observables.stations), np.zeros((n, 1))], axis=1)
+    field = observation.grid.wavelength / aperture.subaperture_diameter * _ARCSEC
+    columns = {
+        "TEL_NAME": ("16A", None, names),
+        "STA_NAME": ("16A", None, names),
+        "STA_INDEX": ("1I", None, np.arange(1, n + 1, dtype=np.int16)),
+        "DIAMETER": ("1E", "m", np.full(n, aperture.subaperture_diameter)),
+        "STAXYZ": ("3D", "m", places),
+        "FOV": ("1D", "arcsec", np.full(n, field)),
+        "FOVTYPE": ("6A", None, ["FWHM"] * n),
+    }
+    return _table("OI_ARRAY", {"ARRNAME": _ARRAY, "FRAME": "SKY", "ARRAYX": 0.0, "ARRAYY": 0.0, "ARRAYZ": 0.0}, columns)
+
+
+def _target_name(header: Mapping[str, Any]) -> str:
+    return str(header.get("TARGNAME", header.get("OBJECT", "UNKNOWN")))[:32]
+
+
+def _text(header: Mapping[str, Any], name: str) -> str:
+    return str(header.get(name, "UNKNOWN")).strip() or "UNKNOWN"
+
+
+def _date(header: Mapping[str, Any]) -> tuple[str, float]:
+    """Date and time (ISO) and MJD of the observation: MJD-AVG, MJD-OBS or DATE-OBS; MJD 0 where nothing is known."""
+    from astropy.time import Time
+
+    time: Any = None
+    for name in ("MJD-AVG", "MJD-OBS"):
+        if time is None and isinstance(header.get(name), int | float):
+            time = Time(header[name], format="mjd")
+    if time is None and "DATE-OBS" not in header:
+        time = Time(0.0, format="mjd")
+    if time is None:
+        text = str(header["DATE-OBS"])
+        if "T" not in text and "TIME-OBS" in header:
+            text = f"{text}T{header['TIME-OBS']}"
+        try:
+            time = Time(text)
+        except ValueError as error:
+            raise ValueError(f"DATE-OBS is {text!r}, which is no date") from error
+    return time.isot[:19], float(time.mjd)
