@@ -37,16 +37,41 @@ def image_formation(scene: Tensor, psfs: Tensor) -> Tensor:
     >>> image_formation(scene, psf).round().nonzero().tolist()  # the second half has left the field
     [[3, 3]]
     """
+    raster, (height, width) = _wide_raster(psfs, scene), scene.shape[-2:]
+    spectrum = torch.fft.rfft2(scene, s=raster) * torch.fft.rfft2(psfs)
+    return torch.fft.irfft2(spectrum, s=raster)[..., :height, :width]
+
+
+def image_formation_adjoint(frames: Tensor, psfs: Tensor) -> Tensor:
+    """The adjoint of `image_formation` in the scene: <image_formation(o, h), y> = <o, image_formation_adjoint(y, h)>.
+
+    `frames` (..., H, W) are correlated with the same `psfs` (..., rows, columns). An axis along which a scene was
+    broadcast, such as that of the frames, is left for the caller to sum. Differentiable in both; raises ValueError
+    likewise.
+
+    Examples
+    --------
+    >>> psfs = torch.rand(3, 8, 8); scene = torch.rand(4, 4); frames = torch.rand(3, 4, 4)
+    >>> there = (image_formation(scene, psfs) * frames).sum()
+    >>> back = (scene * image_formation_adjoint(frames, psfs).sum(0)).sum()
+    >>> torch.allclose(there, back)
+    True
+    """
+    raster, (height, width) = _wide_raster(psfs, frames), frames.shape[-2:]
+    spectrum = torch.fft.rfft2(frames, s=raster) * torch.fft.rfft2(psfs).conj()
+    return torch.fft.irfft2(spectrum, s=raster)[..., :height, :width]
+
+
+def _wide_raster(psfs: Tensor, image: Tensor) -> tuple[int, int]:
+    """Rows and columns of the PSFs: so wide that what wraps around falls outside the image."""
     rows, columns = psfs.shape[-2:]
-    height, width = scene.shape[-2:]
+    height, width = image.shape[-2:]
     if rows < 2 * height - 1 or columns < 2 * width - 1:
         raise ValueError(
             f"PSFs of {rows} x {columns} pixels are too small for a scene of {height} x {width}: at least "
             f"{2 * height - 1} x {2 * width - 1} are needed, unfolded (sample the pupil with more oversampling)"
         )
-    # On a raster this wide what wraps around falls outside the crop.
-    spectrum = torch.fft.rfft2(scene, s=(rows, columns)) * torch.fft.rfft2(psfs)
-    return torch.fft.irfft2(spectrum, s=(rows, columns))[..., :height, :width]
+    return rows, columns
 
 
 class Detector(nn.Module):

@@ -1,0 +1,111 @@
+"""torchmask's exposures as a physics of deepinv, so that its priors, optimisers and samplers run on them.
+
+Needs the extra `deepinv`; nothing else in torchmask imports this module.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from deepinv.physics import LinearPhysics, PoissonGaussianNoise
+from torch import Tensor
+
+from torchmask.optics.detector import image_formation, image_formation_adjoint
+from torchmask.simulation.observation import Observation
+
+
+class StackPhysics(LinearPhysics):
+    """A stack of short exposures with known point-spread functions: y = noise(A x), A x = the T blurred images.
+
+    Parameters
+    ----------
+    psfs : (T, rows, columns) or (B, T, rows, columns) tensor
+        Unfolded, with their origin at [0, 0] (FFT order), at least 2 H - 1 by 2 W - 1 for images of H x W: what
+        `psf_from_samples` gives for a field twice as wide. A buffer; its dtype and device are those of the images.
+    unit : float
+        Electrons per pixel that count as 1, in images and frames: deepinv's denoisers expect images up to about 1.
+    readout_noise : float
+        Electrons rms per pixel and frame.
+    generator : torch.Generator, optional
+        Of the noise.
+
+    Raises
+    ------
+    ValueError
+        If `psfs` has neither 3 nor 4 axes, `unit` is not finite and positive, `readout_noise` is negative or not
+        finite, or an image or a stack does not have the axes below.
+
+    Notes
+    -----
+    Images are (B, 1, H, W), frames (B, T, H, W): the exposures stand where deepinv has channels. The convolution is
+    linear, as in `image_formation`: light that leaves the field is lost. For non-negative PSFs of unit sum the norm of
+    A is at most sqrt(T). The noise is `PoissonGaussianNoise(gain=1 / unit, sigma=readout_noise / unit)`; negative
+    rounding errors of the FFTs are clipped.
+
+    Examples
+    --------
+    >>> observation = Observation.load("stack.npz")  # doctest: +SKIP
+    >>> physics, frames = StackPhysics.from_observation(observation)  # doctest: +SKIP
+    >>> restored = deepinv.optim.FISTA(  # doctest: +SKIP
+    ...     deepinv.optim.L2(), deepinv.optim.TVPrior(), lambda_reg=1e-3, stepsize=1 / len(observation.frames)
+    ... )(frames, physics)
+    """
+
+    psfs: Tensor
+
+    def __init__(
+        self,
+        psfs: Tensor,
+        unit: float = 1.0,
+        readout_noise: float = 0.0,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        if psfs.ndim not in (3, 4):
+            raise ValueError(f"psfs has shape {tuple(psfs.shape)}: it must be (T, rows, columns), or that for a batch")
+        if not (math.isfinite(unit) and unit > 0):
+            raise ValueError(f"unit is {unit}: it must be finite and positive, in electrons per pixel")
+        if not (math.isfinite(readout_noise) and readout_noise >= 0):
+            raise ValueError(f"readout_noise is {readout_noise}: it must be finite and not negative, in electrons rms")
+        noise = PoissonGaussianNoise(1 / unit, readout_noise / unit, clip_positive=True, rng=generator)
+        super().__init__(noise_model=noise.to(psfs.dtype), device=psfs.device)  # type: ignore[arg-type]
+        self.unit = float(unit)
+        self.register_buffer("psfs", psfs)
+
+    @classmethod
+    def from_observation(
+        cls, observation: Observation, unit: float | None = None, generator: torch.Generator | None = None
+    ) -> tuple[StackPhysics, Tensor]:
+        """The physics of a simulated observation with its true PSFs, and its frames (1, T, H, W) in `unit`.
+
+        Light beyond the stored PSFs is taken for lost, and read-out noise that nobody knows for none. `unit` is by
+        default the 99.9th percentile of the mean frame, which a restored object exceeds a few times over. Raises
+        ValueError if the observation knows no PSFs.
+        """
+        if observation.psfs is None:
+            raise ValueError("the observation holds no psfs: make a StackPhysics of restored or calibrated ones")
+        height, width = observation.grid.shape
+        psfs = observation.frames.new_zeros(len(observation.frames), 2 * height, 2 * width)
+        psfs[..., :height, :width] = observation.psfs
+        psfs = psfs.roll((-(height // 2), -(width // 2)), dims=(-2, -1))
+        if unit is None:
+            unit = float(torch.quantile(observation.frames.mean(0), 0.999))
+        physics = cls(psfs, unit, observation.readout_noise or 0.0, generator)
+        return physics, physics.measured(observation.frames)
+
+    def measured(self, frames: Tensor) -> Tensor:
+        """Frames (T, H, W) or (B, T, H, W) [electrons] as this physics measures them, (B, T, H, W)."""
+        return (frames if frames.ndim == 4 else frames[None]).to(self.psfs) / self.unit
+
+    def A(self, x: Tensor, **kwargs: object) -> Tensor:
+        """The expected frames (B, T, H, W) of images (B, 1, H, W)."""
+        if x.ndim != 4 or x.shape[1] != 1:
+            raise ValueError(f"the image has shape {tuple(x.shape)}: it must be (batch, 1, rows, columns)")
+        return image_formation(x, self.psfs)
+
+    def A_adjoint(self, y: Tensor, **kwargs: object) -> Tensor:
+        """The adjoint of `A`: images (B, 1, H, W) of frames (B, T, H, W)."""
+        n_frames = self.psfs.shape[-3]
+        if y.ndim != 4 or y.shape[1] != n_frames:
+            raise ValueError(f"the stack has shape {tuple(y.shape)}: it must be (batch, {n_frames}, rows, columns)")
+        return image_formation_adjoint(y, self.psfs).sum(1, keepdim=True)
