@@ -16,11 +16,11 @@ export OMP_NUM_THREADS ?= 1
 	$(BIN)/pip install --quiet -c constraints.txt -e '.[test]'
 	touch $@ .venv/.experiments
 
-.PHONY: demo test quick lint clean
+.PHONY: demo test quick lint docs notebooks dist clean
 demo: .venv/.experiments
 	OMP_NUM_THREADS=2 $(BIN)/python experiments/codesign.py
 
-test: lint
+test: lint docs
 	$(BIN)/pytest -n 2
 
 quick: .venv/.test
@@ -31,5 +31,16 @@ lint: .venv/.test
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 
+docs: .venv/.test
+	$(BIN)/sphinx-build -W --keep-going -q -b html docs docs/_build/html
+
+# Executes the notebooks whole, each in less than two minutes on two cores, and keeps their outputs.
+notebooks: .venv/.test
+	OMP_NUM_THREADS=2 $(BIN)/python notebooks/execute.py
+
+# An sdist and a wheel, in dist/.
+dist: .venv/.test
+	$(BIN)/python -m build --no-isolation
+
 clean:
-	rm -rf .venv build dist *.egg-info
+	rm -rf .venv build dist *.egg-info docs/_build

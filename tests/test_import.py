@@ -17,6 +17,11 @@ HEAVY = (
     "rich",
     "joblib",
     "ezdxf",
+    "deepinv",
+    "torchvision",
+    "ray",
+    "yaml",
+    "sphinx",
 )
 
 

@@ -1,0 +1,116 @@
+"""What is published: an sdist and a wheel that hold all that is needed, and import quickly where nothing else is."""
+
+import json
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tarfile
+import tomllib
+import zipfile
+from email.parser import Parser
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+EXTRAS = PROJECT["optional-dependencies"]
+
+
+def run(*command, **options):
+    done = subprocess.run([str(part) for part in command], capture_output=True, text=True, check=False, **options)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def name_of(requirement):
+    return requirement.split("[")[0].split("=")[0].strip("<>~! ").lower()
+
+
+def test_all_is_every_extra():
+    (everything,) = EXTRAS["all"]
+    assert sorted(everything.removeprefix("torchmask[").removesuffix("]").split(",")) == sorted(set(EXTRAS) - {"all"})
+
+
+@pytest.fixture(scope="module")
+def dist(tmp_path_factory):
+    """Both built from a copy, because setuptools writes beside what it builds; the wheel from the sdist."""
+    folder = tmp_path_factory.mktemp("source")
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, folder)
+    shutil.copytree(ROOT / "torchmask", folder / "torchmask", ignore=shutil.ignore_patterns("__pycache__"))
+    run(sys.executable, "-m", "build", "--no-isolation", folder)
+    return folder / "dist"
+
+
+@pytest.fixture(scope="module")
+def wheel(dist):
+    (path,) = dist.glob("*.whl")
+    return path
+
+
+@pytest.mark.slow
+def test_the_wheel_holds_the_package_and_nothing_else(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        names = archive.namelist()
+        information = next(name for name in names if name.endswith("METADATA")).removesuffix("METADATA")
+        described = Parser().parsestr(archive.read(information + "METADATA").decode())
+        entries = archive.read(information + "entry_points.txt").decode()
+    inside = {name for name in names if not name.startswith(information)}
+    source = ROOT / "torchmask"
+    wanted = {f"torchmask/{path.relative_to(source).as_posix()}" for path in source.rglob("*.py")}
+    assert inside == wanted | {"torchmask/py.typed", "torchmask/optics/masks.json"}
+    assert information + "licenses/LICENSE" in names
+    assert entries.split() == ["[console_scripts]", "torchmask", "=", PROJECT["scripts"]["torchmask"]]
+    assert set(described.get_all("Provides-Extra")) == set(EXTRAS)
+    plain = {name_of(line) for line in described.get_all("Requires-Dist") if "extra ==" not in line}
+    assert plain == {"torch", "numpy", "scipy"}
+
+
+@pytest.mark.slow
+def test_the_sdist_holds_what_builds_the_wheel(dist):
+    (path,) = dist.glob("*.tar.gz")
+    with tarfile.open(path) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    assert {"pyproject.toml", "README.md", "LICENSE", "torchmask/py.typed", "torchmask/optics/masks.json"} <= names
+
+
+@pytest.fixture(scope="module")
+def installed(wheel, tmp_path_factory):
+    """The wheel without its dependencies, in an environment that sees those of this one, but not this torchmask."""
+    folder = tmp_path_factory.mktemp("environment")
+    run(sys.executable, "-m", "venv", "--without-pip", folder)
+    python = folder / "bin" / "python"
+    run(sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--no-deps", "--no-index", wheel)
+    (site,) = folder.glob("lib/python*/site-packages")
+    (site / "dependencies.pth").write_text(sysconfig.get_path("purelib"), encoding="utf-8")
+    return python
+
+
+@pytest.mark.slow
+def test_the_installed_package_imports_quickly_and_alone(installed, tmp_path):
+    program = """
+import json, sys, time
+import torch
+before, start = set(sys.modules), time.process_time()
+import torchmask
+seconds = time.process_time() - start
+new = {name.partition(".")[0] for name in set(sys.modules) - before}
+mask = torchmask.SparseAperture.from_catalog("golay6", 1.0, 0.15)
+print(json.dumps([torchmask.__file__, seconds, sorted(new - set(sys.stdlib_module_names)), mask.n_subapertures]))
+"""
+    file, seconds, new, n_subapertures = json.loads(run(installed, "-c", program, cwd=tmp_path))
+    assert Path(file).is_relative_to(installed.parents[1])
+    assert seconds < 3
+    optional = {name_of(line) for lines in EXTRAS.values() for line in lines} - {"torchmask"}
+    providers = metadata.packages_distributions()
+    assert {dist.lower() for name in new for dist in providers.get(name, [])}.isdisjoint(optional)
+    assert {"torchmask", "scipy"} <= set(new)
+    assert n_subapertures == 6
+
+
+@pytest.mark.slow
+def test_the_installed_command_runs(installed, tmp_path):
+    assert "golay6" in run(installed.parent / "torchmask", "masks", cwd=tmp_path)
