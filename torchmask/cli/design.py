@@ -102,15 +102,15 @@ def run(options: Options) -> None:
             last[:] = [record]
 
         try:
-            callback = fan_out(output.callback, keep)
+            callback = fan_out(keep, output.callback)
             result = search(options, criterion, options.mask_diameter, options.seed, callback, rules)
         except KeyboardInterrupt:
             if last:
                 _save_interrupted(output.directory, options, last[0], rules)
             raise
         seconds = time.perf_counter() - started
-        log_design(result, criterion.grid, output.logger)
         _save_mask(output.directory, result.aperture)
+        log_design(result, criterion.grid, output.logger)
         table = metrics(result, criterion) | {"evaluations": result.evaluations, "seconds": seconds}
         write_json(output.directory / "metrics.json", table)
         output.summary.append(

@@ -12,7 +12,7 @@ from torchmask import viz
 from torchmask.design.search import SearchResult
 from torchmask.grid import Grid
 from torchmask.io import as_array
-from torchmask.optics.otf import analytic_otf
+from torchmask.optics.otf import PSF
 from torchmask.simulation.observation import Observation
 from torchmask.tracking import RunLogger
 
@@ -38,10 +38,10 @@ def log_observation(name: str, observation: Observation, logger: RunLogger) -> N
     assert observation.psfs is not None
     grid = observation.grid
     psfs = torch.fft.ifftshift(observation.psfs, dim=(-2, -1))
-    perfect = analytic_otf(observation.aperture, grid)
-    still = torch.fft.ifft2(perfect).real
+    still = PSF(observation.aperture, grid, oversampling=4)().to(psfs)
+    otfs = {"no turbulence": torch.fft.fft2(still), "exposures": torch.fft.fft2(psfs)}
     logger.figure(f"{name}/psf", viz.psf_figure({"no turbulence": still, "first exposure": psfs[0]}, grid))
-    logger.figure(f"{name}/mtf", viz.mtf_figure({"no turbulence": perfect, "exposures": torch.fft.fft2(psfs)}, grid))
+    logger.figure(f"{name}/mtf", viz.mtf_figure(otfs, grid))
     logger.figure(f"{name}/frames", viz.frames_figure(observation.frames, pixel_scale=grid.pixel_scale))
     logger.image(f"{name}/first_frame", observation.frames[0])
 

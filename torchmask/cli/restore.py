@@ -109,11 +109,11 @@ def run(options: Options) -> None:
     )
     with new_run("restore", options, options.out) as output:
         result = inversion.restore(observation.frames, valid=observation.valid, callback=output.callback)
+        result.save(output.directory / "restored.npz")
+        save_restored(output.directory / "restored.fits", result, observation, history(options, result))
         table = metrics(observation, result)
         write_json(output.directory / "metrics.json", table)
         _log(observation, result, table, output)
-        result.save(output.directory / "restored.npz")
-        save_restored(output.directory / "restored.fits", result, observation, history(options, result))
         output.summary.append(result.summary())
 
 

@@ -63,8 +63,8 @@ def run(options: Options) -> None:
         observation = simulate_observation(
             scene, aperture, grid, turbulence, detector, options.n_frames, generator, callback=output.callback
         )
-        log_observation("observation", observation, output.logger)
         observation.save(output.directory / "stack.npz")
+        log_observation("observation", observation, output.logger)
         kept = float(observation.frames.sum() / (options.n_photons * options.n_frames))
         output.summary.append(
             f"{options.n_frames} frames of {grid.shape[0]} x {grid.shape[1]} pixels of "

@@ -1,0 +1,279 @@
+"""design, simulate, restore, codesign, small: what they write, that configs reproduce it, that nothing is lost."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from astropy.io import fits
+
+from torchmask.cli.main import main
+from torchmask.design.constraints import KeepOutDisc, KeepOutSegment, MinimumGap, check
+from torchmask.design.criterion import AsymptoticMSE
+from torchmask.design.manufacture import load_mask
+from torchmask.design.psd import NoisePSD, PowerLawPSD
+from torchmask.grid import Grid
+from torchmask.io import load_npz
+from torchmask.optics.aperture import FullAperture
+from torchmask.restoration.myopic import MyopicDeconvolution
+from torchmask.restoration.result import RestorationResult
+from torchmask.simulation.observation import Observation
+from torchmask.tracking import RunLogger, read_metrics
+
+DESIGN = ["design", "--n-subapertures", "4", "--fill-factor", "0.1", "--budget", "60", "--n-frequencies", "32"]
+RULES = ["--min-gap", "0.05", "--central-obstruction", "0.3", "--spiders", "0", "0", "0", "0.5", "0.02"]
+ARCSEC = np.pi / 180 / 3600
+
+
+def run(*argv):
+    assert main([str(argument) for argument in argv]) == 0
+
+
+def contents(folder):
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """A mask, a stack taken through it, and the image restored from that."""
+    folder = tmp_path_factory.mktemp("runs")
+    run(*DESIGN, *RULES, "--wavelength", "1e-6", "--seed", "3", "--out", folder / "design")
+    mask = ["--mask", folder / "design" / "mask.json"]
+    imaging = ["--wavelength", "1e-6", "--n-pixels", "32", "--n-frames", "3", "--r0", "0.3", "--seed", "5"]
+    run("simulate", *mask, *imaging, "--out", folder / "simulate")
+    run("restore", folder / "simulate" / "stack.npz", "--max-iterations", "12", "--out", folder / "restore")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def cube(runs):
+    """The same stack as a telescope would hand it over: a FITS cube with sky coordinates, and no more."""
+    frames = load_npz(runs / "simulate" / "stack.npz")["frames"]
+    image = fits.PrimaryHDU(frames)
+    cards = {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRVAL1": 82.1875, "CRVAL2": -65.4487, "CRPIX1": 16.0}
+    image.header.update(cards | {"CRPIX2": 16.0, "BUNIT": "electron", "OBJECT": "satellite"})
+    image.writeto(runs / "cube.fits")
+    return runs / "cube.fits"
+
+
+def test_design_writes_a_mask_that_obeys_and_its_error(runs):
+    folder = runs / "design"
+    mask = load_mask(folder / "mask.json")
+    check(mask, 1e-9, [MinimumGap(0.05), KeepOutDisc(0.3), KeepOutSegment((0, 0), (0, 0.5), 0.02)])
+    assert (mask.n_subapertures, mask.mask_diameter, mask.fill_factor) == (4, 1.0, pytest.approx(0.1, rel=1e-12))
+    criterion = AsymptoticMSE(Grid.nyquist(1.0, 1e-6, 32), PowerLawPSD(1.5, 1e7), NoisePSD(1e7), 20)
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert metrics["relative_mse"] == pytest.approx(float(criterion.relative(mask)), rel=1e-12)
+    floor = float(criterion.floor(1.0) / criterion.object_psd.mean())
+    assert metrics["relative_mse_above_floor"] == pytest.approx(metrics["relative_mse"] - floor, rel=1e-12)
+    assert metrics["redundancy"]["n_baselines"] == 6
+    assert {"mask.svg", "design_mask.png", "design_uv_coverage.png", "design_history.png"} <= {
+        path.name for path in folder.iterdir()
+    }
+    assert {row["stage"] for row in read_metrics(folder)} == {"design/hybrid", "design/refine", "design"}
+    assert json.loads((folder / "status.json").read_text())["status"] == "finished"
+
+
+def test_the_config_reproduces_every_result(runs, tmp_path):
+    for command in ("design", "simulate", "restore"):
+        run(command, "--config", runs / command / "config.yaml", "--out", tmp_path / command)
+        assert (tmp_path / command / "config.yaml").read_text() == (runs / command / "config.yaml").read_text()
+    assert (tmp_path / "design/mask.json").read_text() == (runs / "design/mask.json").read_text()
+    for name in ("simulate/stack.npz", "restore/restored.npz"):
+        first, again = load_npz(runs / name), load_npz(tmp_path / name)
+        for key in first.keys() - {"seconds"}:
+            np.testing.assert_array_equal(first[key], again[key])
+
+
+def test_an_option_beside_the_config_changes_that_alone(runs, tmp_path):
+    run("simulate", "--config", runs / "simulate" / "config.yaml", "--seed", "6", "--out", tmp_path / "other")
+    first, other = Observation.load(runs / "simulate/stack.npz"), Observation.load(tmp_path / "other/stack.npz")
+    assert (first.grid, first.r0, first.n_photons) == (other.grid, other.r0, other.n_photons)
+    assert bool((first.frames != other.frames).any())
+
+
+def test_simulate_takes_its_units_as_they_are_called(runs, tmp_path):
+    observation = Observation.load(runs / "simulate/stack.npz")
+    assert torch.equal(observation.aperture.centers, load_mask(runs / "design/mask.json").centers)
+    assert observation.grid == Grid.nyquist(1.0, 1e-6, 32)
+    assert (observation.r0, observation.outer_scale, observation.readout_noise) == (0.3, 20.0, 1.5)
+    telescope = ["--mask", "full", "--mask-diameter", "2.0", "--central-obstruction", "0.5"]
+    sky = ["--pixel-scale-arcsec", "0.02", "--n-pixels", "16", "--n-frames", "1", "--r0", "None"]
+    run("simulate", *telescope, *sky, "--out", tmp_path / "full")
+    observation = Observation.load(tmp_path / "full/stack.npz")
+    assert isinstance(observation.aperture, FullAperture)
+    assert (observation.aperture.mask_diameter, observation.aperture.central_obstruction) == (2.0, 0.25)
+    assert observation.grid.pixel_scale == pytest.approx(0.02 * ARCSEC, rel=1e-12)
+    assert observation.r0 is None
+
+
+def test_restore_is_the_library_call_and_says_how_well_it_fits(runs):
+    folder = runs / "restore"
+    observation = Observation.load(runs / "simulate/stack.npz")
+    method = MyopicDeconvolution(
+        observation.aperture, observation.grid, r0=0.3, outer_scale=20.0, readout_noise=1.5, max_iterations=12
+    )
+    expected = method.restore(observation.frames)
+    found = RestorationResult.load(folder / "restored.npz")
+    torch.testing.assert_close(found.object, expected.object, rtol=0, atol=0)
+    with fits.open(folder / "restored.fits") as content:
+        np.testing.assert_array_equal(content[0].data, expected.object.numpy())
+        history = "".join(content[0].header["HISTORY"])
+    assert "stack.npz" in history
+    assert "max_iterations = 12" in history
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert metrics["chi_square"] == pytest.approx(float(expected.chi_square.mean()), rel=1e-12)
+    assert metrics["score"] < metrics["mean_frame_score"] < 1
+    assert {"restored.png", "comparison.png", "cost.png"} <= {path.name for path in folder.iterdir()}
+
+
+def test_a_fits_cube_restores_to_the_same_image_with_its_sky(runs, cube, tmp_path):
+    """A cube that says nothing of mask, wavelength and scale: the options stand for its header."""
+    scale = Grid.nyquist(1.0, 1e-6, 32).pixel_scale / ARCSEC
+    given = ["--mask", runs / "design/mask.json", "--wavelength", "1e-6", "--pixel-scale-arcsec", repr(scale)]
+    known = ["--r0", "0.3", "--outer-scale", "20", "--readout-noise", "1.5", "--max-iterations", "12"]
+    run("restore", cube, *given, *known, "--out", tmp_path / "restore")
+    found = RestorationResult.load(tmp_path / "restore/restored.npz").object
+    expected = RestorationResult.load(runs / "restore/restored.npz").object
+    # The pixel scale goes through arcseconds and back: twelve iterations do not blow up its rounding.
+    torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-6 * float(expected.max()))
+    header = fits.getheader(tmp_path / "restore/restored.fits")
+    assert (header["CTYPE1"], header["CRVAL1"], header["CRPIX1"], header["OBJECT"]) == (
+        "RA---TAN",
+        82.1875,
+        16.0,
+        "satellite",
+    )
+    assert str(cube) in "".join(header["HISTORY"])
+    assert "score" not in json.loads((tmp_path / "restore/metrics.json").read_text())
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ([], "--mask is missing"),
+        (["--mask", "golay6"], "golay6 has no size of its own"),
+        (["--mask", "MASK"], "give --wavelength"),
+        (["--mask", "MASK", "--wavelength", "1e-6"], "give --pixel-scale-arcsec"),
+        (["--mask", "MASK", "--wavelength", "1e-6", "--pixel-scale-arcsec", "9"], "undersamples"),
+        (["--mask", "MASK", "--wavelength", "-1e-6", "--pixel-scale-arcsec", "0.1"], "wavelength is -1e-06"),
+        (["--mask", "MASK", "--mask-diameter", "2"], "--mask-diameter"),
+        (["--mask", "MASK", "--central-obstruction", "0.1"], "--central-obstruction is for a full pupil"),
+    ],
+)
+def test_what_a_cube_lacks_is_named(runs, cube, tmp_path, capsys, given, message):
+    given = [runs / "design/mask.json" if word == "MASK" else word for word in given]
+    refused(["restore", cube, *given], tmp_path, capsys, message)
+
+
+def refused(argv, folder, capsys, message):
+    """One line, status 1, and no result folder."""
+    assert main([*map(str, argv), "--out", str(folder / "new" / "run")]) == 1
+    out, err = capsys.readouterr()
+    assert err.count("\n") == 1, err
+    assert "Traceback" not in out + err
+    assert re.search(message, err), err
+    assert not (folder / "new").exists()
+
+
+def test_bad_stacks_are_refused(runs, cube, tmp_path, capsys):
+    stack = (runs / "simulate/stack.npz").read_bytes()
+    (tmp_path / "cut.npz").write_bytes(stack[: len(stack) // 2])
+    (tmp_path / "cut.fits").write_bytes(cube.read_bytes()[:5000])
+    fits.PrimaryHDU(np.ones((2, 2, 8, 8))).writeto(tmp_path / "four.fits")
+    np.savez(tmp_path / "frames.npz", frames=np.ones((2, 8, 8)))
+    full = ["--mask", "full", "--mask-diameter", "1", "--wavelength", "1e-6", "--pixel-scale-arcsec", "0.02"]
+    refused(["restore"], tmp_path, capsys, "no stack to restore")
+    refused(["restore", tmp_path / "none.npz"], tmp_path, capsys, "there is no file")
+    refused(["restore", tmp_path / "none.fits", *full], tmp_path, capsys, "there is no file")
+    refused(["restore", tmp_path / "cut.npz"], tmp_path, capsys, "cut.npz")
+    refused(["restore", tmp_path / "cut.fits", *full], tmp_path, capsys, "cut.fits")
+    refused(["restore", tmp_path / "four.fits", *full], tmp_path, capsys, r"shape \(2, 2, 8, 8\)")
+    refused(["restore", tmp_path / "frames.npz"], tmp_path, capsys, "has no centers")
+    refused(["restore", runs / "simulate/stack.npz", "--crop", "8"], tmp_path, capsys, "--crop is for FITS")
+    refused(["restore", *[runs / "simulate/stack.npz"] * 2], tmp_path, capsys, "2 stacks")
+
+
+def test_impossible_requests_are_refused_and_leave_nothing(tmp_path, capsys):
+    refused([*DESIGN, "--fill-factor", "0.9"], tmp_path, capsys, "cannot be packed|no mask|fill_factor")
+    refused([*DESIGN, "--central-obstruction", "0.99"], tmp_path, capsys, "no mask of 4 holes")
+    refused([*DESIGN, "--min-gap", "-1"], tmp_path, capsys, "gap is -1.0")
+    refused([*DESIGN, "--budget", "0"], tmp_path, capsys, "budget is 0")
+    refused(["simulate", "--mask", "none.json"], tmp_path, capsys, "there is no mask file none.json")
+    refused(["simulate", "--mask", "keck_nirc2_9", "--n-photons", "0"], tmp_path, capsys, "n_photons is 0")
+    (tmp_path / "bad.yaml").write_text("n_holes: 4")
+    refused(
+        ["design", "--config", tmp_path / "bad.yaml"], tmp_path, capsys, "unknown key n_holes; known keys are n_sub"
+    )
+
+
+def test_nothing_is_overwritten(runs, capsys):
+    before = contents(runs)
+    for command in ("design", "simulate", "restore"):
+        argv = [command, "--config", str(runs / command / "config.yaml"), "--out", str(runs / command)]
+        assert main(argv) == 1
+        assert f"{command}-2" in capsys.readouterr().err
+    assert contents(runs) == before
+
+
+def test_without_out_a_run_gets_a_folder_of_its_own(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    run(*DESIGN)
+    (folder,) = (tmp_path / "runs").iterdir()
+    assert re.fullmatch(r"design-\d{8}-\d{6}", folder.name)
+    assert f"written to runs/{folder.name}" in capsys.readouterr().out
+
+
+def interrupt_at(monkeypatch, stage, step):
+    original = RunLogger.__call__
+
+    def interrupting(self, record):
+        original(self, record)
+        if (record.stage, record.step) >= (stage, step):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(RunLogger, "__call__", interrupting)
+
+
+def test_an_interrupted_search_leaves_its_best_mask(tmp_path, monkeypatch, capsys):
+    interrupt_at(monkeypatch, "design/hybrid", 30)
+    assert main([*DESIGN, *RULES, "--out", str(tmp_path / "run")]) == 130
+    assert f"what was reached is in {tmp_path / 'run'}" in capsys.readouterr().err
+    check(load_mask(tmp_path / "run/mask.json"), 1e-9, [MinimumGap(0.05), KeepOutDisc(0.3)])
+    assert json.loads((tmp_path / "run/status.json").read_text())["status"] == "interrupted"
+
+
+def test_an_interrupted_restoration_leaves_the_image_it_reached(runs, tmp_path, monkeypatch, capsys):
+    interrupt_at(monkeypatch, "restoration", 11)
+    assert main(["restore", str(runs / "simulate/stack.npz"), "--out", str(tmp_path / "run")]) == 130
+    assert capsys.readouterr().err.endswith("torchmask restore: interrupted\n")
+    state = load_npz(tmp_path / "run/checkpoints/restoration.npz")
+    assert state["object"].shape == (32, 32)
+    monkeypatch.undo()
+    run("view", tmp_path / "run", "--out", tmp_path / "state.png")
+    assert "interrupted" in capsys.readouterr().out
+    assert (tmp_path / "state.png").is_file()
+
+
+@pytest.mark.filterwarnings("default::UserWarning")
+def test_a_warning_is_one_line_too(runs, tmp_path, capsys):
+    wrong = ["--readout-noise", "5000", "--max-iterations", "2"]
+    run("restore", runs / "simulate/stack.npz", *wrong, "--out", tmp_path / "run")
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("torchmask restore: warning: ")
+
+
+def test_codesign_runs_from_the_package_and_its_config_is_strict(tmp_path, capsys):
+    argv = ["codesign", "--smoke", "--runs", str(tmp_path), "--imaging.n-photons", "1e6"]
+    run(*argv, "--name", "first")
+    assert "score" in capsys.readouterr().out
+    stored = yaml.safe_load((tmp_path / "first/config.yaml").read_text())
+    assert (stored["imaging"]["n_photons"], stored["design"]["n_subapertures"]) == (1e6, 5)
+    assert main([*argv, "--name", "first"]) == 1
+    assert "first-2" in capsys.readouterr().err
+    (tmp_path / "bad.yaml").write_text("design: {n_holes: 5}")
+    assert main([*argv, "--config", str(tmp_path / "bad.yaml")]) == 1
+    assert "unknown key design.n_holes; known keys are design.n_subapertures" in capsys.readouterr().err
