@@ -52,10 +52,7 @@ def run(options: Options) -> None:
         raise ValueError(f"{options.out} does not end in .png")
     view = view_path(options.path)
     print(view.text)
-    base = options.out or Path(f"{options.path.resolve().stem}.png")
-    names = {suffix: base.with_name(f"{base.stem}{suffix}.png") for suffix in view.figures}
-    if options.out is None:
-        names = _free(names)
+    names = _names(options.out, view) if options.out else _free_names(options.path.resolve().stem, view)
     for suffix, figure in view.figures.items():
         with atomic_write(names[suffix]) as file:
             figure.savefig(file, format="png", dpi=160)
@@ -180,11 +177,14 @@ def _view_run(folder: Path) -> View:
     return View("\n".join([*lines, "", f"{there[0]}:", result.text]), result.figures)
 
 
-def _free(names: dict[str, Path]) -> dict[str, Path]:
-    """The same names, or those with the first number behind them that all are free with."""
+def _names(path: Path, view: View) -> dict[str, Path]:
+    return {suffix: path.with_name(f"{path.stem}{suffix}.png") for suffix in view.figures}
+
+
+def _free_names(stem: str, view: View) -> dict[str, Path]:
+    """Names in the current folder after `stem`, or after the first of stem-2, stem-3, ... that are all free."""
     for number in itertools.count(1):
-        tag = "" if number == 1 else f"-{number}"
-        numbered = {key: path.with_name(f"{path.stem}{tag}.png") for key, path in names.items()}
-        if not any(path.exists() for path in numbered.values()):
-            return numbered
+        names = _names(Path(f"{stem}.png" if number == 1 else f"{stem}-{number}.png"), view)
+        if not any(path.exists() for path in names.values()):
+            return names
     raise AssertionError  # count never ends
