@@ -4,6 +4,7 @@ mask -> pupil field -> PSF / OTF -> short exposures -> restored object
 """
 
 from torchmask.data.restored import save_restored
+from torchmask.data.visibilities import Observables, frame_observables, restored_observables
 from torchmask.design.constraints import check
 from torchmask.design.criterion import AsymptoticMSE, wiener_mse
 from torchmask.design.manufacture import load_mask
@@ -12,6 +13,7 @@ from torchmask.design.refine import refine_mask
 from torchmask.design.search import SearchResult, search_mask
 from torchmask.design.table import design_table
 from torchmask.grid import Grid
+from torchmask.oifits import save_oifits
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.detector import Detector
 from torchmask.optics.otf import OTF, PSF
@@ -36,6 +38,7 @@ __all__ = [
     "Grid",
     "MyopicDeconvolution",
     "NoisePSD",
+    "Observables",
     "Observation",
     "PowerLawPSD",
     "RestorationResult",
@@ -49,10 +52,13 @@ __all__ = [
     "ZernikePhase",
     "check",
     "design_table",
+    "frame_observables",
     "load_mask",
     "make_scene",
     "multiframe_wiener",
     "refine_mask",
+    "restored_observables",
+    "save_oifits",
     "save_restored",
     "search_mask",
     "simulate_observation",

@@ -72,7 +72,7 @@ def save_oifits(
 
     date, mjd = _date(header)
     common = {"DATE-OBS": date[:10], "ARRNAME": _ARRAY, "INSNAME": _text(header, "INSTRUME")}
-    seconds = float(header.get("XPOSURE", header.get("EXPTIME", 0.0))) * len(observation.frames)
+    seconds = float(header.get("XPOSURE", 0.0)) * len(observation.frames)
     hdus = fits.HDUList([_primary(header, date)])
     hdus.append(_target(header))
     hdus.append(_array(observables, observation))
@@ -127,23 +127,32 @@ def _rows(
     return {
         "TARGET_ID": ("1I", None, np.ones(n, dtype=np.int16)),
         "TIME": ("1D", "s", np.zeros(n)),
-        "MJD": ("1D", "day", np.full(n, mjd)),
+        "MJD": ("1D", "d", np.full(n, mjd)),
         "INT_TIME": ("1D", "s", np.full(n, seconds)),
-        **measured,
+        **{name: (code, unit, _spectrum(values)) for name, (code, unit, values) in measured.items()},
         **places,
         "STA_INDEX": (f"{holes.shape[1]}I", None, as_array(holes).astype(np.int16) + 1),
-        "FLAG": ("1L", None, bad),
+        "FLAG": ("1L", None, _spectrum(bad)),
     }
+
+
+def _spectrum(values: Any) -> np.ndarray:
+    """(n, 1): one value per wavelength, and one wavelength."""
+    return as_array(values)[:, None]
 
 
 def _table(name: str, cards: Mapping[str, Any], columns: Mapping[str, tuple[str, str | None, Any]]) -> Any:
     """A binary table from {column: (format, unit, values)}, of the second revision."""
     from astropy.io import fits
 
+    arrays = {column: (code, unit, as_array(values)) for column, (code, unit, values) in columns.items()}
     table = fits.BinTableHDU.from_columns(
         [
-            fits.Column(name=column, format=code, unit=unit, array=as_array(values))
-            for column, (code, unit, values) in columns.items()
+            # without TDIM, readers take a spectrum of one wavelength for a plain number
+            fits.Column(
+                name=column, format=code, unit=unit, array=values, dim="(1)" if values.shape[1:] == (1,) else None
+            )
+            for column, (code, unit, values) in arrays.items()
         ],
         name=name,
     )

@@ -28,7 +28,7 @@ _CELESTIAL = re.compile(
     r"|LONPOLE|LATPOLE|RADESYS|EQUINOX|[AB]P?_(ORDER|DMAX|\d+_\d+)"
 )
 _ABOUT = ("OBJECT", "TARGNAME", "TARG_RA", "TARG_DEC", "RA", "DEC", "TELESCOP", "INSTRUME", "FILTER", "DATE-OBS")
-_ABOUT += ("TIME-OBS", "MJD-OBS", "MJD-AVG", "OBSERVER", "XPOSURE", "EXPTIME")
+_ABOUT += ("TIME-OBS", "MJD-OBS", "MJD-AVG", "OBSERVER")
 
 
 def missing(path: Any, keywords: str, option: str) -> ValueError:
@@ -108,6 +108,13 @@ def wavelength(header: Any, path: Any, given: float | None) -> float:
     raise missing(path, "WAVELEN, nor a FILTER that is known", f"wavelength [m]{what}")
 
 
+def exposure_seconds(header: Any, path: Any, is_cube: bool, given: float | None) -> float | None:
+    """Exposure time of a frame [s]: XPOSURE, EXPTIME or EFFEXPTM; EFFINTTM, of one integration, for a cube."""
+    if given is not None:
+        return given
+    return number(header, ("EFFINTTM",) * is_cube + ("XPOSURE", "EXPTIME", "EFFEXPTM"), path)
+
+
 def electrons_per_unit(
     header: Any, path: Any, is_cube: bool, unit: str | None, gain: float | None, exposure_time: float | None
 ) -> float:
@@ -134,8 +141,7 @@ def electrons_per_unit(
         return gain
 
     def seconds() -> float:
-        names = ("EFFINTTM",) * is_cube + ("XPOSURE", "EXPTIME", "EFFEXPTM")
-        time = number(header, names, path) if exposure_time is None else exposure_time
+        time = exposure_seconds(header, path, is_cube, exposure_time)
         if not time:
             raise missing(path, f"XPOSURE or EXPTIME, which its unit {text} needs", "exposure_time [s]")
         return time

@@ -47,6 +47,7 @@ def observation_fields(
     _check_alike(files, lengths, scales)
     options = (unit, gain, exposure_time)
     factors = [keywords.electrons_per_unit(f.header, f.path, f.is_cube, *options) for f in files]
+    times = [keywords.exposure_seconds(file.header, file.path, file.is_cube, exposure_time) for file in files]
     noises = [keywords.number(file.header, ("RDNOISE", "READNOIS"), file.path) for file in files]
     images = [_image(source, name) for source, name in ((dark, "dark"), (flat, "flat"), (bad_pixels, "bad_pixels"))]
 
@@ -77,8 +78,16 @@ def observation_fields(
         "readout_noise": readout_noise,
         "valid": torch.from_numpy(valid),
         "errors": None if errors is None else torch.from_numpy(errors),
-        "header": headers[0],
+        "header": headers[0] | _mean_exposure(files, times),
     }
+
+
+def _mean_exposure(files: Sequence[FITSImages], times: Sequence[float | None]) -> dict[str, float]:
+    """XPOSURE, the mean exposure time of a frame [s], if all files tell theirs."""
+    known = [(time, len(file.values)) for time, file in zip(times, files, strict=True) if time is not None]
+    if len(known) < len(files):
+        return {}
+    return {"XPOSURE": sum(time * count for time, count in known) / sum(count for _, count in known)}
 
 
 def _check_options(
