@@ -51,8 +51,11 @@ def run(options: Options) -> None:
     if options.out is not None and options.out.suffix.lower() != ".png":
         raise ValueError(f"{options.out} does not end in .png")
     view = view_path(options.path)
-    print(view.text)
     names = _names(options.out, view) if options.out else _free_names(options.path.resolve().stem, view)
+    taken = [str(path) for path in names.values() if path.exists()]
+    if taken:
+        raise ValueError(f"{' and '.join(taken)} exists and is not overwritten: choose another name or move it away")
+    print(view.text)
     for suffix, figure in view.figures.items():
         with atomic_write(names[suffix]) as file:
             figure.savefig(file, format="png", dpi=160)
