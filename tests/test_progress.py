@@ -53,8 +53,8 @@ def test_few_plain_lines_without_a_terminal(clock):
         clock.now += 50  # figures, say: no part of the stage
         run(bar, clock, "restoration/mask", 10, 1.0)
     assert out.getvalue().splitlines() == [
-        "design/cma 41/100 cost 2.439 10 s",
-        "design/cma 81/100 cost 1.2346 20 s",
+        "design/cma 41/100 cost 2.439 10 s, 14 s left",  # 10 s (100 - 41) / 41
+        "design/cma 81/100 cost 1.2346 20 s, 5 s left",
         "design/cma 100/100 cost 1 25 s",
         "restoration/mask 10/10 cost 10 9 s",
     ]

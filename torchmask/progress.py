@@ -60,7 +60,8 @@ class Progress:
             self._draw(record)
         elif now - self._printed.get(record.stage, self._started[record.stage]) >= _PLAIN_INTERVAL:
             self._printed[record.stage] = now
-            self._print(record)
+            left = elapsed * (record.n_steps / record.step - 1)
+            self._print(record, f", {left:.0f} s left")
 
     def close(self, interrupted: bool = False) -> None:
         """End the stage that is running, and give the terminal back. An interrupted stage keeps its unfilled bar."""
@@ -95,9 +96,9 @@ class Progress:
             self._tasks[record.stage] = self._bars.add_task(record.stage, total=record.n_steps, value="")
         self._bars.update(self._tasks[record.stage], completed=record.step, value=_objective(record))
 
-    def _print(self, record: Record) -> None:
+    def _print(self, record: Record, estimate: str = "") -> None:
         seconds = self._last_time - self._started[record.stage]
-        line = f"{record.stage} {record.step}/{record.n_steps} {_objective(record)} {seconds:.0f} s"
+        line = f"{record.stage} {record.step}/{record.n_steps} {_objective(record)} {seconds:.0f} s{estimate}"
         self._console.print(line, highlight=False, markup=False, soft_wrap=True)
 
     def _end_stage(self, interrupted: bool = False) -> None:

@@ -146,6 +146,13 @@ main(["--help"])
     assert all("pip install 'torchmask[experiments]'" in line for line in lines)
 
 
+def test_a_reader_that_has_read_enough_is_no_error():
+    command = f"{Path(sys.executable).with_name('torchmask')} masks | head -n 1"
+    done = subprocess.run(command, shell=True, capture_output=True, text=True, check=False)
+    assert done.stdout.startswith("name")
+    assert done.stderr == ""
+
+
 def test_the_console_script_runs(tmp_path):
     """The installed command itself, once."""
     program = str(Path(sys.executable).with_name("torchmask"))

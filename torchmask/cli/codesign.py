@@ -203,7 +203,7 @@ def codesign(config: Config, scene: torch.Tensor, output: Run) -> dict[str, dict
         logger.figure(f"restoration/{name}_cost", viz.history_figure({name: result.cost.tolist()}, "cost"))
         table[name] = metrics(observation, result, cutoff)
         for key, value in table[name].items():
-            logger.scalar(f"comparison/{name}_{key}", value)
+            logger.scalar(f"comparison/{name}/{key}", value)
         pictures[f"{name}, {table[name]['photons_per_frame']:.1e} photons"] = (observation.frames[0], result.object)
         arrays |= {f"{name}_object": result.object, f"{name}_coefficients": result.coefficients}
         arrays |= {f"{name}_frames": observation.frames}

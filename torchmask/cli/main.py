@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
 import sys
 import warnings
 from collections.abc import Sequence
@@ -66,6 +67,9 @@ def _run(command: str, argv: list[str]) -> int:
         if debug or missing not in _EXTRAS:
             raise
         _say(command, f"needs {missing}, which a plain install leaves out: pip install 'torchmask[experiments]'")
+        return 1
+    except BrokenPipeError:  # `torchmask masks | head` has read enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
         return 1
     except (ValueError, OSError) as error:
         if debug:
