@@ -39,6 +39,19 @@ def save_restored(
     -----
     The image is in electrons per pixel and frame (BUNIT). CHISQ is the mean over the frames of the mean square residual
     in units of the noise, CHISQMAX that of the worst frame; CONVERGD says whether the restoration came to rest.
+
+    Examples
+    --------
+    >>> import tempfile, torch
+    >>> from torchmask.grid import Grid
+    >>> from torchmask.optics.aperture import SparseAperture
+    >>> from torchmask.restoration.myopic import MyopicDeconvolution
+    >>> frames = torch.full((4, 32, 32), 2.0); frames[:, 12:20, 12:20] = 100.0
+    >>> frames = torch.poisson(frames, generator=torch.Generator().manual_seed(0))
+    >>> mask = SparseAperture([[0.0, 0.3], [-0.3, -0.2], [0.3, -0.2]], 0.2, 1.0)
+    >>> observation = Observation(frames, mask, Grid.nyquist(1.0, 550e-9, 32), readout_noise=None)
+    >>> result = MyopicDeconvolution(mask, observation.grid, n_modes=3, max_iterations=3).restore(frames)
+    >>> save_restored(tempfile.mkdtemp() + "/restored.fits", result, observation, history="an example")
     """
     from astropy.io import fits
 

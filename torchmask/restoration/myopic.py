@@ -75,8 +75,8 @@ class MyopicDeconvolution(nn.Module):
     >>> from torchmask.optics.aperture import SparseAperture
     >>> mask = SparseAperture([[0.0, 0.3], [-0.3, -0.2], [0.3, -0.2]], 0.2, 1.0)
     >>> method = MyopicDeconvolution(mask, Grid.nyquist(1.0, 550e-9, 32), n_modes=3, r0=0.2, max_iterations=5)
-    >>> frames = torch.poisson(torch.rand(4, 32, 32, generator=torch.Generator().manual_seed(0)) * 1e3)
-    >>> result = method.restore(frames.double())
+    >>> frames = torch.full((4, 32, 32), 20.0); frames[:, 12:20, 12:20] = 1000.0
+    >>> result = method.restore(torch.poisson(frames, generator=torch.Generator().manual_seed(0)))
     >>> result.object.shape, result.coefficients.shape
     (torch.Size([32, 32]), torch.Size([4, 3, 3]))
     """

@@ -39,7 +39,8 @@ class RestorationResult:
     >>> from torchmask.restoration.myopic import MyopicDeconvolution
     >>> mask = SparseAperture([[0.0, 0.3], [-0.3, -0.2], [0.3, -0.2]], 0.2, 1.0)
     >>> method = MyopicDeconvolution(mask, Grid.nyquist(1.0, 550e-9, 32), n_modes=3, max_iterations=3)
-    >>> result = method.restore(torch.rand(4, 32, 32, generator=torch.Generator().manual_seed(0)))
+    >>> frames = torch.full((4, 32, 32), 20.0); frames[:, 12:20, 12:20] = 1000.0
+    >>> result = method.restore(torch.poisson(frames, generator=torch.Generator().manual_seed(0)))
     >>> result.chi_square.shape, result.converged
     (torch.Size([4]), False)
     >>> result.save(f"{tempfile.mkdtemp()}/result.npz")  # and RestorationResult.load reads it
