@@ -170,10 +170,9 @@ class CompanionModel:
     def search(self, exposures: Exposures, star: Fit, offsets: Tensor) -> tuple[Tensor, Tensor]:
         """Contrast of a companion at each of `offsets` (M, 2) [rad] and its standard error, everything else refitted.
 
-        Linearised about `star`, a fit without companion.
+        Linearised about `star`, a fit without companion, or with one, beside which a second is looked for.
         """
-        none = torch.zeros(3, dtype=torch.float64)
-        normal = self._normal(exposures, star.shared, star.own, none, False)
+        normal = self._normal(exposures, star.shared, star.own, star.companion, False)
         factor, scale, vector = normal.factor()
         solution = normal.solve()
         weight = self._root_weight(exposures)
@@ -181,7 +180,7 @@ class CompanionModel:
         power = torch.zeros_like(aligned)
         crossed = torch.zeros(len(vector), len(offsets), dtype=torch.float64)
         for t in range(len(exposures.frames)):
-            residual, jacobian = self._linear(exposures, t, star.shared, star.own[t], none, False, weight[t])
+            residual, jacobian = self._linear(exposures, t, star.shared, star.own[t], star.companion, False, weight[t])
             transfer = torch.fft.rfft2(star.images[t] - star.own[t, 1], s=self.optics.field.shape)
             moved = (offsets @ exposures.to_pixels[t].T)[:, :, None, None]
             shifted = torch.fft.irfft2(transfer * self._shift(moved[:, 0], moved[:, 1]), s=self.optics.field.shape)

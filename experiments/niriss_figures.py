@@ -51,22 +51,22 @@ def images_figure(images: dict[str, np.ndarray], marks: Sequence[dict[str, float
 @styled
 def search_figure(offsets: Tensor, maps: dict[str, Tensor], separation: np.ndarray, limit: np.ndarray) -> Figure:
     """Contrast over the limit at its separation [arcsec] wherever a companion was looked for, and the limit itself."""
-    figure = new_figure(10.2, 3.5)
+    figure = new_figure(2.7 * len(maps) + 3.9, 3.4)
     axes = figure.subplots(1, len(maps) + 1, width_ratios=[1.0] * len(maps) + [1.25])
     east, north = (offsets / ARCSEC).T.numpy()
     away = np.hypot(east, north)
     for ax, (title, contrast) in zip(axes, maps.items(), strict=False):
         ratio = contrast.numpy() / np.interp(away, separation, limit)
-        drawn = ax.scatter(east, north, c=ratio, cmap="RdBu_r", vmin=-2, vmax=2, s=14, marker="s", linewidths=0)
+        drawn = ax.scatter(east, north, c=ratio, cmap="RdBu_r", vmin=-2, vmax=2, s=19, marker="s", linewidths=0)
         ax.set(title=title, xlabel="east [arcsec]", ylabel="north [arcsec]" if ax is axes[0] else "", aspect="equal")
         ax.invert_xaxis()
     figure.colorbar(drawn, ax=list(axes[:-1]), label="contrast / limit", shrink=0.85)
     ax = axes[-1]
-    for color, (title, contrast) in zip((COLORS[1], FAINT), maps.items(), strict=False):
-        ax.semilogy(away, contrast.abs().numpy(), ".", markersize=3, color=color, label=title)
-    ax.semilogy(separation, limit, color=COLORS[0], label="limit")
-    ax.set(xlabel="separation [arcsec]", ylabel="contrast", ylim=(1e-5, 0.1), title="detection limit")
-    ax.legend(loc="lower right")
+    for color, (title, contrast) in zip((COLORS[1], FAINT, COLORS[2]), maps.items(), strict=False):
+        ax.plot(away, contrast.abs().numpy(), ".", linestyle="none", markersize=3, color=color, label=title)
+    ax.plot(separation, limit, color=COLORS[0], label="limit")
+    ax.set(xlabel="separation [arcsec]", ylabel="contrast", yscale="log", ylim=(2e-5, 0.1), title="detection limit")
+    ax.legend(loc="upper right", markerscale=2)
     return figure
 
 
