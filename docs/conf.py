@@ -1,7 +1,9 @@
 """Configuration of the manual. Build it with `make docs`."""
 
 import re
+import shutil
 from importlib import metadata
+from pathlib import Path
 
 import torchmask
 
@@ -29,6 +31,9 @@ napoleon_google_docstring = False
 napoleon_use_rtype = False
 napoleon_use_ivar = True
 add_module_names = False
+# A reference to what the manual does not hold is an error; types in signatures and names of others are not looked up.
+nitpicky = True
+nitpick_ignore_regex = [("py:.*", r"(?!torchmask\.).*"), ("py:class", ".*")]
 python_use_unqualified_type_names = True
 python_display_short_literal_types = True
 maximum_signature_line_length = 88
@@ -77,5 +82,14 @@ def _code(text):
     return f":py:obj:`{text}`" if re.fullmatch(r"torchmask(\.\w+)+", text) else f"``{text}``"
 
 
+def copy_notebooks(app):
+    """Sphinx reads below its own folder only."""
+    target = Path(app.srcdir) / "notebooks"
+    target.mkdir(exist_ok=True)
+    for notebook in (Path(app.srcdir).parent / "notebooks").glob("*.ipynb"):
+        shutil.copy2(notebook, target)
+
+
 def setup(app):
+    app.connect("builder-inited", copy_notebooks, priority=0)
     app.connect("autodoc-process-docstring", plain_text, priority=400)  # before napoleon
