@@ -3,8 +3,9 @@
 mask -> pupil field -> PSF / OTF -> short exposures -> restored object
 """
 
+from torchmask.data.fringes import frame_observables
 from torchmask.data.restored import save_restored
-from torchmask.data.visibilities import Observables, frame_observables, restored_observables
+from torchmask.data.visibilities import Observables, restored_observables
 from torchmask.design.constraints import check
 from torchmask.design.criterion import AsymptoticMSE, wiener_mse
 from torchmask.design.manufacture import load_mask

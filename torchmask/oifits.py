@@ -52,6 +52,18 @@ def save_oifits(
     Signs as in `torchmask.data.visibilities`. STA_INDEX counts holes from 1, in the order of `aperture.centers`;
     U1COORD, V1COORD belong to the first pair of a triangle (i, j), U2COORD, V2COORD to the second (j, k). STAXYZ are
     the holes' places in the pupil, towards east and north, FRAME = 'SKY'. What is not finite is flagged.
+
+    Examples
+    --------
+    >>> import tempfile, torch
+    >>> from torchmask.data.visibilities import frame_observables
+    >>> from torchmask.grid import Grid
+    >>> from torchmask.optics.aperture import SparseAperture
+    >>> frames = torch.rand(4, 64, 64, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 1e4
+    >>> mask = SparseAperture([[0.0, 0.4], [-0.35, -0.2], [0.35, -0.25]], 0.15, 1.0)
+    >>> observation = Observation(frames, mask, Grid.nyquist(1.0, 550e-9, 64), readout_noise=1.0)
+    >>> path = tempfile.mkdtemp() + "/seen.oifits"
+    >>> save_oifits(path, frame_observables(observation), observation, bandwidth=30e-9)
     """
     from astropy.io import fits
 
@@ -244,7 +256,7 @@ def _date(header: Mapping[str, Any]) -> tuple[str, float]:
         if time is None and isinstance(header.get(name), int | float):
             time = Time(header[name], format="mjd")
     if time is None and "DATE-OBS" not in header:
-        time = Time(0.0, format="mjd")
+        return "1858-11-17T00:00:00", 0.0
     if time is None:
         text = str(header["DATE-OBS"])
         if "T" not in text and "TIME-OBS" in header:
