@@ -183,7 +183,7 @@ def compare(
     table = {name: sum(values) / len(values) for name, values in each.items()}
     better = sum(a < b for a, b in zip(each["network"], each["Wiener"], strict=True))
     for name, value in table.items():
-        log(f"comparison/{name.replace(' ', '_')}_score", value)
+        log(f"comparison/{name.replace(' ', '_')}/score", value)
     log("comparison/improved", better / len(restored))
     print(*(f"{name:12s} {value:.4f}" for name, value in table.items()), sep="\n")
     print(f"The network is better than its input on {better} of {len(restored)} stacks it was not trained on.")

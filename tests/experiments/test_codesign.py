@@ -45,7 +45,7 @@ def test_every_result_is_in_the_folder(finished):
         assert result[f"{name}_frames"].shape == (3, 64, 64)
         assert result[f"{name}_object"].min() >= 0
     stages = {row["stage"] for row in read_metrics(finished)}
-    assert {"design/cma", "design/refine", "restoration/mask", "restoration/full", "comparison"} <= stages
+    assert {"design/cma", "design/refine", "restoration/mask", "restoration/full", "comparison/mask"} <= stages
 
 
 def test_tensorboard_finds_scalars_and_images(finished):
@@ -54,7 +54,7 @@ def test_tensorboard_finds_scalars_and_images(finished):
     events = EventAccumulator(str(finished), size_guidance={"images": 0, "scalars": 0})
     events.Reload()
     tags = events.Tags()
-    assert {"restoration/mask/cost", "restoration/full/cost", "comparison/mask_score"} <= set(tags["scalars"])
+    assert {"restoration/mask/cost", "restoration/full/cost", "comparison/mask/score"} <= set(tags["scalars"])
     images = {"restoration/mask/object", "figures/design/mask", "figures/design/uv_coverage", "figures/comparison"}
     assert images | {"observation/mask/first_frame", "figures/observation/full/mtf"} <= set(tags["images"])
 
@@ -65,7 +65,7 @@ def test_the_full_pupil_gets_photons_by_its_area_and_reaches_as_far(finished):
     separation = np.linalg.norm(result["centers"][:, None] - result["centers"][None], axis=-1).max()
     diameter = float(result["subaperture_diameter"])
     expected = (separation + diameter) ** 2 / (5 * diameter**2)
-    ratio = rows["comparison/full_photons_per_frame"] / rows["comparison/mask_photons_per_frame"]
+    ratio = rows["comparison/full/photons_per_frame"] / rows["comparison/mask/photons_per_frame"]
     assert ratio == pytest.approx(expected, rel=1e-12)
 
 
