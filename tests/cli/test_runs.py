@@ -10,6 +10,7 @@ import yaml
 from astropy.io import fits
 
 from torchmask.cli.main import main
+from torchmask.cli.report import draw_zones
 from torchmask.design.constraints import KeepOutDisc, KeepOutSegment, MinimumGap, check
 from torchmask.design.criterion import AsymptoticMSE
 from torchmask.design.manufacture import load_mask
@@ -21,6 +22,7 @@ from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.result import RestorationResult
 from torchmask.simulation.observation import Observation
 from torchmask.tracking import RunLogger, read_metrics
+from torchmask.viz import mask_figure
 
 DESIGN = ["design", "--n-subapertures", "4", "--fill-factor", "0.1", "--budget", "60", "--n-frequencies", "32"]
 RULES = ["--min-gap", "0.05", "--central-obstruction", "0.3", "--spiders", "0", "0", "0", "0.5", "0.02"]
@@ -74,6 +76,19 @@ def test_design_writes_a_mask_that_obeys_and_its_error(runs):
     }
     assert {row["stage"] for row in read_metrics(folder)} == {"design/hybrid", "design/refine", "design"}
     assert json.loads((folder / "status.json").read_text())["status"] == "finished"
+
+
+def test_zones_that_holes_keep_clear_of_are_drawn_where_they_are(runs):
+    """Points in pupil metres, inside and just outside the obstruction and the spider; the figure is in millimetres."""
+    figure = mask_figure(load_mask(runs / "design/mask.json"))
+    before = len(figure.axes[0].patches)
+    draw_zones(figure, [KeepOutDisc(0.3), KeepOutSegment((0, 0), (0, 0.5), 0.02), MinimumGap(0.05)], 1000.0)
+    disc, bar = figure.axes[0].patches[before:]
+    for patch, x, y, inside in (
+        *((disc, 149, 0, True), (disc, 0, -149, True), (disc, 151, 0, False)),
+        *((bar, 9, 400, True), (bar, -9, 10, True), (bar, 11, 400, False), (bar, 0, 501, False), (bar, 0, -1, False)),
+    ):
+        assert patch.get_path().transformed(patch.get_patch_transform()).contains_point((x, y)) == inside, (x, y)
 
 
 def test_the_config_reproduces_every_result(runs, tmp_path):
@@ -194,6 +209,15 @@ def test_bad_stacks_are_refused(runs, cube, tmp_path, capsys):
     refused(["restore", tmp_path / "frames.npz"], tmp_path, capsys, "has no centers")
     refused(["restore", runs / "simulate/stack.npz", "--crop", "8"], tmp_path, capsys, "--crop is for FITS")
     refused(["restore", *[runs / "simulate/stack.npz"] * 2], tmp_path, capsys, "2 stacks")
+
+
+def test_files_of_several_kinds_are_not_mixed(tmp_path, capsys):
+    full = ["--mask", "full", "--mask-diameter", "1", "--wavelength", "1e-6"]
+    for name, cards in (("a", {"FILTER": "K"}), ("b", {"FILTER": "H"}), ("c", {"FILTER": "K", "PIXELSCL": 0.03})):
+        header = fits.Header({"PIXELSCL": 0.02, "BUNIT": "electron"} | cards)
+        fits.PrimaryHDU(np.ones((16, 16)), header).writeto(tmp_path / f"{name}.fits")
+    refused(["restore", tmp_path / "a.fits", tmp_path / "b.fits", *full], tmp_path, capsys, "mix filters")
+    refused(["restore", tmp_path / "a.fits", tmp_path / "c.fits", *full], tmp_path, capsys, "mix pixel scales")
 
 
 def test_impossible_requests_are_refused_and_leave_nothing(tmp_path, capsys):

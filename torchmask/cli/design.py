@@ -110,7 +110,7 @@ def run(options: Options) -> None:
             raise
         seconds = time.perf_counter() - started
         _save_mask(output.directory, result.aperture)
-        log_design(result, criterion.grid, output.logger)
+        log_design(result, criterion.grid, output.logger, rules)
         table = metrics(result, criterion) | {"evaluations": result.evaluations, "seconds": seconds}
         write_json(output.directory / "metrics.json", table)
         output.summary.append(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,6 +10,8 @@ import torch
 
 from torchmask import _drawing as drawing
 from torchmask import viz
+from torchmask.design.constraints import KeepOutDisc, KeepOutSegment
+from torchmask.design.feasibility import Constraint
 from torchmask.design.search import SearchResult
 from torchmask.grid import Grid
 from torchmask.io import as_array
@@ -20,9 +23,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def log_design(design: SearchResult, grid: Grid, logger: RunLogger) -> None:
-    """The mask, the frequencies it passes, and how the search went."""
-    logger.figure("design/mask", viz.mask_figure(design.aperture))
+def log_design(design: SearchResult, grid: Grid, logger: RunLogger, constraints: Sequence[Constraint] = ()) -> None:
+    """The mask with what it keeps clear of, the frequencies it passes, and how the search went."""
+    mask = viz.mask_figure(design.aperture)
+    draw_zones(mask, constraints, drawing.length_unit(design.aperture.mask_diameter)[1])
+    logger.figure("design/mask", mask)
     logger.figure("design/uv_coverage", viz.uv_coverage_figure(design.aperture, grid))
     logger.figure(
         "design/history",
@@ -31,6 +36,23 @@ def log_design(design: SearchResult, grid: Grid, logger: RunLogger) -> None:
         ),
     )
     logger.scalar("design/relative_mse", design.relative_mse)
+
+
+def draw_zones(figure: Figure, constraints: Sequence[Constraint], scale: float) -> None:
+    """Shade the zones of the pupil that no hole may reach; `scale` units of the axes are a metre."""
+    from matplotlib.patches import Circle, Polygon
+
+    style: dict[str, Any] = {"facecolor": drawing.FAINT, "edgecolor": "none"}
+    for zone in constraints:
+        if isinstance(zone, KeepOutDisc):
+            center = scale * np.array(zone.center)
+            figure.axes[0].add_patch(Circle((center[0], center[1]), scale * zone.diameter / 2, **style))
+        elif isinstance(zone, KeepOutSegment):
+            start, end = scale * np.array(zone.start), scale * np.array(zone.end)
+            across = np.array([start[1] - end[1], end[0] - start[0]])
+            across *= scale * zone.width / 2 / np.linalg.norm(across)
+            corners = [start + across, end + across, end - across, start - across]
+            figure.axes[0].add_patch(Polygon(np.array(corners), **style))
 
 
 def log_observation(name: str, observation: Observation, logger: RunLogger) -> None:

@@ -190,7 +190,7 @@ def _log(observation: Observation, result: RestorationResult, table: dict[str, A
         pictures = {"stack": (observation.frames[0], result.object)}
         logger.figure("comparison", viz.comparison_figure(observation.object, pictures, cutoff, scale))
     for name, value in table.items():
-        logger.scalar(f"result/{name}", float(value))
+        logger.scalar(f"comparison/restored/{name}", float(value))
 
 
 def history(options: Options, result: RestorationResult) -> list[str]:
