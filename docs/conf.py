@@ -18,10 +18,12 @@ extensions = [
     "sphinx.ext.napoleon",
     "sphinx.ext.mathjax",
     "sphinx.ext.viewcode",
+    "sphinx-mathjax-offline",
 ]
 
 # Notebooks are shown with the outputs they were committed with: `make notebooks` renews those.
 nb_execution_mode = "off"
+nb_render_markdown_format = "myst"  # tables that a cell shows
 myst_enable_extensions = ["amsmath", "attrs_inline", "colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
 
@@ -56,8 +58,10 @@ def plain_text(app, what, name, obj, options, lines):
     """
     if what == "class":
         lines[:] = _fields(lines)
+    in_example = False
     for number, line in enumerate(lines):
-        if line.lstrip().startswith((">>>", "...")):
+        in_example = bool(line.strip()) and (in_example or line.lstrip().startswith(">>>"))
+        if in_example:
             continue
         parts = re.split(r"(``.*?``|`.*?`)", line)
         parts[::2] = [re.sub(r"[|*]", r"\\\g<0>", part) for part in parts[::2]]
