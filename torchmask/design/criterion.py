@@ -35,7 +35,7 @@ class AsymptoticMSE(nn.Module):
         psd(grid, dtype, device) such as `PowerLawPSD` and `NoisePSD`, or a tensor that broadcasts to (H, W) in FFT
         order. They need not be symmetric. The object's must be at least 0, the noise's positive.
     n_frames : int
-        K.
+        Number of exposures, K.
 
     Raises
     ------

@@ -38,7 +38,7 @@ def search_mask(
     ----------
     criterion : AsymptoticMSE, or any differentiable error of masks like it
     n_subapertures : int
-        N.
+        Number of holes, N.
     mask_diameter : float
         D [m].
     fill_factor : float

@@ -280,7 +280,7 @@ class SparseAperture(Aperture):
         Parameters
         ----------
         n_subapertures : int
-            N.
+            Number of holes, N.
         mask_diameter : float
             D [m].
         fill_factor : float
