@@ -24,6 +24,7 @@ STATIC_RMS, OWN_RMS = 0.3, 0.02  # [rad] expected sizes of the common aberration
 OWN_MODES = 3  # piston, tip and tilt of every hole
 BLUR, BLUR_RMS = 0.1, 0.1  # [pixel^2] variance of the spread of charge along an axis, and how well it is known
 STEPS = 5  # of Gauss-Newton; the aberrations are small, and two are mostly enough
+_MARGIN = 2.0  # of the field around the exposures, which sets how finely the holes are sampled: to half a percent
 _HALVINGS = 6  # of a step that makes the fit worse
 
 
@@ -111,11 +112,14 @@ class CompanionModel:
     ) -> None:
         self.grid, self.radius, self.flux_error = grid, radius, flux_error
         self.n_sub, self.n_modes = aperture.n_subapertures, n_modes
-        self.optics = ExposureModel(aperture, grid, n_modes, margin=1.0, wavelengths=wavelengths, weights=weights)
+        self.optics = ExposureModel(aperture, grid, n_modes, margin=_MARGIN, wavelengths=wavelengths, weights=weights)
         rows, columns = self.optics.field.shape
         self._nu_y = torch.fft.fftfreq(rows, dtype=torch.float64)[:, None]
         self._nu_x = torch.fft.rfftfreq(columns, dtype=torch.float64)
         self._pixel = torch.sinc(self._nu_y) * torch.sinc(self._nu_x)
+        # The cells of the pupil samples dim the model's image towards the border of its field; this undoes it.
+        across = torch.sinc(torch.fft.fftfreq(columns, dtype=torch.float64))
+        self._cells = 1 / (torch.sinc(self._nu_y) * across) ** 2
         y, x = torch.meshgrid(*(torch.arange(n).double() - n // 2 for n in grid.shape), indexing="ij")
         self._near = torch.hypot(y, x) <= radius
         self._n_aberrations = self.n_sub * n_modes
@@ -125,7 +129,7 @@ class CompanionModel:
         flux, background, y, x = place
         contrast, offset = companion[0], to_pixels @ companion[1:]
         spread = torch.exp(-2 * math.pi**2 * (blur[0] * self._nu_y**2 + blur[1] * self._nu_x**2))
-        transfer = torch.fft.rfft2(self.optics.psf(aberrations[None])[0]) * (flux * spread * self._pixel)
+        transfer = torch.fft.rfft2(self.optics.psf(aberrations[None])[0] * self._cells) * (flux * spread * self._pixel)
         sky = self._shift(y, x) * (1 + contrast * self._shift(offset[0], offset[1]))
         image = torch.fft.irfft2(transfer * sky, s=self.optics.field.shape)
         return image[: self.grid.shape[0], : self.grid.shape[1]] + background

@@ -69,7 +69,7 @@ class Config:
     """Of the small aberrations of each exposure, as if they were turbulence [m]: 0.07 rad rms over a hole."""
     max_iterations: int = 800
     """Of the restorations."""
-    n_injections: int = 12
+    n_injections: int = 8
     """Companions put beside the calibrator, around the clock, to see how well they are found."""
     step: float = 0.05
     """Of the search for companions [arcsec]."""
@@ -88,6 +88,7 @@ class Pose:
     mirrored: bool = False
     rotation: float = 0.0  # [deg], from x to y of the detector
     magnification: float = 1.0  # of the pupil in units of the wavelength: stands for the effective wavelength
+    hole: float = 0.80  # [m] flat to flat
 
 
 def read(folder: Path, star: str, crop: int) -> tuple[Exposures, Grid]:
@@ -113,9 +114,7 @@ def optics(config: Config, pose: Pose, grid: Grid, to_pixels: Tensor) -> tuple[S
     turn = torch.tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]], dtype=torch.float64)
     pixel = torch.linalg.vector_norm(torch.linalg.inv(to_pixels[0]), dim=0).flip(0)  # sides along x and y [rad]
     centers = mask.centers @ turn.T * (pixel / grid.pixel_scale)
-    hexagon = SparseAperture(
-        centers, mask.subaperture_diameter, mask.mask_diameter, "hexagon", mask.orientation + angle
-    )
+    hexagon = SparseAperture(centers, pose.hole, mask.mask_diameter, "hexagon", mask.orientation + angle)
     middle, width = FILTER
     places = [(i + 0.5) / config.n_wavelengths - 0.5 for i in range(config.n_wavelengths)]
     return hexagon, [(middle + width * place) / pose.magnification for place in places]
@@ -130,7 +129,7 @@ def make_model(config: Config, pose: Pose, grid: Grid, exposures: Exposures, flu
 def find_pose(
     config: Config, grid: Grid, exposures: Exposures, callback: Callback
 ) -> tuple[Pose, list[dict[str, Any]]]:
-    """The orientation, rotation and magnification of the mask with the lowest chi-square, and all that were tried.
+    """How the mask lies on the detector, by the lowest chi-square, and all that was tried.
 
     On two exposures of a single star on different pixels. A mask turned by 180 degrees makes the same image with
     aberrations of opposite parity, so x mirrored and y mirrored are the same to these data.
@@ -141,7 +140,7 @@ def find_pose(
     def chi_square(pose: Pose) -> float:
         fit = make_model(config, pose, grid, some, 0.02).fit(some, steps=3)
         rows.append(dataclasses.asdict(pose) | {"chi_square": float(fit.chi_square.mean())})
-        callback(Record("orientation", len(rows), 18, {"chi_square": rows[-1]["chi_square"]}))
+        callback(Record("orientation", len(rows), 21, {"chi_square": rows[-1]["chi_square"]}))
         return rows[-1]["chi_square"]
 
     scans: dict[bool, list[tuple[float, float]]] = {False: [], True: []}
@@ -153,7 +152,8 @@ def find_pose(
     magnification = valley(scales)
     turns = [rotation + turn for turn in (-0.2, 0.0, 0.2)]
     rotation = valley([(turn, chi_square(Pose(mirrored, turn, magnification))) for turn in turns])
-    best = Pose(mirrored, rotation, magnification)
+    holes = [(hole, chi_square(Pose(mirrored, rotation, magnification, hole))) for hole in (0.79, 0.81, 0.83)]
+    best = Pose(mirrored, rotation, magnification, valley(holes))
     chi_square(best)
     return best, rows
 
@@ -290,6 +290,8 @@ def restore(
     config: Config, pose: Pose, grid: Grid, exposures: Exposures, stage: str, callback: Callback
 ) -> RestorationResult:
     """The image, without being told that there is a star or a companion."""
+    # Its coarser pupil samples narrow the image of a hole, as larger holes would: the nominal size fits.
+    pose = dataclasses.replace(pose, hole=Pose.hole)
     aperture, wavelengths = optics(config, pose, grid, exposures.to_pixels)
 
     def named(record: Record) -> None:
@@ -408,8 +410,8 @@ def findings(config: Config, results: dict[str, Any]) -> list[str]:
     lines = [
         f"Mask on the detector: {'mirrored in x' if pose.mirrored else 'as in the catalogue, not mirrored'} (or that "
         f"turned by 180 degrees, which makes the same image), rotated by {pose.rotation:+.2f} degrees from x to y, "
-        f"magnified by {pose.magnification:.4f}: chi-square {same:.2f}, against at least {other:.0f} if mirrored the "
-        "other way.",
+        f"magnified by {pose.magnification:.4f}, holes of {pose.hole:.3f} m: chi-square {same:.2f}, against at least "
+        f"{other:.0f} if mirrored the other way.",
         f"Model and exposures of {config.calibrator} differ by {100 * results['flux_error']:.1f} % of a pixel's flux "
         "beyond the noise.",
     ]

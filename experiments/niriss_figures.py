@@ -80,13 +80,13 @@ def exposures_figure(exposures: Exposures, fit: Fit, radius: float) -> Figure:
     axes = figure.subplots(1, 3)
     data = torch.where(exposures.valid[0], exposures.frames[0], torch.nan)
     for ax, title, image in zip(axes, ("exposure", "model"), (data, fit.images[0]), strict=False):
-        drawn = ax.imshow((image / peak).clamp(min=1e-4), cmap="magma", norm=LogNorm(1e-4, 1), origin="lower")
+        drawn = ax.imshow((image / peak).clamp(min=1e-4).numpy(), cmap="magma", norm=LogNorm(1e-4, 1), origin="lower")
         ax.set_title(title)
     figure.colorbar(drawn, ax=list(axes[:2]), label="fraction of the peak", shrink=0.85)
     y, x = np.mgrid[: data.shape[0], : data.shape[1]]
     far = torch.from_numpy(np.hypot(y - data.shape[0] // 2, x - data.shape[1] // 2) > radius)
     left = torch.where(far, torch.nan, (data - fit.images[0]) / peak)
-    drawn = axes[2].imshow(left, cmap="RdBu_r", vmin=-0.01, vmax=0.01, origin="lower")
+    drawn = axes[2].imshow(left.numpy(), cmap="RdBu_r", vmin=-0.01, vmax=0.01, origin="lower")
     axes[2].set_title("exposure - model")
     figure.colorbar(drawn, ax=axes[2], label="fraction of the peak", shrink=0.85)
     return figure
