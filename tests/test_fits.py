@@ -397,6 +397,28 @@ def test_damaged_files_are_refused_in_one_line(tmp_path, mask, cube):
         Observation.from_fits([], mask)
 
 
+def test_no_damage_brings_anything_but_one_line(tmp_path, mask, cube):
+    """Bytes of headers and data changed at random, or the end cut off: read, or refused with a ValueError."""
+    extensions = [("ERR", cube / 10), ("DQ", np.eye(16, 20, dtype=np.int16))]
+    header = HEADER | SKY | {"BUNIT": "adu", "GAIN": 2.0, "OBJECT": "x"}
+    good = write(tmp_path / "good.fits", cube, header, extensions, "SCI").read_bytes()
+    rng = np.random.default_rng(0)
+    refusals = []
+    for _ in range(80):
+        damaged = np.frombuffer(good, dtype=np.uint8).copy()
+        places = rng.integers(0, 3 * 2880, rng.integers(1, 6))
+        damaged[places] = rng.integers(32, 127, len(places))
+        if rng.random() < 0.3:
+            damaged = damaged[: rng.integers(len(damaged))]
+        (tmp_path / "bad.fits").write_bytes(damaged.tobytes())
+        try:
+            Observation.from_fits(tmp_path / "bad.fits", mask, crop=6)
+        except ValueError as error:
+            refusals.append(str(error))
+    assert all("bad.fits" in message and "\n" not in message for message in refusals)
+    assert 20 < len(refusals) < 75
+
+
 @pytest.mark.parametrize(
     ("data", "message"),
     [

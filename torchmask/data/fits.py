@@ -19,7 +19,7 @@ class FITSImages:
     values : (T, H, W) float64
     errors : (T, H, W) or None, from an ERR extension
     valid : (T, H, W) bool: finite, and not marked in a DQ extension
-    header : the image's cards, and behind them those of the primary header
+    header : the cards that hold a value: the image's, and where it has none, those of the primary header
     is_cube : whether the file itself has a time axis
     """
 
@@ -27,7 +27,7 @@ class FITSImages:
     values: np.ndarray
     errors: np.ndarray | None
     valid: np.ndarray
-    header: Any
+    header: dict[str, bool | int | float | str]
     is_cube: bool
 
 
@@ -44,7 +44,7 @@ def read_fits(path: str | Path) -> FITSImages:
         several that could be meant, or its extensions disagree in shape.
     """
     from astropy.io import fits
-    from astropy.io.fits.verify import VerifyWarning
+    from astropy.io.fits.verify import VerifyError, VerifyWarning
     from astropy.utils.exceptions import AstropyUserWarning
 
     path = Path(path)
@@ -57,7 +57,7 @@ def read_fits(path: str | Path) -> FITSImages:
                 images = _images(path, hdus)
     except _Refused as error:
         raise ValueError(f"{path} {error}") from None
-    except (OSError, TypeError, ValueError, LookupError, EOFError, zlib.error) as error:
+    except (OSError, TypeError, ValueError, LookupError, EOFError, MemoryError, zlib.error, VerifyError) as error:
         raise _damaged(path, error) from error
     for warning in caught:  # all that astropy says of a truncated file or a wrong checksum
         if issubclass(warning.category, AstropyUserWarning) and not issubclass(warning.category, VerifyWarning):
@@ -84,8 +84,7 @@ def _images(path: Path, hdus: Any) -> FITSImages:
     if values is None or values.ndim not in (2, 3) or 0 in values.shape:
         shape = None if values is None else values.shape
         raise _Refused(f"holds an array of shape {shape}: it must be an image (H, W) or a cube (T, H, W)")
-    header = images[0].header.copy()
-    header.extend(hdus[0].header, unique=True)
+    header = _cards(hdus[0].header) | _cards(images[0].header)
     errors, quality = (_extension(hdus, name, values.shape) for name in ("ERR", "DQ"))
     valid = np.isfinite(values)
     if errors is not None:
@@ -104,11 +103,28 @@ def _images(path: Path, hdus: Any) -> FITSImages:
     )
 
 
+def _cards(header: Any) -> dict[str, bool | int | float | str]:
+    """The cards with a value; those that cannot be read are passed over, they may not be needed."""
+    from astropy.io.fits.verify import VerifyError
+
+    cards = {}
+    for card in header.cards:
+        try:
+            name, value = card.keyword, card.value
+        except (VerifyError, ValueError):
+            continue
+        if isinstance(value, bool | int | float | str) and value != "" and name not in ("COMMENT", "HISTORY", ""):
+            cards[name] = value
+    return cards
+
+
 def _extension(hdus: Any, name: str, shape: tuple[int, ...]) -> np.ndarray | None:
     """The data of a companion extension, one image for all frames if it is flat; None if there is none."""
-    if name not in hdus or hdus[name].data is None:
+    if name not in hdus:
         return None
-    data = hdus[name].data
+    data = hdus[name].data if hdus[name].is_image else None
+    if data is None:
+        raise _Refused(f"has {name} that is no image")
     if data.shape not in (shape, shape[-2:]):
         raise _Refused(f"has {name} of shape {data.shape}, and images of shape {shape}: they must agree")
     return np.broadcast_to(data, shape)

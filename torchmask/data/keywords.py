@@ -43,7 +43,7 @@ def number(header: Any, names: tuple[str, ...], path: Any) -> float | None:
     """
     for name in names:
         value = header.get(name)
-        if value is None or value == "":
+        if value is None:
             continue
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value < 0:
             raise ValueError(f"{path}: {name} is {value!r}, which is no positive number")
@@ -57,15 +57,16 @@ def pixel_matrix(header: Any) -> np.ndarray | None:
 
     if not any(name in header for name in ("CD1_1", "CD1_2", "CDELT1")):
         return None
-    cards = celestial_cards(header)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # astropy's corrections of old-fashioned cards
-        wcs = WCS(_as_header(cards), naxis=2)
-        units = [str(unit) for unit in wcs.wcs.cunit]
-        if not all(units):  # plain pixel coordinates, which say nothing of the sky
-            return None
-        scale = [unit.to("deg") if unit.is_equivalent("deg") else math.nan for unit in wcs.wcs.cunit]
-        matrix = np.diag(scale) @ wcs.pixel_scale_matrix
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # astropy's corrections of old-fashioned cards
+            wcs = WCS(_as_header(celestial_cards(header)), naxis=2)
+            if not all(str(unit) for unit in wcs.wcs.cunit):  # plain pixel coordinates, which say nothing of the sky
+                return None
+            scale = [unit.to("deg") for unit in wcs.wcs.cunit]
+            matrix = np.diag(scale) @ wcs.pixel_scale_matrix
+    except (ValueError, TypeError, AttributeError, MemoryError):  # cards that make no sense, units that are no angle
+        return None
     return matrix if np.isfinite(matrix).all() and np.linalg.det(matrix) != 0 else None
 
 
@@ -191,8 +192,7 @@ def celestial_cards(header: Any) -> dict[str, Any]:
 
 def kept_cards(header: Any) -> dict[str, Any]:
     """The cards that go with an observation: sky coordinates, target, telescope, filter and date."""
-    about = {name: header[name] for name in _ABOUT if name in header}
-    return celestial_cards(header) | {name: value for name, value in about.items() if value not in (None, "")}
+    return celestial_cards(header) | {name: header[name] for name in _ABOUT if name in header}
 
 
 def shift_cards(cards: dict[str, Any], x: int, y: int) -> dict[str, Any]:
