@@ -56,7 +56,7 @@ def save_oifits(
     Examples
     --------
     >>> import tempfile, torch
-    >>> from torchmask.data.visibilities import frame_observables
+    >>> from torchmask.data.fringes import frame_observables
     >>> from torchmask.grid import Grid
     >>> from torchmask.optics.aperture import SparseAperture
     >>> frames = torch.rand(4, 64, 64, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 1e4
