@@ -101,7 +101,7 @@ class RunLogger:
     def __init__(self, directory: str | Path, *, seed: int | None = None) -> None:
         from torch.utils.tensorboard import SummaryWriter  # before the folder is made: it may not be installed
 
-        self.directory = _claim(Path(directory))
+        self.directory: Path = _claim(Path(directory))
         self._start = time.monotonic()
         self._charts: dict[str, dict[str, list[str]]] = {}  # category -> title -> tags
         self._charted: set[tuple[str, str]] = set()
@@ -111,7 +111,7 @@ class RunLogger:
         self._image_steps: dict[str, int] = {}
         self._session_end: Any = None
         self._closed = False
-        self.writer = SummaryWriter(str(self.directory), flush_secs=_FLUSH_INTERVAL)
+        self.writer: Any = SummaryWriter(str(self.directory), flush_secs=_FLUSH_INTERVAL)
         self._metrics = open(self.directory / "metrics.jsonl", "x", encoding="utf-8", buffering=1)  # noqa: SIM115
         self._write_status("running")
         environment = _environment(seed)

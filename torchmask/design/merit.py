@@ -43,7 +43,7 @@ class Holes:
 
     def __init__(self, template: SparseAperture, constraints: Sequence[Constraint]) -> None:
         self.template = template
-        self.constraints = tuple(constraints)
+        self.constraints: tuple[Constraint, ...] = tuple(constraints)
         self.radius = center_radius(template) / template.mask_diameter
         self.subspace = Subspace(template.n_subapertures, constraints, template.centers)
         pinned = self.subspace.origin.unflatten(-1, (-1, 2)) / template.mask_diameter

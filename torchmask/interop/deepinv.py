@@ -69,7 +69,7 @@ class StackPhysics(LinearPhysics):
             raise ValueError(f"readout_noise is {readout_noise}: it must be finite and not negative, in electrons rms")
         noise = PoissonGaussianNoise(1 / unit, readout_noise / unit, clip_positive=True, rng=generator)
         super().__init__(noise_model=noise.to(psfs.dtype), device=psfs.device)  # type: ignore[arg-type]
-        self.unit = float(unit)
+        self.unit: float = float(unit)
         self.register_buffer("psfs", psfs)
 
     @classmethod

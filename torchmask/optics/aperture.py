@@ -216,13 +216,13 @@ class SparseAperture(Aperture):
         if isinstance(centers, nn.Parameter):
             if dtype not in (None, centers.dtype) or device not in (None, centers.device):
                 raise ValueError("dtype and device of a Parameter are its own: move it before it is handed in")
-            self.centers = centers
+            self.centers: Tensor = centers
         else:
             self.register_buffer("centers", centers.to(dtype=dtype, device=device))
-        self.subaperture_diameter = float(subaperture_diameter)
-        self.mask_diameter = float(mask_diameter)
+        self.subaperture_diameter: float = float(subaperture_diameter)
+        self.mask_diameter: float = float(mask_diameter)
         self.shape = shape
-        self.orientation = float(orientation)
+        self.orientation: float = float(orientation)
 
     @classmethod
     def from_catalog(
@@ -353,8 +353,9 @@ class FullAperture(Aperture):
                 "blocked, at least 0 and below 1"
             )
         self.register_buffer("centers", torch.zeros(1, 2, dtype=dtype or torch.float64, device=device))
-        self.subaperture_diameter = self.mask_diameter = float(diameter)
-        self.central_obstruction = float(central_obstruction)
+        self.subaperture_diameter: float = float(diameter)
+        self.mask_diameter: float = float(diameter)
+        self.central_obstruction: float = float(central_obstruction)
 
     def extra_repr(self) -> str:
         return f"diameter={self.mask_diameter:.6g}, central_obstruction={self.central_obstruction:.4g}"

@@ -99,7 +99,7 @@ class Detector(nn.Module):
         super().__init__()
         if not (math.isfinite(readout_noise) and readout_noise >= 0):
             raise ValueError(f"readout_noise is {readout_noise}: it must be finite and not negative, in electrons rms")
-        self.readout_noise = float(readout_noise)
+        self.readout_noise: float = float(readout_noise)
 
     def forward(self, expected: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Draw frames (..., H, W) [electrons] whose mean is `expected` (..., H, W) [electrons].

@@ -98,11 +98,11 @@ class RandomField:
     ) -> None:
         self.bands = bands
         self.shape = shape
-        self.kind = {"dtype": COMPLEX[dtype], "device": device}
+        self.kind: dict[str, Any] = {"dtype": COMPLEX[dtype], "device": device}
         # randn gives complex numbers a mean square of 1: half of it for each of the two fields
-        self.amplitudes = [(math.sqrt(2) * band.amplitude).to(device, dtype) for band in bands]
+        self.amplitudes: list[Tensor] = [(math.sqrt(2) * band.amplitude).to(device, dtype) for band in bands]
         places = [torch.arange(n, **_HOST) * s for n, s in zip(shape, step, strict=True)]
-        self.waves = [
+        self.waves: list[tuple[Tensor, Tensor]] = [
             (_phasor(places[0][:, None] * fy).to(**self.kind), _phasor(fx[:, None] * places[1]).to(**self.kind))
             for fy, fx, _ in bands[1:]
         ]

@@ -159,8 +159,8 @@ class TurbulencePhase(nn.Module):
             raise ValueError(f"wind is {wind}: it must be two finite numbers (vx, vy), in m/s")
         if frame_interval is not None and not (math.isfinite(frame_interval) and frame_interval > 0):
             raise ValueError(f"frame_interval is {frame_interval}: it must be finite and positive, in s")
-        self.r0 = float(r0)
-        self.outer_scale = float(outer_scale)
+        self.r0: float = float(r0)
+        self.outer_scale: float = float(outer_scale)
         self.wind = wind
         self.frame_interval = frame_interval
 

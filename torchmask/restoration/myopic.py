@@ -118,10 +118,10 @@ class MyopicDeconvolution(nn.Module):
             raise ValueError(f"static_modes is {static_modes}: it must be at least 0")
         symmetric = aperture.n_subapertures == 1
         n_modes = n_modes or (231 if symmetric else 6)
-        self.known_r0 = r0 is not None
+        self.known_r0: bool = r0 is not None
         # Masks are made for holes of about r0; a full pupil that needs a restoration spans several.
-        self.r0 = r0 or aperture.subaperture_diameter / (7 if symmetric else 1)
-        self.outer_scale = outer_scale or 20 * aperture.mask_diameter
+        self.r0: float = r0 or aperture.subaperture_diameter / (7 if symmetric else 1)
+        self.outer_scale: float = outer_scale or 20 * aperture.mask_diameter
         self.readout_noise = readout_noise
         self.tv_weight = tv_weight
         self.aberration_prior = aberration_prior
@@ -129,7 +129,7 @@ class MyopicDeconvolution(nn.Module):
         self.tolerance = tolerance
         self.aperture = aperture
         self.grid = grid
-        self.n_modes = max(n_modes, static_modes)
+        self.n_modes: int = max(n_modes, static_modes)
 
         def mixing(modes: int, r0: float) -> Tensor:
             """Coefficients (N J) of the modes 1 to `modes` from their parameters."""
@@ -144,7 +144,7 @@ class MyopicDeconvolution(nn.Module):
 
         columns = mixing(n_modes, self.r0)
         static = mixing(static_modes, aperture.subaperture_diameter) if static_modes else columns[:, :0]
-        self.model = ExposureModel(
+        self.model: ExposureModel = ExposureModel(
             aperture,
             grid,
             self.n_modes,

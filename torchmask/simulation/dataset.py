@@ -138,15 +138,15 @@ class StackDataset(Dataset[dict[str, Tensor]]):
             raise ValueError(f"length is {length}: it must be a whole number of at least 1")
         if seed != int(seed) or seed < 0:
             raise ValueError(f"seed is {seed}: it must be a whole number of at least 0")
-        self.aperture = copy.deepcopy(aperture).requires_grad_(False).to("cpu", dtype)
+        self.aperture: Aperture = copy.deepcopy(aperture).requires_grad_(False).to("cpu", dtype)
         self.grid = grid
-        self.length = int(length)
+        self.length: int = int(length)
         self.n_frames = n_frames
-        self.ranges = ranges or StackRanges()
+        self.ranges: StackRanges = ranges or StackRanges()
         self.size = size
         self.outer_scale = outer_scale
-        self.detector = Detector(readout_noise)
-        self.seed = int(seed)
+        self.detector: Detector = Detector(readout_noise)
+        self.seed: int = int(seed)
         self.dtype = dtype
         self._mesh = satellite_mesh() if path is None else load_mesh(path)
         self[0]  # refuses what cannot be simulated now rather than in a worker
