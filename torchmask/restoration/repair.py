@@ -15,15 +15,15 @@ from torchmask.restoration.problem import JointProblem, State
 
 _OUTLYING = 1.25  # times the median residual variance of the frames
 _STARTS = 6
-_ITERATIONS = 60
+_ROUNDS, _ITERATIONS = 3, 30  # of falling noise, without which most random starts fall into poor minima
 
 
-def repair(problem: JointProblem, state: State, excess: Tensor, seed: int) -> tuple[State, int]:
+def repair(problem: JointProblem, state: State, excess: Tensor, first_excess: float, seed: int) -> tuple[State, int]:
     """Aberrations of outlying frames from the best of several random starts, and the evaluations that it took.
 
     `excess` (T,) tells which frames fit badly. A frame keeps its aberrations unless others lower its cost.
     """
-    bad = (excess > _OUTLYING * excess.median()).nonzero().flatten()
+    bad = (excess > _OUTLYING * excess.quantile(0.25)).nonzero().flatten()
     if not len(bad):
         return state, 0
     precision = problem.precision
@@ -48,7 +48,11 @@ def repair(problem: JointProblem, state: State, excess: Tensor, seed: int) -> tu
     for _ in range(_STARTS):
         noise = torch.randn(now.z.shape, dtype=now.z.dtype, device="cpu", generator=generator).to(now.z)
         fresh = torch.cat([spread * noise[:, :own], now.z[:, own:]], dim=1)  # what is common to all frames stays
-        trial = part.descend(replace(now, z=fresh), _ITERATIONS, count)
+        trial = replace(now, z=fresh, excess=torch.full_like(now.excess, first_excess))
+        for _ in range(_ROUNDS):
+            trial = part.descend(trial, _ITERATIONS, count)
+            trial = replace(trial, excess=part.calibrate(trial).excess)
+        trial = replace(trial, excess=now.excess)
         costs = part.frame_costs(trial)
         best = torch.where((costs < least)[:, None], trial.z, best)
         least = torch.minimum(costs, least)

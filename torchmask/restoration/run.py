@@ -68,6 +68,8 @@ class Restoration:
         weight = valid.new_ones(1, 1, 1) if bool(valid.all()) else valid
         precision = weight.to(basis) * (self.unit**2 / self.variance)
         self.problem = JointProblem(self.model, self.frames, precision, method.tv_weight, parallel=parallel)
+        change = self.frames - self.frames.mean((1, 2), keepdim=True) * self.frames.mean(0)
+        self._first_excess = max(1.0, float((change**2 * precision).mean()) / _CONTINUATION)
         self._symmetric = method.aperture.n_subapertures == 1  # under point reflection, and of many modes
 
     def __call__(
@@ -120,7 +122,7 @@ class Restoration:
         """What no descent does: frames in a local minimum start anew, the object moves between the pixels."""
         progress.centrings += 1
         excess = self.problem.calibrate(progress.state).excess
-        state, evaluations = repair(self.problem, progress.state, excess, seed=progress.centrings)
+        state, evaluations = repair(self.problem, progress.state, excess, self._first_excess, seed=progress.centrings)
         progress.n_evaluations += evaluations
         progress.state = centre_on_pixels(self.problem, state)
         if progress.state is state:  # it is where it belongs
@@ -165,9 +167,7 @@ class Restoration:
         gains = self.frames.mean((1, 2)).double()
         gains = gains / gains.mean()
         prior = 1.0 if self.method.aberration_prior else 0.0
-        change = self.frames - gains[:, None, None].to(self.frames) * self.frames.mean(0)
-        unexplained = float((change**2 * self.problem.precision).mean()) / _CONTINUATION
-        excess = torch.full_like(gains, max(1.0, unexplained))
+        excess = torch.full_like(gains, self._first_excess)
         state = State(image, z, gains, prior, excess)
         return _Progress(state) if start is None else self._warm(state, start)
 
