@@ -37,12 +37,17 @@ class BatchedBFGS:
     are skipped.
     """
 
+    first_step: float
+    tolerance: float
+    patience: int
+    finished: Tensor
+
     def __init__(self, start: Tensor, first_step: float, tolerance: float, patience: int = 1000) -> None:
         self.first_step, self.tolerance, self.patience = first_step, tolerance, patience
         n, size = start.shape
-        self.points = start.clone()
-        self.values = start.new_full((n,), torch.inf)
-        self.gradients = torch.zeros_like(start)
+        self.points: Tensor = start.clone()
+        self.values: Tensor = start.new_full((n,), torch.inf)
+        self.gradients: Tensor = torch.zeros_like(start)
         self.finished = torch.zeros(n, dtype=torch.bool, device=start.device)
         self._identity = torch.eye(size, dtype=start.dtype, device=start.device)
         self._inverse = self._identity.repeat(n, 1, 1)

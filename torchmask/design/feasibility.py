@@ -102,11 +102,11 @@ class Subspace:
             names = " and ".join(str(c) for c in constraints if isinstance(c, LinearEquality))
             raise Infeasible(f"no mask of {n_subapertures} holes obeys {names} together")
         like = torch.zeros((), dtype=torch.float64) if like is None else like
-        self.origin = torch.as_tensor(origin).to(like)
-        self.basis = torch.as_tensor(right[rank:].T.copy()).to(like)
+        self.origin: Tensor = torch.as_tensor(origin).to(like)
+        self.basis: Tensor = torch.as_tensor(right[rank:].T.copy()).to(like)
         # What z must change by so that one hole moves by a given step, with the smallest change elsewhere.
         rows = right[rank:].T.reshape(n_subapertures, 2, -1)
-        self.lift = torch.as_tensor(np.linalg.pinv(rows, rcond=1e-9)).to(like)  # (N, F, 2)
+        self.lift: Tensor = torch.as_tensor(np.linalg.pinv(rows, rcond=1e-9)).to(like)  # (N, F, 2)
 
     @property
     def size(self) -> int:

@@ -23,6 +23,9 @@ SAME = 0.01  # masks whose sorted separations differ by less than this of the di
 class Pool:
     """The best local optima so far, all different up to rotation, reflection and the order of holes."""
 
+    holes: Holes
+    size: int
+
     def __init__(self, holes: Holes, size: int) -> None:
         self.holes, self.size = holes, size
         self.entries: list[tuple[float, Tensor, Tensor]] = []  # value, x, sorted separations

@@ -44,8 +44,8 @@ class Holes:
     def __init__(self, template: SparseAperture, constraints: Sequence[Constraint]) -> None:
         self.template = template
         self.constraints: tuple[Constraint, ...] = tuple(constraints)
-        self.radius = center_radius(template) / template.mask_diameter
-        self.subspace = Subspace(template.n_subapertures, constraints, template.centers)
+        self.radius: float = center_radius(template) / template.mask_diameter
+        self.subspace: Subspace = Subspace(template.n_subapertures, constraints, template.centers)
         pinned = self.subspace.origin.unflatten(-1, (-1, 2)) / template.mask_diameter
         self.subspace.origin = self._unroll(pinned, 1.0).flatten(-2)
 
@@ -105,6 +105,11 @@ class Merit:
     problem. `evaluations` counts the masks whose MSE was computed, with or without gradient.
     Source: Nocedal & Wright, Numerical Optimization, section 17.3.
     """
+
+    criterion: Criterion
+    holes: Holes
+    weight: float
+    evaluations: int
 
     def __init__(self, criterion: Criterion, holes: Holes, weight: float) -> None:
         self.criterion, self.holes, self.weight = criterion, holes, weight

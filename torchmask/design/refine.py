@@ -49,6 +49,11 @@ class SearchResult:
 class Monitor:
     """Keeps the history of a stage and tells the callback, about a hundred times."""
 
+    stage: str
+    budget: int
+    holes: Holes
+    callback: Callback | None
+
     def __init__(self, stage: str, budget: int, holes: Holes, callback: Callback | None) -> None:
         self.stage, self.budget, self.holes, self.callback = stage, budget, holes, callback
         self.rows: list[tuple[float, float]] = []
