@@ -466,7 +466,7 @@ def main(config: Config) -> int:
     directory = config.runs / (config.name or datetime.now().strftime("niriss-%Y%m%d-%H%M%S"))
     if config.smoke:
         config = dataclasses.replace(
-            config, n_wavelengths=1, static_modes=3, radius=12.0, max_iterations=20, n_injections=2, step=0.1
+            config, crop=32, n_wavelengths=1, static_modes=3, radius=12.0, max_iterations=20, n_injections=2, step=0.1
         )
     try:
         for star in (config.target, config.calibrator):  # before a folder is made

@@ -192,14 +192,14 @@ def test_valley_of_a_parabola():
     assert niriss_ab_dor.valley([(0.0, 1.0), (1.0, 2.0), (2.0, 5.0)]) == 0.0  # never beyond what was tried
 
 
-def write(folder, star, companion, mask, n):
+def write(folder, star, companion, mask, n, seed):
     """Files as the archive gives them, in DN/s, with two dithers."""
     from astropy.io import fits
 
     for t in range(n):
         sky = sky_matrix(188.0)
         place = ((31.9, 34.1), (36.05, 29.0))[t % 2]
-        image, noise = expose(mask, sky, companion, place, 64, [MIDDLE], seed=10 * n + t)
+        image, noise = expose(mask, sky, companion, place, 64, [MIDDLE], seed=seed + t)
         unit = niriss_ab_dor.GAIN * 26.0
         sci = fits.ImageHDU((image / unit).numpy().astype(np.float32), name="SCI")
         degrees = np.degrees(sky)
@@ -220,7 +220,7 @@ def test_directions_on_the_sky_are_those_of_the_world_coordinates(tmp_path):
     from astropy.io import fits
     from astropy.wcs import WCS
 
-    write(tmp_path, "star", np.zeros(3), SparseAperture.from_catalog(niriss_ab_dor.MASK), 1)
+    write(tmp_path, "star", np.zeros(3), SparseAperture.from_catalog(niriss_ab_dor.MASK), 1, seed=1)
     exposures, grid = niriss_ab_dor.read(tmp_path, "star", 40)
     assert grid.wavelength == MIDDLE
     assert grid.pixel_scale == pytest.approx(SCALE, rel=1e-6)
@@ -241,14 +241,15 @@ def observed(tmp_path_factory):
     turn = math.radians(0.7)
     rotation = torch.tensor([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]], dtype=torch.float64)
     mask = SparseAperture(mask.centers @ rotation.T, 0.8, mask.mask_diameter, "hexagon", mask.orientation + turn)
-    write(folder, "pair", np.array([0.03, *polar_offset(0.35, 100.0)]), mask, 2)
-    write(folder, "single", np.zeros(3), mask, 2)
+    write(folder, "pair", np.array([0.03, *polar_offset(0.35, 100.0)]), mask, 2, seed=10)
+    write(folder, "single", np.zeros(3), mask, 2, seed=20)
+    write(folder, "lonely", np.zeros(3), mask, 2, seed=30)
     return folder
 
 
-def run(folder, runs, target, calibrator="single"):
+def run(folder, runs, target):
     config = niriss_ab_dor.Config(
-        data=folder, target=target, calibrator=calibrator, crop=40, smoke=True, name=target, runs=runs
+        data=folder, target=target, calibrator="single", crop=40, smoke=True, name=target, runs=runs
     )
     assert niriss_ab_dor.main(config) == 0
     return json.loads((runs / target / "results.json").read_text())
@@ -273,11 +274,14 @@ def test_from_files_to_the_companion(observed, tmp_path, capsys):
         assert (tmp_path / "pair" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_no_companion_is_said_so(observed, tmp_path, capsys):
-    results = run(observed, tmp_path, "single")
+def test_no_companion_is_said_so(observed, tmp_path, capsys, monkeypatch):
+    pose = niriss_ab_dor.Pose(mirrored=True, rotation=0.7)
+    rows = [{"mirrored": mirrored, "chi_square": 1.0} for mirrored in (True, False)]
+    monkeypatch.setattr(niriss_ab_dor, "find_pose", lambda *args: (pose, rows))
+    results = run(observed, tmp_path, "lonely")
     assert not results["found"]
     assert results["companion"] is None
-    assert "single: NO companion found" in capsys.readouterr().out
+    assert "lonely: NO companion found" in capsys.readouterr().out
 
 
 def test_missing_exposures_are_said_so(tmp_path, capsys):
@@ -286,6 +290,7 @@ def test_missing_exposures_are_said_so(tmp_path, capsys):
     assert not (tmp_path / "runs").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not REAL.is_dir(), reason="the real exposures lie beside the checkout")
 def test_real_exposures(tmp_path, capsys):
     """Small and rough; what counts is that it runs on files from the archive, and finds the mask's way round."""
