@@ -525,6 +525,23 @@ def test_shifted_cards_leave_the_originals_alone():
     assert cards == SKY
 
 
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"valid": torch.ones(3, 16, 20)}, r"valid is torch.float32 of shape \(3, 16, 20\): it must be bool"),
+        ({"valid": torch.ones(2, 16, 20, dtype=torch.bool)}, r"valid is torch.bool of shape \(2, 16, 20\)"),
+        ({"errors": torch.ones(16, 20)}, r"errors has shape \(16, 20\): it must be \(3, 16, 20\)"),
+        ({"readout_noise": -1.0}, r"readout_noise is -1.0"),
+    ],
+)
+def test_an_observation_of_parts_that_disagree_is_refused(mask, cube, fields, message):
+    with pytest.raises(ValueError, match=message):
+        Observation(
+            **{"frames": torch.from_numpy(cube), "aperture": mask, "readout_noise": None} | fields,
+            grid=Grid((16, 20), 1e-7, 550e-9),
+        )
+
+
 # --- the real observations
 
 

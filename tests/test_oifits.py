@@ -11,7 +11,7 @@ from scipy.integrate import quad
 from scipy.special import j0
 
 from torchmask.data.fringes import frame_observables
-from torchmask.data.visibilities import Observables, restored_observables
+from torchmask.data.visibilities import Observables, restored_observables, sky_stations
 from torchmask.grid import Grid
 from torchmask.oifits import save_oifits
 from torchmask.optics.aperture import FullAperture, SparseAperture
@@ -191,6 +191,18 @@ def test_signs_on_the_sky_as_a_reader_of_the_file_sees_them(tmp_path, mask, grid
         assert np.abs(wrapped(phases - closures(expected, 4))).max() < (3 * lost + 0.003) / np.abs(expected).min() < 0.1
         squared = np.array([row.vis2data.data[0] for row in data.vis2])
         assert np.abs(squared - np.abs(expected) ** 2).max() < 2 * lost + 0.003
+
+
+def test_oblong_and_skewed_pixels_have_the_phase_of_their_place_on_the_sky(mask, grid):
+    header = sky_cards(0.4, False, grid.pixel_scale)
+    header |= {"CD1_1": 1.01 * header["CD1_1"], "CD2_1": 1.02 * header["CD2_1"]}
+    matrix = np.radians([[header["CD1_1"], header["CD1_2"]], [header["CD2_1"], header["CD2_2"]]])
+    observation = Observation(torch.ones(1, *grid.shape), mask, grid, 0.0, header=header)
+    x, y = 5.0, -3.0
+    nu = mask.centers.numpy() / grid.period
+    expected = nu @ [x, y]
+    stations = sky_stations(observation).numpy()
+    np.testing.assert_allclose(stations @ (matrix @ [x, y]) / WAVELENGTH, expected, rtol=1e-12, atol=1e-12)
 
 
 def test_a_restored_object_has_exactly_the_visibilities_of_its_pixels(mask, grid):

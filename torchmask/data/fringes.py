@@ -66,9 +66,9 @@ def frame_observables(observation: Observation) -> Observables:
     """
     aperture, grid = observation.aperture, observation.grid
     pairs, triangles = pairs_and_triangles(aperture)
-    frames, valid = check_frames(observation.frames, observation.valid, grid)
-    readout = observation.readout_noise or 0.0
-    variance = frames.clamp(min=0) + readout**2 if observation.errors is None else observation.errors.double() ** 2
+    frames, valid = (values.cpu() for values in check_frames(observation.frames, observation.valid, grid))
+    readout, errors = observation.readout_noise or 0.0, observation.errors
+    variance = frames.clamp(min=0) + readout**2 if errors is None else errors.double().cpu() ** 2
     envelope = _Envelope(aperture, grid)
     waves = fringe_waves(aperture, grid, pairs)
     fits = [_fit_fringes(*frame, envelope, waves, aperture) for frame in zip(frames, valid, variance, strict=True)]
@@ -79,7 +79,7 @@ def frame_observables(observation: Observation) -> Observables:
     logarithms = _log_jacobian(light, fringes)
     n = aperture.n_subapertures
     values, noise = fringes * n, noise * n**2
-    visibilities, errors = _ratio(values, light, noise / 2)
+    visibilities, visibility_errors = _ratio(values, light, noise / 2)
     power = (values.abs() ** 2 - noise).clamp(min=0)
     squared, squared_errors = _ratio(
         values.abs() ** 2 - noise, light**2, 4 * power**2 * _variance(logarithms.real, covariance) + noise**2
@@ -98,7 +98,7 @@ def frame_observables(observation: Observation) -> Observables:
         triangles,
         sky_stations(observation),
         visibilities,
-        errors,
+        visibility_errors,
         squared,
         squared_errors,
         triple.angle(),

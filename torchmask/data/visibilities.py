@@ -105,7 +105,7 @@ def restored_observables(result: RestorationResult, observation: Observation) ->
     """
     aperture, grid = observation.aperture, observation.grid
     pairs, triangles = pairs_and_triangles(aperture)
-    scene = result.object.double()
+    scene = result.object.double().cpu()
     if tuple(scene.shape) != grid.shape:
         raise ValueError(f"the object has shape {tuple(scene.shape)}: the observation's frames have {grid.shape}")
     light = float(scene.sum())
