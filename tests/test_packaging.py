@@ -1,6 +1,7 @@
 """What is published: an sdist and a wheel that hold all that is needed, and import quickly where nothing else is."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -114,3 +115,15 @@ print(json.dumps([torchmask.__file__, seconds, sorted(new - set(sys.stdlib_modul
 @pytest.mark.slow
 def test_the_installed_command_runs(installed, tmp_path):
     assert "golay6" in run(installed.parent / "torchmask", "masks", cwd=tmp_path)
+
+
+@pytest.mark.slow
+def test_the_public_names_are_typed(installed, tmp_path):
+    """As a type checker of a user's project sees them; what is left are attributes whose types it has to infer."""
+    environment = {**os.environ, "PATH": f"{installed.parent}:{os.environ['PATH']}"}
+    environment["VIRTUAL_ENV"] = str(installed.parents[1])
+    command = [sys.executable, "-m", "pyright", "--verifytypes", "torchmask", "--ignoreexternal", "--outputjson"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path, env=environment)
+    report = json.loads(done.stdout)["typeCompleteness"]
+    assert report["exportedSymbolCounts"]["withKnownType"] > 1000
+    assert report["completenessScore"] > 0.97

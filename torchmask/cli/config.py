@@ -90,7 +90,7 @@ def stored(options: Any) -> dict[str, Any]:
     return {field.name: plain(getattr(options, field.name)) for field in _fields(type(options))}
 
 
-def _fields(options: type) -> list[dataclasses.Field]:
+def _fields(options: type) -> list[dataclasses.Field[Any]]:
     return [field for field in dataclasses.fields(options) if field.name not in _NOT_STORED]
 
 

@@ -140,7 +140,7 @@ def _load(path: Path, task: Task) -> dict[str, Any] | None:
 
 
 def _compute(
-    function: Callable, pending: Mapping[Path, Task], backend: str, n_workers: int | None
+    function: Callable[..., Any], pending: Mapping[Path, Task], backend: str, n_workers: int | None
 ) -> Iterator[tuple[Path, Any, str | None]]:
     """(path, result, None) or (path, None, traceback) of each task as it ends."""
     import joblib
@@ -155,7 +155,7 @@ def _compute(
         yield from parallel(joblib.delayed(_guarded)(function, path, task) for path, task in pending.items())
 
 
-def _guarded(function: Callable, path: Path, task: Task) -> tuple[Path, Any, str | None]:
+def _guarded(function: Callable[..., Any], path: Path, task: Task) -> tuple[Path, Any, str | None]:
     """One task on one thread; a failure travels as text, so that it does not end the others."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

@@ -217,7 +217,7 @@ class Observation:
             raise ValueError(f"{path} holds no valid observation: {error}") from error
 
     @classmethod
-    def _from_arrays(cls, stored: dict) -> Observation:
+    def _from_arrays(cls, stored: dict[str, Any]) -> Observation:
         number = {name: float(stored[name].item()) for name in _NUMBERS if name in stored}
         centers, diameter = torch.from_numpy(stored["centers"]), number["subaperture_diameter"]
         shape, orientation = str(stored.get("shape", "disc")), number.get("orientation", 0.0)
