@@ -103,7 +103,6 @@ def _view_fits(path: Path) -> View:
     lines = [f"{what} of {rows} x {columns} pixels, {100 * images.valid.mean():.4g} % of them valid"]
     keys = ("OBJECT", "TELESCOP", "INSTRUME", "FILTER", "WAVELEN", "PIXELSCL", "BUNIT", "CHISQ", "NOISE")
     lines += [f"{key} = {images.header[key]}" for key in keys if key in images.header]
-    lines += [f"HISTORY {line}" for line in images.header.get("HISTORY", [])]
     scale = images.header.get("PIXELSCL")
     angle = scale * ARCSEC if isinstance(scale, float) else None
     if count == 1:
