@@ -28,6 +28,7 @@ myst_enable_extensions = ["amsmath", "attrs_inline", "colon_fence", "deflist", "
 myst_heading_anchors = 3
 
 autodoc_typehints = "signature"
+autodoc_mock_imports = ["deepinv"]  # an extra, whose torchvision may not suit the torch that is installed
 autodoc_member_order = "bysource"
 napoleon_google_docstring = False
 napoleon_use_rtype = False
