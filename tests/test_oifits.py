@@ -1,5 +1,6 @@
 """Visibilities and closure phases against closed forms, their errors, their signs on the sky, and the OIFITS file."""
 
+import dataclasses
 import itertools
 import math
 from pathlib import Path
@@ -15,9 +16,12 @@ from torchmask.data.visibilities import Observables, restored_observables, sky_s
 from torchmask.grid import Grid
 from torchmask.oifits import save_oifits
 from torchmask.optics.aperture import FullAperture, SparseAperture
+from torchmask.optics.detector import Detector
 from torchmask.optics.otf import disc_otf, psf_from_samples
+from torchmask.optics.turbulence import TurbulencePhase
+from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.result import RestorationResult
-from torchmask.simulation.observation import Observation
+from torchmask.simulation.observation import Observation, simulate_observation
 
 reader = pytest.importorskip("oifits")
 fits = pytest.importorskip("astropy.io.fits")
@@ -278,6 +282,25 @@ def test_errors_of_a_restored_object_are_those_of_frames_with_its_noise():
         torch.testing.assert_close(getattr(restored, name), getattr(direct, name), rtol=0.08, atol=0)
     louder = restored_observables(result_of(scene, mask, n_frames=2, noise=6.0), observation)
     torch.testing.assert_close(louder.closure_errors, 2 * restored.closure_errors)
+    worse = dataclasses.replace(result_of(scene, mask, n_frames=2, noise=3.0), chi_square=torch.tensor([3.0, 5.0]))
+    torch.testing.assert_close(restored_observables(worse, observation).closure_errors, 2 * restored.closure_errors)
+
+
+def test_restoring_a_binary_brings_its_closure_phases_nearer_the_truth():
+    mask = SparseAperture.from_catalog("golay6", 1.0, 0.12)
+    grid = Grid.nyquist(mask.extent, WAVELENGTH, 48)
+    scene = torch.zeros(48, 48, dtype=torch.float64)
+    scene[24, 24], scene[20, 27] = 1e6, 3e5
+    turbulence, generator = TurbulencePhase(0.2, 20.0), torch.Generator().manual_seed(0)
+    seen = simulate_observation(scene, mask, grid, turbulence, Detector(), 8, generator)
+    restored = MyopicDeconvolution(mask, grid, r0=0.2, max_iterations=300).restore(seen.frames)
+    rms = []
+    for observables in (restored_observables(restored, seen), frame_observables(seen)):
+        truth = closures(binary(observables.baselines, 3 * grid.pixel_scale, -4 * grid.pixel_scale, 0.3), 6)
+        rms.append(float(np.sqrt((wrapped(observables.closure_phases.numpy() - truth) ** 2).mean())))
+    assert np.abs(truth).max() > 0.5
+    assert rms[0] < 0.5 * rms[1]
+    assert rms[1] < 0.06
 
 
 # --- the file

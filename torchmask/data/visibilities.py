@@ -74,9 +74,10 @@ class Observables:
 def restored_observables(result: RestorationResult, observation: Observation) -> Observables:
     """Visibilities and closure phases of a restored object, freed of the aberrations that were restored with it.
 
-    Errors are those that the noise alone would leave if the restored aberrations were exact: the noise of the frames
-    over the light that their transfer functions, made from the restored coefficients, send into the patch of each
-    baseline. The prior and the uncertainty of the aberrations are not in them.
+    Errors are those that noise alone would leave if the restored aberrations were exact: the noise of the frames (or
+    what the model leaves unexplained, if that is more) over the light that their transfer functions, made from the
+    restored coefficients, send into the patch of each baseline. The prior and the uncertainty of the aberrations are
+    not in them: at high flux these are larger.
 
     Parameters
     ----------
@@ -112,7 +113,8 @@ def restored_observables(result: RestorationResult, observation: Observation) ->
     if not light > 0:
         raise ValueError("the restored object is black: it has no visibilities")
     values = (fringe_waves(aperture, grid, pairs).conj() @ scene.to(torch.complex128).flatten()) / light
-    noise = result.noise**2 * math.prod(grid.shape) / (light**2 * _transmitted(result, aperture, grid, pairs))
+    variance = result.noise**2 * max(1.0, float(result.chi_square.mean()))
+    noise = variance * math.prod(grid.shape) / (light**2 * _transmitted(result, aperture, grid, pairs))
     total, of_light = noise[1:], noise[0]
     power = values.abs() ** 2
     first, second, third = triangle_sides(pairs, triangles)
