@@ -67,7 +67,7 @@ class RestorationOptions:
     prior: bool = True
     """Weigh aberrations by their von Karman statistics."""
     max_iterations: int = 700
-    """Upper limit of L-BFGS-B iterations."""
+    """Upper limit of iterations."""
 
 
 @dataclass(frozen=True)

@@ -84,7 +84,7 @@ class Options(MaskOptions, FITSOptions, RunOptions):
     tv_weight: float = 1.0
     """Of the total variation of the object, without unit: more is smoother."""
     max_iterations: int = 1000
-    """Upper limit of L-BFGS-B iterations."""
+    """Upper limit of iterations."""
     tolerance: float = 1e-4
     """Converged when 100 iterations lower the cost by less than this fraction."""
 

@@ -31,7 +31,7 @@ from torchmask.restoration.subpixel import centre_on_pixels
 if TYPE_CHECKING:
     from torchmask.restoration.myopic import MyopicDeconvolution
 
-SEGMENT = 100  # iterations between restarts of L-BFGS-B
+SEGMENT = 100  # iterations between restarts of the descent
 _BLURRED = 300  # iterations after which the object is sharp enough to look for its place and for lost frames
 _CENTRINGS = 3  # how often that is done
 _CONTINUATION = 30.0  # the first noise variance: what the mean frame leaves unexplained over this
