@@ -217,6 +217,13 @@ def inject(exposures: Exposures, star: Fit, companion: Tensor) -> Exposures:
     return dataclasses.replace(exposures, frames=exposures.frames + companion[0] * moved)
 
 
+def turned(change: Tensor, companion: Tensor) -> Tensor:
+    """A difference in (contrast, east, north) as contrast, along and across the direction of a companion."""
+    outwards = companion[1:] / torch.linalg.vector_norm(companion[1:])
+    across = torch.stack([outwards[1], -outwards[0]])
+    return torch.stack([change[0], change[1:] @ outwards, change[1:] @ across])
+
+
 def floor_by_injection(
     model: CompanionModel, exposures: Exposures, star: Fit, like: Tensor, n: int, step: float, callback: Callback
 ) -> tuple[Tensor, list[dict[str, float]]]:
@@ -233,8 +240,7 @@ def floor_by_injection(
         start = torch.cat([like[:1], (truth[1:] / (step * ARCSEC)).round() * step * ARCSEC])
         found = model.fit(inject(exposures, star, truth), start, star, steps=3).companion
         wrong = found - truth
-        across = torch.stack([outwards[1], -outwards[0]])
-        errors.append(torch.stack([wrong[0], wrong[1:] @ outwards, wrong[1:] @ across]))
+        errors.append(turned(wrong, truth))
         rows.append({"true_position_angle": math.degrees(angle)} | polar(found))
         callback(Record("injection", i + 1, n, {"contrast_error": float(wrong[0] / like[0])}))
     return torch.stack(errors), rows
@@ -243,7 +249,7 @@ def floor_by_injection(
 def measure(
     config: Config, model: CompanionModel, target: Exposures, star: Fit, start: Tensor, floor: Tensor
 ) -> tuple[Fit, dict[str, Any]]:
-    """The companion with errors: from the exposures (jackknife, or the noise if that is more), and the calibrator."""
+    """The companion with errors: from the exposures (jackknife, or the noise if that is more), and `floor`."""
     fit = model.fit(target, start, star)
     n = len(target.frames)
     scatter = fit.jackknife - fit.jackknife.mean(0)
@@ -377,7 +383,12 @@ def analyse(config: Config, log: RunLogger, callback: Callback) -> dict[str, Any
         start = torch.cat([contrast[best, None], offsets[best]])
         like = model.fit(target, start, alone).companion
         errors, recovered = floor_by_injection(model, single, star, like, config.n_injections, config.step, callback)
-        floor = errors.square().mean(0).sqrt()
+        fewer = dataclasses.replace(config, static_modes=max(3, config.static_modes - 4))
+        simpler = make_model(fewer, pose, grid, target, model.flux_error)
+        change = simpler.fit(target, start, simpler.fit(target)).companion - like
+        # What the calibrator shows, and what a choice of ours changes.
+        floor = torch.hypot(errors.square().mean(0).sqrt(), turned(change, like))
+        results["fewer_modes"] = polar(like + change)
         shown, results["companion"] = measure(config, model, target, alone, start, floor)
         results["injections"] = recovered
         halves = [list(range(first, len(target.frames), 2)) for first in (0, 1)]
@@ -457,7 +468,7 @@ def table(results: dict[str, Any]) -> Table:
             f"{row[n]:.2f} +- {row['statistical_error'][n]:.2f} +- {row['systematic_error'][n]:.2f}" for n in names
         ]
         sheet.add_row(str(row["exposures"]), *values, f"{np.mean(row['chi_square']):.2f}")
-    sheet.caption = "errors: from the exposures, from companions put beside the calibrator"
+    sheet.caption = "errors: from the exposures; from companions put beside the calibrator and fewer aberrations"
     return sheet
 
 

@@ -65,8 +65,8 @@ def search_figure(offsets: Tensor, maps: dict[str, Tensor], separation: np.ndarr
     for color, (title, contrast) in zip((COLORS[1], FAINT, COLORS[2]), maps.items(), strict=False):
         ax.plot(away, contrast.abs().numpy(), ".", linestyle="none", markersize=3, color=color, label=title)
     ax.plot(separation, limit, color=COLORS[0], label="limit")
-    ax.set(xlabel="separation [arcsec]", ylabel="contrast", yscale="log", ylim=(2e-5, 0.1), title="detection limit")
-    ax.legend(loc="upper right", markerscale=2)
+    ax.set(xlabel="separation [arcsec]", ylabel="contrast", yscale="log", ylim=(2e-5, 2), title="detection limit")
+    ax.legend(loc="upper left", markerscale=2)
     return figure
 
 
