@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 
 import torch
-from deepinv.physics import LinearPhysics, PoissonGaussianNoise
+from deepinv.physics import LinearPhysics, PoissonGaussianNoise  # pyright: ignore[reportMissingImports] -- an extra
 from torch import Tensor
 
 from torchmask.optics.detector import image_formation, image_formation_adjoint
