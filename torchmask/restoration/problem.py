@@ -117,7 +117,7 @@ class JointProblem:
         return misfit.value.to(state.z) + 0.5 * (self.prior(state) * state.z**2).sum(1)
 
     def descend(self, state: State, n_iterations: int, progress: Callable[[float, int, Any], None]) -> State:
-        """Bounded L-BFGS from `state`; `progress(cost, evaluations, function giving (image, z))` after every iteration."""
+        """L-BFGS from `state`; `progress(cost, evaluations, function giving (image, z))` after every iteration."""
         image_scale, z_scale = self.scales(state)
         n, seen = state.image.numel(), 0
 
