@@ -30,8 +30,8 @@ class MyopicDeconvolution(nn.Module):
         1/2 sum_t || (g_t window(h_t(a_t) * o) - y_t) / sigma ||^2  +  mu TV(o)  +  1/2 ||z||^2
 
     by bounded L-BFGS in variables scaled by the diagonal of the Hessian, from zero aberrations (random ones for a full
-    pupil) and the clipped mean frame. It restarts every 100 iterations: then the scales, the transmission g_t of each frame
-    and, if r0 is not given, the strength of the turbulence are brought up to date; sigma falls from what the mean frame
+    pupil) and the clipped mean frame. It restarts every 100 iterations: then the scales, the transmission g_t of each
+    frame and, if r0 is not given, the strength of the turbulence are brought up to date; sigma falls from what the mean frame
     leaves unexplained to the noise or to what the model cannot explain, if that is more; frames that fit badly start
     anew from random aberrations, and the object is moved between the pixels to where it fits best.
 
