@@ -31,9 +31,9 @@ class MyopicDeconvolution(nn.Module):
 
     by bounded L-BFGS in variables scaled by the diagonal of the Hessian, from zero aberrations (random ones for a full
     pupil) and the clipped mean frame. It restarts every 100 iterations: then the scales, the transmission g_t of each
-    frame and, if r0 is not given, the strength of the turbulence are brought up to date; sigma falls from what the mean frame
-    leaves unexplained to the noise or to what the model cannot explain, if that is more; frames that fit badly start
-    anew from random aberrations, and the object is moved between the pixels to where it fits best.
+    frame and, if r0 is not given, the strength of the turbulence are brought up to date; sigma falls from what the
+    mean frame leaves unexplained to the noise or to what the model cannot explain, if that is more; frames that fit
+    badly start anew from random aberrations, and the object is moved between the pixels to where it fits best.
 
     Parameters
     ----------
