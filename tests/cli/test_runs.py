@@ -281,6 +281,33 @@ def test_an_interrupted_restoration_leaves_the_image_it_reached(runs, tmp_path, 
     assert (tmp_path / "state.png").is_file()
 
 
+def test_an_interrupted_restoration_goes_on_to_the_same_result(runs, tmp_path, monkeypatch, capsys):
+    stack = [runs / "simulate/stack.npz", "--max-iterations", "205", "--tv-weight", "0.5"]
+    run("restore", *stack, "--out", tmp_path / "whole")
+    interrupt_at(monkeypatch, "restoration", 150)
+    assert main(["restore", *map(str, stack), "--out", str(tmp_path / "cut")]) == 130
+    assert (tmp_path / "cut/resume.npz").is_file()
+    assert not (tmp_path / "cut/restored.npz").exists()
+    monkeypatch.undo()
+    before = contents(tmp_path / "cut")
+    run("restore", "--resume", tmp_path / "cut", "--out", tmp_path / "rest")
+    assert contents(tmp_path / "cut") == before
+    whole, rest = (load_npz(tmp_path / name / "restored.npz") for name in ("whole", "rest"))
+    assert whole["cost"].shape == (205,)
+    for key in whole.keys() - {"seconds"}:
+        np.testing.assert_array_equal(whole[key], rest[key])
+    steps = [row["step"] for row in read_metrics(tmp_path / "rest") if row["stage"] == "restoration"]
+    assert steps == list(range(101, 206))
+    assert (tmp_path / "rest/config.yaml").read_text() == (tmp_path / "whole/config.yaml").read_text()
+    # What cannot be gone on from: other settings, a run without a checkpoint, no run at all.
+    capsys.readouterr()
+    refused(["restore", "--resume", tmp_path / "cut", "--tv-weight", "2"], tmp_path, capsys, "other frames or settings")
+    refused(["restore", "--resume", runs / "simulate"], tmp_path, capsys, "it is for `torchmask simulate`")
+    (tmp_path / "rest/resume.npz").unlink()
+    refused(["restore", "--resume", tmp_path / "rest"], tmp_path, capsys, "no .*resume.npz to go on from")
+    refused(["restore", "--resume", tmp_path / "none"], tmp_path, capsys, "there is no config file .*none/config.yaml")
+
+
 @pytest.mark.filterwarnings("default::UserWarning")
 def test_a_warning_is_one_line_too(runs, tmp_path, capsys):
     wrong = ["--readout-noise", "5000", "--max-iterations", "2"]

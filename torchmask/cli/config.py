@@ -18,14 +18,17 @@ from torchmask.io import atomic_write, to_json
 
 T = TypeVar("T")
 
+CONFIG = "config.yaml"  # its name in the folder of a run
 _COMMAND = "command"  # the key that says which command a config file is for
 # Where results go and how errors are shown: no part of what is computed.
-_NOT_STORED = ("out", "name", "runs", "config", "debug")
+_NOT_STORED = ("out", "name", "runs", "config", "resume", "debug")
 _KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text", Path: "a path"}
 
 
 def parse(options: type[T], command: str, argv: Sequence[str]) -> T:
     """The options of a command, by falling priority: `argv`, the file behind --config, the defaults of `options`.
+
+    Without --config the file is that of the run behind --resume, if one is given.
 
     Raises ValueError for a config file that `load_config` refuses, SystemExit for wrong usage and for --help.
     """
@@ -34,7 +37,9 @@ def parse(options: type[T], command: str, argv: Sequence[str]) -> T:
     prog = f"torchmask {command}"
     early = argparse.ArgumentParser(prog=prog, add_help=False, allow_abbrev=False)
     early.add_argument("--config", type=Path)
-    path = early.parse_known_args(argv)[0].config
+    early.add_argument("--resume", type=Path)
+    given = early.parse_known_args(argv)[0]
+    path = given.resume / CONFIG if given.config is None and given.resume is not None else given.config
     if path is None:
         return tyro.cli(options, prog=prog, args=argv)
     return tyro.cli(options, prog=prog, args=argv, default=load_config(path, options, command))

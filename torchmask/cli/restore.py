@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -22,6 +23,8 @@ from torchmask.metrics import score, ssim
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.result import RestorationResult
 from torchmask.simulation.observation import Observation
+
+CHECKPOINT = "resume.npz"  # of a run: from here it can go on
 
 
 @dataclass(frozen=True)
@@ -87,11 +90,17 @@ class Options(MaskOptions, FITSOptions, RunOptions):
     """Upper limit of iterations."""
     tolerance: float = 1e-4
     """Converged when 100 iterations lower the cost by less than this fraction."""
+    resume: Path | None = None
+    """Folder of an interrupted run, whose options stand for all that are not given here: go on from its last state,
+    written every 100 iterations, to the same result as without the interruption."""
 
 
 def run(options: Options) -> None:
     """Restore, and write the image."""
     observation = load_observation(options)
+    checkpoint = None if options.resume is None else options.resume / CHECKPOINT
+    if checkpoint is not None and not checkpoint.is_file():
+        raise ValueError(f"there is no {checkpoint} to go on from: it is written at the 100th iteration")
     inversion = MyopicDeconvolution(
         observation.aperture,
         observation.grid,
@@ -108,7 +117,12 @@ def run(options: Options) -> None:
         tolerance=options.tolerance,
     )
     with new_run("restore", options, options.out) as output:
-        result = inversion.restore(observation.frames, valid=observation.valid, callback=output.callback)
+        state = output.directory / CHECKPOINT
+        if checkpoint is not None:
+            shutil.copyfile(checkpoint, state)
+        result = inversion.restore(
+            observation.frames, valid=observation.valid, checkpoint=state, callback=output.callback
+        )
         result.save(output.directory / "restored.npz")
         save_restored(output.directory / "restored.fits", result, observation, history(options, result))
         table = metrics(observation, result)

@@ -11,12 +11,10 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from torchmask.cli.config import save_config, stored
+from torchmask.cli.config import CONFIG, save_config, stored
 from torchmask.progress import Progress
 from torchmask.record import Callback, Record
 from torchmask.tracking import RunLogger, fan_out, free_name
-
-CONFIG = "config.yaml"
 
 
 @dataclass(frozen=True)
