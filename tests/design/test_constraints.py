@@ -146,6 +146,54 @@ def test_projection_of_a_single_hole_is_the_closed_form():
     torch.testing.assert_close(turned.centers, mask([[0.2, 0.1], [-0.2, -0.1]]).centers, rtol=0, atol=1e-12)
 
 
+# Where the direction to leave is not defined, and the length of the shortest way out.
+STUCK = [
+    (KeepOutDisc(0.4), [[0.0, 0.0]], 0.25),
+    (KeepOutDisc(0.4, (0.1, 0.2)), [[0.1, 0.2], [0.4, -0.1]], 0.25),
+    (KeepOutDisc(0.4), [[0.0, 0.0], [0.0, 0.0]], 0.25 * math.sqrt(2)),
+    (KeepOutDisc(0.4), [[0.0, 1e-200]], 0.25),  # its square is zero
+    (KeepOutSegment((0.0, 0.0), (0.4, 0.0), 0.02), [[0.2, 0.0]], 0.06),
+    (KeepOutSegment((0.0, 0.0), (0.4, 0.3), 0.02), [[0.2, 0.15]], 0.06),
+    (KeepOutSegment((0.1, 0.2), (0.4, 0.3), 0.02), [[0.19, 0.23]], 0.06),  # on the axis up to rounding
+    (KeepOutSegment((0.0, 0.0), (0.4, 0.0), 0.02), [[0.0, 0.0]], 0.06),
+    (KeepOutSegment((0.0, 0.0), (0.4, 0.0), 0.02), [[0.4, 0.0]], 0.06),
+    (MinimumGap(0.02), [[0.1, 0.1], [0.1, 0.1]], 0.12 / math.sqrt(2)),
+    (NoOverlap(), [[0.1, 0.1]] * 3, 0.1),  # to an equilateral triangle
+    (NonRedundancy(0.06), [[0.0, 0.0], [0.0, 0.0]], 0.06 / math.sqrt(2)),
+    # equal steps: a - 2 b + c has to become 0.06 long
+    (NonRedundancy(0.06), [[-0.2, 0.0], [0.0, 0.0], [0.2, 0.0]], 0.06 / math.sqrt(6)),
+    # a square: a - b + c - d has to
+    (NonRedundancy(0.06), [[0.0, 0.0], [0.2, 0.0], [0.2, 0.2], [0.0, 0.2]], 0.03),
+]
+
+
+@pytest.mark.parametrize(("constraint", "centers", "shortest"), STUCK)
+def test_projection_leaves_where_no_direction_is_better(constraint, centers, shortest):
+    aperture = mask(centers)
+    projected = constraint.project(aperture)
+    assert float(constraint.violation(projected)) == 0
+    assert float((projected.centers - aperture.centers).norm()) == pytest.approx(shortest, rel=1e-6)
+    assert constraint.project(aperture).centers.equal(projected.centers)
+
+
+@pytest.mark.parametrize("shape", ["disc", "hexagon"])
+@pytest.mark.parametrize(("constraint", "centers", "shortest"), STUCK)
+def test_descent_leaves_where_no_direction_is_better(constraint, centers, shortest, shape):
+    del shortest
+    start = torch.tensor(centers, dtype=torch.float64, requires_grad=True)
+    before = constraint.penalty(mask(start, shape=shape))
+    (gradient,) = torch.autograd.grad(before, start)
+    after = constraint.penalty(mask(start.detach() - 0.01 * gradient, shape=shape))
+    assert float(after) < float(before.detach())
+
+
+def test_symmetric_mask_leaves_the_center():
+    rules = [InsideDisc(), NoOverlap(), KeepOutDisc(0.3), NFoldSymmetry(4)]
+    found = project(mask([[0.0, 0.0]] * 4), rules)
+    check(found, 1e-11, rules)
+    assert torch.linalg.vector_norm(found.centers, dim=-1).tolist() == pytest.approx([0.2] * 4, rel=1e-6)
+
+
 @given(seed=st.integers(0, 10**6), fill=st.floats(0.05, 0.5), n=st.integers(2, 12))
 @settings(max_examples=25, derandomize=True, deadline=None)
 def test_any_mask_finds_its_way_into_the_disc(seed, fill, n):

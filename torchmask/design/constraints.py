@@ -17,11 +17,11 @@ from torchmask.design.feasibility import Constraint, Inequality, LinearEquality
 from torchmask.optics.aperture import SparseAperture
 
 
-def _length(vector: Tensor, fallback: Tensor) -> Tensor:
-    """Length along the last axis; at zero, where any direction would do, the gradient is along `fallback`."""
-    zero = (vector == 0).all(-1, keepdim=True)
-    tiny = math.sqrt(torch.finfo(vector.dtype).tiny)
-    return torch.linalg.vector_norm(vector + zero * tiny * fallback, dim=-1)
+def _length(vector: Tensor) -> Tensor:
+    """Length along the last axis; at zero, where any direction would do, the gradient is along the first axis."""
+    zero = (vector == 0).all(-1)
+    x, y = vector.unbind(-1)
+    return torch.where(zero, x, torch.hypot(torch.where(zero, 1.0, x), y))
 
 
 def _outer_radius(aperture: SparseAperture) -> float:
@@ -67,9 +67,10 @@ class MinimumGap(Inequality):
         )
         difference = aperture.centers[..., first, :] - aperture.centers[..., second, :]
         if aperture.shape == "disc":
-            distance = _length(difference, difference.new_tensor([1.0, 0.0]))
+            distance = _length(difference)
         else:
-            distance = (difference @ _directions(aperture, 3, 0.0).T).abs().amax(-1)
+            # `max`, not `amax`: of equal ones it takes one, so that the gradient of coincident holes is not zero
+            distance = (difference @ _directions(aperture, 6, 0.0).T).max(-1).values
         return distance - (aperture.subaperture_diameter + self.gap)
 
 
@@ -104,7 +105,7 @@ class KeepOutDisc(Inequality):
 
     def margins(self, aperture: SparseAperture) -> Tensor:
         difference = aperture.centers - aperture.centers.new_tensor(self.center)
-        return _length(difference, difference.new_tensor([1.0, 0.0])) - self.diameter / 2 - _outer_radius(aperture)
+        return _length(difference) - self.diameter / 2 - _outer_radius(aperture)
 
 
 @dataclass(frozen=True)
@@ -134,13 +135,15 @@ class KeepOutSegment(Inequality):
             raise ValueError(f"width is {self.width}: it must be finite and not negative, in m")
 
     def margins(self, aperture: SparseAperture) -> Tensor:
-        start = aperture.centers.new_tensor(self.start)
-        along = aperture.centers.new_tensor(self.end) - start
+        start, end = (aperture.centers.new_tensor(point) for point in (self.start, self.end))
+        length = torch.linalg.vector_norm(end - start)
+        along = (end - start) / length
         offset = aperture.centers - start
-        fraction = ((offset * along).sum(-1) / (along * along).sum()).clamp(0, 1)
-        difference = offset - fraction[..., None] * along
-        across = torch.stack([-along[1], along[0]]) / torch.linalg.vector_norm(along)
-        return _length(difference, across) - self.width / 2 - _outer_radius(aperture)
+        # From the nearest point of the segment: across it, and beyond its ends. On the axis a hole leaves sideways.
+        position = offset @ along
+        across = offset[..., 1] * along[0] - offset[..., 0] * along[1]
+        difference = torch.stack([across, position - position.clamp(min=0).minimum(length)], dim=-1)
+        return _length(difference) - self.width / 2 - _outer_radius(aperture)
 
 
 @dataclass(frozen=True)
@@ -170,7 +173,7 @@ class NonRedundancy(Inequality):
             ],
             dim=-2,
         )
-        return _length(pairs, pairs.new_tensor([1.0, 0.0])) - self.distance
+        return _length(pairs) - self.distance
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ aperture whose `centers` (..., N, 2) may carry leading population axes, and foll
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -121,6 +122,11 @@ class Subspace:
         """(..., N, 2) -> (..., F), of the nearest point of the subspace."""
         return (centers.flatten(-2) - self.origin) @ self.basis
 
+    def spread(self) -> Tensor:
+        """A step (F,) that sends every hole its own way, as far as the equalities let it: by the golden angle."""
+        angles = math.pi * (3 - math.sqrt(5)) * torch.arange(len(self.lift), dtype=self.basis.dtype)
+        return torch.stack([angles.cos(), angles.sin()], dim=-1).flatten() @ self.basis
+
     def place(self, z: Tensor, hole: int, position: Tensor) -> Tensor:
         """Move one hole to `position` (..., 2) as far as the equalities let it, and all that is tied to it."""
         return z + (position - self.centers(z)[..., hole, :]) @ self.lift[hole].T
@@ -162,6 +168,7 @@ def _project_one(
     slack = slack / scale
     margins = _margin_function(aperture, subspace, constraints)
     nearest = subspace.coordinates(aperture.centers).numpy() / scale
+    nudge = 1e-9 * subspace.spread().numpy()  # holes that coincide, or sit on an axis, must part somehow
     z = nearest
     relevant = np.zeros(0, dtype=bool)
     while True:
@@ -178,7 +185,7 @@ def _project_one(
         rows = np.flatnonzero(relevant)
         # From afar the nearest mask is a matter of optimisation; what is then left goes by Newton's method.
         if shortfall > 1e-3:
-            z = _nearest_point(nearest, z, margins, rows, slack)
+            z = _nearest_point(nearest, z + nudge, margins, rows, slack)
         z = _onto(z, margins, rows, slack)
 
 
