@@ -183,6 +183,19 @@ def test_frames_keep_their_values_and_share_a_scale():
     rendered(viz.frames_figure(torch.zeros(1, 4, 4)))
 
 
+@pytest.mark.parametrize("peak", [0.6, 1.0, 49.0, 5200.0, 9.7e5])
+def test_numbers_beside_the_bar_of_frames_do_not_overlap(peak):
+    ramp = peak * torch.linspace(0, 1, 1024, dtype=torch.float64).reshape(1, 32, 32)
+    figure = viz.frames_figure(ramp)
+    rendered(figure)
+    bar = figure.axes[-1]
+    low, high = bar.get_ylim()
+    boxes = [label.get_window_extent() for label in bar.get_yticklabels()]
+    assert len(boxes) == 5
+    assert all(low <= tick <= high for tick in bar.get_yticks())
+    assert all(below.y1 < above.y0 for below, above in itertools.pairwise(boxes))
+
+
 def test_history_is_logarithmic_where_it_helps():
     ax = viz.history_figure({"a": [100.0, 10.0, 1.0], "b": np.array([50.0, math.nan, math.inf, 2.0])}, "cost").axes[0]
     assert ax.get_yscale() == "log"

@@ -191,11 +191,13 @@ def frames_figure(frames: Any, count: int = 4, pixel_scale: float | None = None)
     images[f"mean of {len(stack)}"] = stack.mean(0)
     figure, axes = drawing.row_of_axes([1.0] * len(images), height=2.5)
     unit, extent = drawing.sky_extent(stack.shape[1:], pixel_scale)
-    norm = PowerNorm(0.5, 0, _peak(stack[:count], 99.9) or 1, clip=True)
+    peak = _peak(stack[:count], 99.9) or 1.0
+    norm = PowerNorm(0.5, 0, peak, clip=True)
     for ax, (name, values) in zip(axes, images.items(), strict=True):
         ax.imshow(values, cmap="gray", norm=norm, extent=extent)
         drawing.image_axes(ax, name, f"x [{unit}]", f"y [{unit}]" if ax is axes[0] else "")
-    drawing.colorbar(figure, axes, "electrons")
+    even = (0, 0.05, 0.2, 0.5, 1)  # nearly so, under the square root
+    drawing.colorbar(figure, axes, "electrons", ticks=[drawing.round_below(peak) * part for part in even], format="%g")
     return figure
 
 
