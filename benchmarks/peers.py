@@ -41,6 +41,7 @@ from torchmask.metrics import score, ssim
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.detector import Detector
 from torchmask.optics.turbulence import TurbulencePhase
+from torchmask.restoration.baselines import average_psf, shift_and_add
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.wiener import multiframe_wiener
 from torchmask.simulation.observation import Observation, simulate_observation
@@ -59,7 +60,7 @@ _CUTOFFS = (
     0.95,
     1.0,
 )  # of torchmfbd's Fourier filter over the diffraction limit
-_PSF_FRAMES, _PSF_SEED, _PSF_PHOTONS = 100, 12345, 1e9  # of the average PSF of shift-and-add
+_PSF_SEED = 12345  # of the average PSF of shift-and-add
 
 
 @dataclass(frozen=True)
@@ -199,56 +200,30 @@ def _quiet() -> Iterator[None]:
         torch.set_default_dtype(dtype)
 
 
-def shift_and_add(frames: Tensor) -> np.ndarray:
-    """The mean of frames (T, H, W) registered to a tenth of a pixel, first to the sharpest, then to their mean."""
-    from scipy.ndimage import fourier_shift
-    from skimage.registration import phase_cross_correlation
-
-    stack = frames.double().numpy()
-    spectra = np.fft.fft2(stack)
-    options: dict[str, Any] = {"upsample_factor": 10, "normalization": None}
-    mean = stack[stack.std((1, 2)).argmax()]
-    for _ in range(2):
-        shifts = [phase_cross_correlation(mean, f, **options)[0] for f in stack]
-        moved = [fourier_shift(spectrum, shift) for spectrum, shift in zip(spectra, shifts, strict=True)]
-        mean = np.fft.ifft2(np.mean(moved, axis=0)).real
-    return mean
-
-
-def average_psf(observation: Observation) -> np.ndarray:
-    """What shift-and-add makes of a star, through other screens: sum 1, peak in the middle of odd sides."""
+def average_star(observation: Observation) -> np.ndarray:
+    """The PSF of shift-and-add in this turbulence."""
     assert observation.r0 is not None
-    rows, columns = observation.grid.shape
-    star = torch.zeros(rows, columns, dtype=torch.float64)
-    star[rows // 2, columns // 2] = _PSF_PHOTONS
     turbulence = TurbulencePhase(observation.r0, observation.outer_scale or 20 * observation.aperture.mask_diameter)
     generator = torch.Generator().manual_seed(_PSF_SEED)
-    stars = simulate_observation(
-        star, observation.aperture, observation.grid, turbulence, Detector(), _PSF_FRAMES, generator
-    )
-    psf = shift_and_add(stars.frames).clip(min=0)
-    peak = np.unravel_index(psf.argmax(), psf.shape)
-    psf = np.roll(psf, (rows // 2 - int(peak[0]), columns // 2 - int(peak[1])), axis=(0, 1))
-    psf = psf[1 - rows % 2 :, 1 - columns % 2 :]  # on even sides a PSF and its mirror image have different middles
-    return psf / psf.sum()
+    return average_psf(observation.aperture, observation.grid, turbulence, generator).numpy()
 
 
 def added(observation: Observation, config: Config) -> Iterator[Candidate]:
     """Shift-and-add alone."""
     started = time.perf_counter()
-    yield Candidate("", torch.from_numpy(shift_and_add(observation.frames)), time.perf_counter() - started)
+    yield Candidate("", shift_and_add(observation.frames), time.perf_counter() - started)
 
 
 def richardson_lucy(observation: Observation, config: Config) -> Iterator[Candidate]:
     """scikit-image's, stopped after several numbers of iterations."""
     from skimage.restoration import richardson_lucy
 
-    psf = average_psf(observation)
+    psf = average_star(observation)
     for iterations in (3,) if config.smoke else (5, 10, 20, 40, 80, 160, 320, 640, 1280):
         started = time.perf_counter()
         image = shift_and_add(observation.frames)
-        image = image.clip(min=1e-6 * image.max())
-        restored = richardson_lucy(image / image.max(), psf, num_iter=iterations, clip=False)
+        image = image.clamp(min=1e-6 * float(image.max()))
+        restored = richardson_lucy((image / image.max()).numpy(), psf, num_iter=iterations, clip=False)
         yield Candidate(f"{iterations} iterations", torch.from_numpy(restored), time.perf_counter() - started)
 
 
@@ -256,9 +231,9 @@ def unsupervised_wiener(observation: Observation, config: Config) -> Iterator[Ca
     """scikit-image's, which finds its own regularisation."""
     from skimage.restoration import unsupervised_wiener
 
-    psf, started = average_psf(observation), time.perf_counter()
+    psf, started = average_star(observation), time.perf_counter()
     image = shift_and_add(observation.frames)
-    restored, _ = unsupervised_wiener(image / image.max(), psf, clip=False, rng=0)
+    restored, _ = unsupervised_wiener((image / image.max()).numpy(), psf, clip=False, rng=0)
     yield Candidate("", torch.from_numpy(np.asarray(restored)), time.perf_counter() - started)
 
 

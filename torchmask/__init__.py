@@ -20,6 +20,7 @@ from torchmask.optics.detector import Detector
 from torchmask.optics.otf import OTF, PSF
 from torchmask.optics.turbulence import TurbulencePhase
 from torchmask.optics.zernike import ZernikePhase
+from torchmask.restoration.baselines import average_psf, shift_and_add
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.result import RestorationResult
 from torchmask.restoration.wiener import multiframe_wiener
@@ -51,6 +52,7 @@ __all__ = [
     "StackRanges",
     "TurbulencePhase",
     "ZernikePhase",
+    "average_psf",
     "check",
     "design_table",
     "frame_observables",
@@ -62,6 +64,7 @@ __all__ = [
     "save_oifits",
     "save_restored",
     "search_mask",
+    "shift_and_add",
     "simulate_observation",
     "wiener_mse",
 ]
