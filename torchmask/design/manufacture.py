@@ -224,7 +224,7 @@ def _read_json(path: Path) -> dict[str, Any]:
     if missing:
         raise ValueError(f"it lacks {', '.join(missing)}")
     arguments = {key: record[key] for key in keys}
-    dtype = _DTYPES[arguments.pop("dtype")]
+    dtype = _dtype(arguments.pop("dtype"))
     arguments["centers"] = torch.tensor(arguments["centers"], dtype=torch.float64).to(dtype)
     return arguments
 
@@ -234,8 +234,8 @@ def _read_dxf(path: Path) -> dict[str, Any]:
 
     try:
         drawing = ezdxf.readfile(path)  # pyright: ignore[reportPrivateImportUsage]
-    except ezdxf.DXFError as error:  # pyright: ignore[reportPrivateImportUsage]
-        raise ValueError(str(error)) from error
+    except (ezdxf.DXFError, StopIteration) as error:  # pyright: ignore[reportPrivateImportUsage]
+        raise ValueError(str(error) or "the drawing ends too early") from error
     noted = drawing.header.custom_vars.get("torchmask mm per m")
     if noted is None:
         raise ValueError("the drawing does not say how many millimetres stand for a metre of the pupil")
@@ -269,14 +269,21 @@ def _read_fits(path: Path) -> dict[str, Any]:
         try:
             with fits.open(io.BytesIO(path.read_bytes())) as content:
                 table, header = content["HOLES"].data, content["HOLES"].header  # type: ignore[attr-defined]
+                shape, dtype = header["SHAPE"], _dtype(header["NUMTYPE"])
                 columns = {key: torch.tensor(table[key].tolist(), dtype=torch.float64) for key in table.names}
-        except AstropyWarning as warning:
-            raise ValueError(str(warning)) from warning
+        except (AstropyWarning, fits.VerifyError) as problem:
+            raise ValueError(str(problem)) from problem
     arguments: dict[str, Any] = {
         key: float(columns[key.upper()][0]) for key in ("subaperture_diameter", "mask_diameter", "orientation")
     }
-    centers = torch.stack([columns["X"], columns["Y"]], dim=-1).to(_DTYPES[header["NUMTYPE"]])
-    return {"centers": centers, "shape": header["SHAPE"], **arguments}
+    centers = torch.stack([columns["X"], columns["Y"]], dim=-1).to(dtype)
+    return {"centers": centers, "shape": shape, **arguments}
+
+
+def _dtype(name: str) -> torch.dtype:
+    if name not in _DTYPES:
+        raise ValueError(f"its numbers are {name}: known are {', '.join(_DTYPES)}")
+    return _DTYPES[name]
 
 
 def _one_mask(aperture: SparseAperture) -> Tensor:
