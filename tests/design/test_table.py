@@ -218,11 +218,20 @@ def test_the_files_hold_the_table(small):
         assert record["infeasible"] is None
         assert record["centers"] == [list(center) for center in row.centers]
     assert stored["space"]["reference_fill_factor"] == 0.15
-    markdown = str(table).splitlines()
+
+
+def test_prints_as_markdown_with_what_all_rows_share_above(small):
+    _, table = small
+    shared, empty, *markdown = str(table).splitlines()
+    assert empty == ""
+    assert f"D/r0 = {SMALL.diameter_over_r0[0]:g}, seed = 0." in shared
+    assert "N =" not in shared
     assert len(markdown) == 4
-    assert len({line.count("|") for line in markdown}) == 1
-    assert f"{table.rows[1].wiener_mse:.4g}" in markdown[3]
-    assert "infeasible" not in markdown[0]  # a column without any entry
+    assert len({(len(line), line.count("|")) for line in markdown}) == 1
+    heading, row = ([cell.strip() for cell in markdown[k].split("|")] for k in (0, 3))
+    assert row[heading.index("wiener_mse")] == f"{table.rows[1].wiener_mse:.4g}"
+    assert row[heading.index("N")] == "5"
+    assert not {"infeasible", "seed"} & set(heading)  # without any entry, or the same in all rows
 
 
 def test_masks_are_feasible_and_seeds_differ(tmp_path):

@@ -12,7 +12,7 @@ from torchmask.design.search import METHODS
 from torchmask.grid import Grid
 from torchmask.optics.packing import hole_diameter
 
-_AXES = ("n_subapertures", "fill_factor", "n_photons", "n_frames", "diameter_over_r0", "seed")
+AXES = ("n_subapertures", "fill_factor", "n_photons", "n_frames", "diameter_over_r0", "seed")
 _WHOLE = ("n_subapertures", "n_frames", "seed", "n_pixels", "n_draws")
 _SAMPLES = 512  # across the pupil raster for turbulence, at least: there the sampled OTF biases the error by 0.1 %
 _MAY_BE_ZERO = ("seed", "exponent", "readout_noise")
@@ -69,10 +69,10 @@ class DesignSpace:
             _number("budget", self.budget, whole=True)
         for name in (field.name for field in fields(self) if field.name not in ("method", "budget")):
             given = getattr(self, name)
-            values = tuple(_number(name, v, name in _WHOLE) for v in (given if name in _AXES else (given,)))
+            values = tuple(_number(name, v, name in _WHOLE) for v in (given if name in AXES else (given,)))
             if len(set(values)) < len(values) or not (values or name == "diameter_over_r0"):
                 raise ValueError(f"{name} is {given}: it must hold at least one value, and none twice")
-            object.__setattr__(self, name, values if name in _AXES else values[0])
+            object.__setattr__(self, name, values if name in AXES else values[0])
         if self.n_draws < 2:
             raise ValueError(f"n_draws is {self.n_draws}: a standard error needs at least 2")
         Grid.nyquist(self.mask_diameter, self.wavelength, self.n_pixels)
@@ -84,7 +84,7 @@ class DesignSpace:
 
     def designs(self) -> Iterator[Design]:
         """The rows of the table before anything is computed; those that cannot be built say why."""
-        axes = [getattr(self, name) for name in _AXES if name != "diameter_over_r0"]
+        axes = [getattr(self, name) for name in AXES if name != "diameter_over_r0"]
         for (n, fill, photons, frames, seed), strength in itertools.product(
             itertools.product(*axes), self.diameter_over_r0 or (None,)
         ):

@@ -20,7 +20,7 @@ from torchmask.design.criterion import AsymptoticMSE, wiener_mse
 from torchmask.design.feasibility import Infeasible
 from torchmask.design.psd import NoisePSD, PowerLawPSD
 from torchmask.design.search import search_mask
-from torchmask.design.space import Design, DesignSpace
+from torchmask.design.space import AXES, Design, DesignSpace
 from torchmask.design.sweep import require_backend, run_tasks
 from torchmask.grid import Grid
 from torchmask.io import atomic_write, write_json
@@ -30,12 +30,21 @@ from torchmask.optics.turbulence import TurbulencePhase
 from torchmask.record import Callback
 
 _FRAMES_AT_ONCE = 20  # OTFs held in memory
+_HEADINGS = {
+    "n_subapertures": "N",
+    "n_frames": "K",
+    "diameter_over_r0": "D/r0",
+    "subaperture_diameter": "d [m]",
+    "photons_per_frame": "photons/frame",
+    "wiener_error": "±",
+}
 _COLUMNS = tuple(field.name for field in fields(Design) if field.name != "centers")
 
 
 @dataclass(frozen=True)
 class DesignTable:
-    """The rows of a design table, in the order of the axes; `print` shows them as Markdown."""
+    """The rows of a design table, in the order of the axes; `print` shows them as Markdown,
+    with what all rows share above."""
 
     space: DesignSpace
     rows: tuple[Design, ...]
@@ -58,9 +67,15 @@ class DesignTable:
 
     def __str__(self) -> str:
         names = [name for name in _COLUMNS if any(getattr(row, name) is not None for row in self.rows)]
-        lines = [names, ["---"] * len(names)]
-        lines += [[_cell(getattr(row, name)) for name in names] for row in self.rows]
-        return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+        shared = [n for n in names if n in AXES and len({getattr(row, n) for row in self.rows}) == 1]
+        names = [name for name in names if name not in shared]
+        cells = [[_HEADINGS.get(name, name) for name in names]]
+        cells += [[_cell(getattr(row, name)) for name in names] for row in self.rows]
+        widths = [max(3, *map(len, column)) for column in zip(*cells, strict=True)]
+        cells.insert(1, ["-" * width for width in widths])
+        lines = [" | ".join(map(str.ljust, line, widths)) for line in cells]
+        same = ", ".join(f"{_HEADINGS.get(name, name)} = {_cell(getattr(self.rows[0], name))}" for name in shared)
+        return "\n".join([*([f"In all rows: {same}.", ""] if same else []), *(f"| {line} |" for line in lines)])
 
 
 def design_table(
