@@ -8,12 +8,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchmask.design.feasibility import Constraint, Inequality, LinearEquality
+from torchmask.design.feasibility import Constraint, Inequality, LinearEquality, require_constraints
 from torchmask.optics.aperture import SparseAperture
 
 
@@ -55,6 +56,8 @@ class MinimumGap(Inequality):
     never more than the true distance.
     """
 
+    length: ClassVar[str] = "gap"
+
     gap: float
 
     def __post_init__(self) -> None:
@@ -95,6 +98,8 @@ class KeepOutDisc(Inequality):
         (x, y) [m].
     """
 
+    length: ClassVar[str] = "diameter"
+
     diameter: float
     center: tuple[float, float] = (0.0, 0.0)
 
@@ -121,6 +126,8 @@ class KeepOutSegment(Inequality):
     width : float
         Full width [m]; 0 for a line.
     """
+
+    length: ClassVar[str] = "width"
 
     start: tuple[float, float]
     end: tuple[float, float]
@@ -153,6 +160,8 @@ class NonRedundancy(Inequality):
     With `distance` twice the hole diameter no two pairs of holes share a spatial frequency.
     (N(N-1)/2)^2 margins.
     """
+
+    length: ClassVar[str] = "distance"
 
     distance: float
 
@@ -256,6 +265,7 @@ def check(aperture: SparseAperture, tolerance: float = 1e-9, constraints: Sequen
     --------
     >>> check(SparseAperture([[-0.4, 0.0], [0.4, 0.0]], subaperture_diameter=0.2, mask_diameter=1.0))
     """
+    require_constraints(constraints)
     for constraint in (InsideDisc(), NoOverlap(), *constraints):
         worst = float(constraint.violation(aperture).max())
         if worst > tolerance * aperture.mask_diameter:

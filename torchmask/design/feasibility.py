@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -55,7 +55,13 @@ class Constraint(ABC):
 
 
 class Inequality(Constraint):
-    """A rule `margins >= 0`."""
+    """A rule `margins >= 0`.
+
+    length : name of the field [m] that says how much a dataclass of this kind asks for, so that a search that finds
+        no room can say how much would fit; None if there is none
+    """
+
+    length: ClassVar[str | None] = None
 
     @abstractmethod
     def margins(self, aperture: SparseAperture) -> Tensor:
@@ -132,6 +138,13 @@ class Subspace:
         return z + (position - self.centers(z)[..., hole, :]) @ self.lift[hole].T
 
 
+def require_constraints(constraints: Sequence[Constraint]) -> None:
+    """Raise TypeError unless these are rules, in a sequence."""
+    given = constraints if isinstance(constraints, Sequence) else [constraints]
+    if given is not constraints or not all(isinstance(rule, Constraint) for rule in given):
+        raise TypeError(f"constraints is {constraints}: a list of rules is needed, such as [KeepOutDisc(0.2)]")
+
+
 def all_margins(aperture: SparseAperture, constraints: Sequence[Constraint]) -> Tensor:
     """Margins of all inequalities side by side (..., M) [m]."""
     margins = [c.margins(aperture) for c in constraints if isinstance(c, Inequality)]
@@ -149,6 +162,7 @@ def project(aperture: SparseAperture, constraints: Sequence[Constraint]) -> Spar
     Infeasible
         If no such mask is found.
     """
+    require_constraints(constraints)
     centers = aperture.centers.detach()
     double = with_centers(aperture, centers.double().cpu())
     subspace = Subspace(aperture.n_subapertures, constraints)

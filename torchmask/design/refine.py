@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchmask.design.constraints import InsideDisc, NoOverlap, check
 from torchmask.design.descent import BatchedBFGS
-from torchmask.design.feasibility import Constraint, Infeasible
+from torchmask.design.feasibility import Constraint, Infeasible, require_constraints
 from torchmask.design.merit import Criterion, Holes, Merit
 from torchmask.optics.aperture import SparseAperture
 from torchmask.record import Callback, Record
@@ -118,7 +118,7 @@ def refine_mask(
     Raises
     ------
     ValueError
-        For a population, or if no feasible mask is found near the given one.
+        For a population, a budget below 1, or if no feasible mask is found near the given one.
 
     Examples
     --------
@@ -134,6 +134,9 @@ def refine_mask(
     """
     if aperture.centers.ndim != 2:
         raise ValueError(f"centers has shape {tuple(aperture.centers.shape)}: refine_mask takes one mask, (N, 2)")
+    require_constraints(constraints)
+    if budget != int(budget) or budget < 1:
+        raise ValueError(f"budget is {budget}: it must be a whole number of evaluations, at least 1")
     holes = Holes(detached(aperture), (InsideDisc(), NoOverlap(), *constraints))
     start = holes.coordinates(aperture.centers.detach())
     monitor = Monitor("design/refine", budget, holes, callback)

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
 
 from torchmask.design.constraints import InsideDisc, NoOverlap
 from torchmask.design.descent import BatchedBFGS
-from torchmask.design.feasibility import Constraint, Infeasible
+from torchmask.design.feasibility import Constraint, Inequality, Infeasible, require_constraints
 from torchmask.design.merit import Holes
 from torchmask.design.starts import random_mask
 from torchmask.optics.aperture import SparseAperture
@@ -19,7 +21,7 @@ from torchmask.optics.packing import hole_diameter
 _STARTS = 16
 _ROUNDS = 150
 _BISECTIONS = 14
-_SPECK = 1e-4  # of the fill factor: where no mask of such holes is found, size is not what hinders
+_SPECK = 1e-4  # of what is asked for: where no mask is found even so, it is not what hinders
 _NEAR = 1e-7  # sum of squared shortfalls from which a projection is tried, in mask diameters
 
 
@@ -32,44 +34,69 @@ def require_room(
     ------
     ValueError
         If the holes cannot be packed, or no mask that obeys `constraints` is found: says the largest fill factor at
-        which one was.
+        which one was or, if there is none, how much a rule may ask for at this one.
+    TypeError
+        If `constraints` is no sequence of rules.
     """
     hole_diameter(n_subapertures, mask_diameter, fill_factor)
+    require_constraints(constraints)
     rng = np.random.default_rng(seed)
     holes = _holes(n_subapertures, mask_diameter, fill_factor, constraints)
     try:
         return holes, _first_mask(holes, rng)
     except Infeasible:
-        largest = _largest_found(n_subapertures, mask_diameter, fill_factor, constraints, rng)
-    rules = ", ".join(map(str, constraints)) or "the mask disc"
-    advice = (
-        f"the largest fill factor at which one was found is {largest:.4g}"
-        if largest > 0
-        else f"nor with holes of {_SPECK:g} of that: the rules leave no room"
-    )
-    raise Infeasible(
-        f"no mask of {n_subapertures} holes with fill_factor {fill_factor} was found that obeys {rules}; {advice}"
-    )
+        pass
 
-
-def _largest_found(
-    n: int, mask_diameter: float, fill_factor: float, constraints: Sequence[Constraint], rng: np.random.Generator
-) -> float:
-    """The largest fill factor below `fill_factor` at which a mask was found, by bisection; 0 if there is none."""
-    fits, fails = 0.0, fill_factor
-    trial = _SPECK * fill_factor
-    for _ in range(_BISECTIONS):
+    def fits(fill: float, rules: Sequence[Constraint]) -> bool:
         try:
-            _first_mask(_holes(n, mask_diameter, trial, constraints), rng)
-            fits = trial
+            _first_mask(_holes(n_subapertures, mask_diameter, fill, rules), rng)
         except Infeasible:
-            if fits == 0:
-                return 0.0
+            return False
+        return True
+
+    rules = ", ".join(map(str, constraints)) or "the mask disc"
+    raise Infeasible(
+        f"no mask of {n_subapertures} holes with fill_factor {fill_factor} was found that obeys {rules}; "
+        f"{_advice(fits, fill_factor, list(constraints))}"
+    )
+
+
+def _advice(
+    fits: Callable[[float, Sequence[Constraint]], bool], fill_factor: float, constraints: list[Constraint]
+) -> str:
+    """What to ask for instead: smaller holes or, where their size is not what hinders, less of one rule."""
+    largest = _largest(lambda fill: fits(fill, constraints), fill_factor)
+    if largest > 0:
+        return f"the largest fill factor at which one was found is {largest:.4g}"
+    eased = []
+    for index, rule in enumerate(constraints):
+        if not isinstance(rule, Inequality) or rule.length is None or getattr(rule, rule.length) == 0:
+            continue
+
+        def with_length(value: float, rule: Any = rule, index: int = index) -> list[Constraint]:
+            return [*constraints[:index], replace(rule, **{rule.length: value}), *constraints[index + 1 :]]
+
+        largest = _largest(lambda value, at=with_length: fits(fill_factor, at(value)), getattr(rule, rule.length))
+        if largest > 0:
+            eased.append(f"with a {type(rule).__name__} {rule.length} of at most {largest:.4g} m one was found")
+    return " and ".join(eased) or "nor with much smaller holes: the rules leave no room"
+
+
+def _largest(fits: Callable[[float], bool], limit: float) -> float:
+    """The largest value below `limit` that was found to fit, by bisection; 0 if not even a speck of it does."""
+    largest, fails = 0.0, limit
+    trial = _SPECK * limit
+    for _ in range(_BISECTIONS):
+        if fits(trial):
+            largest = trial
+        elif largest == 0:
+            return 0.0
+        else:
             fails = trial
-        trial = (fits + fails) / 2
+        trial = (largest + fails) / 2
     # rounded down, so that the value that is stated fits
-    digit = 10.0 ** (math.floor(math.log10(fits)) - 3)
-    return math.floor(fits / digit) * digit
+    digit = 10.0 ** (math.floor(math.log10(largest)) - 3)
+    return math.floor(largest / digit) * digit
 
 
 def _holes(n: int, mask_diameter: float, fill_factor: float, constraints: Sequence[Constraint]) -> Holes:

@@ -1,0 +1,58 @@
+"""Requests without room: refused with the largest value that fits, which is known in closed form."""
+
+import math
+
+import pytest
+import torch
+
+from torchmask.design.constraints import FixedHoles, KeepOutDisc, MinimumGap, NFoldSymmetry, check
+from torchmask.design.feasibility import project
+from torchmask.design.refine import refine_mask
+from torchmask.design.room import require_room
+from torchmask.optics.aperture import SparseAperture
+
+HOLE = math.sqrt(0.15 / 3)  # of three holes with a fill factor of 0.15 in a disc of 1 m
+MASK = SparseAperture(torch.tensor([[0.0, 0.3], [0.3, 0.0]]), 0.1, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("rule", "stated", "largest"),
+    [
+        # Between the keep-out disc and the rim the holes are (1 - 0.7) / 2 wide at most.
+        (KeepOutDisc(0.7), "fill factor at which one was found is", 3 * 0.15**2),
+        # Holes of any size are in the way: the disc may reach to the inner edge of those at the rim.
+        (KeepOutDisc(1.5), "KeepOutDisc diameter of at most", 1 - 2 * HOLE),
+        # A triangle at the rim.
+        (MinimumGap(1.0), "MinimumGap gap of at most", math.sqrt(3) * (1 - HOLE) / 2 - HOLE),
+    ],
+)
+def test_the_largest_value_that_fits_is_stated(rule, stated, largest):
+    with pytest.raises(ValueError, match=rf"{stated} \d") as refusal:
+        require_room(3, 1.0, 0.15, [rule])
+    value = float(str(refusal.value).split(stated)[1].split()[0])
+    assert 0.99 * largest < value <= largest
+    if "fill factor" in stated:
+        found = require_room(3, 1.0, value, [rule])[1]
+        check(found, 1e-9, [rule])
+
+
+def test_where_no_size_helps_the_rules_are_named():
+    rules = [FixedHoles([(0.0, 0.0)]), KeepOutDisc(0.2)]
+    with pytest.raises(ValueError, match=r"FixedHoles.*KeepOutDisc.*the rules leave no room"):
+        require_room(6, 1.0, 0.15, rules)
+    with pytest.raises(ValueError, match="4-fold symmetric"):
+        require_room(6, 1.0, 0.15, [NFoldSymmetry(4)])
+    with pytest.raises(ValueError, match=r"at most 0\.66"):
+        require_room(6, 1.0, 0.9, [])
+
+
+@pytest.mark.parametrize("constraints", [KeepOutDisc(0.2), [0.2], None])
+def test_what_is_no_list_of_rules_is_refused(constraints):
+    for call in (
+        lambda: require_room(6, 1.0, 0.15, constraints),
+        lambda: check(MASK, constraints=constraints),
+        lambda: project(MASK, constraints),
+        lambda: refine_mask(lambda mask: mask.centers.sum(), MASK, constraints=constraints),
+    ):
+        with pytest.raises(TypeError, match="a list of rules is needed"):
+            call()
