@@ -12,7 +12,7 @@ from scipy.optimize import minimize_scalar
 from scipy.spatial import Delaunay
 from scipy.special import j1, jn_zeros
 
-from torchmask.design import redundancy
+from torchmask.design import psf_shape, redundancy
 from torchmask.design.redundancy import analyse_redundancy
 from torchmask.grid import Grid
 from torchmask.optics import catalog
@@ -184,13 +184,13 @@ def test_no_lobe_beyond_the_region_searched_exceeds_the_bound(shape):
     mask = mask_of([[0.0, 0.0]], 1.0, 1.0, shape=shape, orientation=0.1)
     axis = np.arange(-24, 24, 0.05)
     plane = np.stack(np.meshgrid(axis, axis), axis=-1)
-    envelope = redundancy._hole_amplitude(plane, mask) ** 2
+    envelope = psf_shape.hole_amplitude(plane, mask) ** 2
     bound = {"disc": 0.0042, "hexagon": 0.0092}[shape]
     outside = envelope[np.abs(plane).max(-1) > 2.5].max()
     assert 0.5 * bound < outside < bound
     if shape == "disc":
         assert envelope[480, 480 + 20 * 1] == pytest.approx(airy(1.0), rel=1e-12)
-        assert redundancy._hole_amplitude(np.array([jn_zeros(1, 1)[0] / np.pi, 0]), mask) == pytest.approx(0, abs=1e-15)
+        assert psf_shape.hole_amplitude(np.array([jn_zeros(1, 1)[0] / np.pi, 0]), mask) == pytest.approx(0, abs=1e-15)
 
 
 @pytest.mark.parametrize("shape", ["disc", "hexagon"])
@@ -204,7 +204,7 @@ def test_closed_form_of_the_psf_against_the_fourier_transform(shape):
         psf = psf_from_samples(mask.samples(grid)).numpy()
         k = np.fft.fftfreq(n, 1 / n)[:, None]
         frequency = np.stack(np.broadcast_arrays(k.T, k), axis=-1) / grid.period
-        expected = redundancy._psf(frequency, mask.centers.numpy(), mask)
+        expected = psf_shape.mask_psf(frequency, mask.centers.numpy(), mask)
         near = (np.abs(k) < 20) & (np.abs(k.T) < 20)
         errors.append(np.abs(psf / psf[0, 0] - expected)[near].max())
     assert errors[0] < 0.03
@@ -218,7 +218,7 @@ def test_width_and_side_lobe_against_a_finely_sampled_psf(name):
     n = math.ceil(20 * 2.5 * mask.extent / mask.subaperture_diameter)
     axis = np.arange(-n, n + 1) / (20 * mask.extent)  # 20 samples a fringe
     plane = np.stack(np.meshgrid(axis, axis[n - 40 :]), axis=-1)
-    psf = redundancy._psf(plane, mask.centers.numpy(), mask)
+    psf = psf_shape.mask_psf(plane, mask.centers.numpy(), mask)
     inner = psf[1:-1, 1:-1]
     neighbours = np.stack(
         [

@@ -1,0 +1,98 @@
+"""The point-spread function of a mask in closed form: how wide its core is and how high its side lobes are.
+
+It is the squared transform of a hole times the squared mean of the holes' phasors. Frequencies are angles on the sky
+over the wavelength [1/m].
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
+from scipy.optimize import minimize
+from scipy.special import j1
+
+from torchmask.optics.aperture import Aperture
+
+Array = NDArray[np.float64]
+
+_DIRECTIONS = 180  # in which the width is measured
+_BLOCK = 2**20  # array elements treated at a time
+
+
+def side_normals(aperture: Aperture, first: float = 0.0) -> Array:
+    """Directions (3, 2) at 60 degrees from each other, from the orientation of a hexagon plus `first`."""
+    angles = aperture.orientation + first + np.arange(3) * np.pi / 3
+    return np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+
+
+def hole_amplitude(frequency: Array, aperture: Aperture) -> Array:
+    """Transform of a hole, 1 at 0, at `frequency` (..., 2) [1/m]: the angle on the sky over the wavelength."""
+    d = aperture.subaperture_diameter
+    if aperture.shape == "disc":
+        x = np.pi * d * np.linalg.norm(frequency, axis=-1)
+        return np.where(x > 1e-6, 2 * j1(x) / np.where(x > 1e-6, x, 1), 1)
+    # Green's theorem gives one term for each pair of opposite sides; the weights cos^2 add up to 3/2.
+    across, along = frequency @ side_normals(aperture).T, frequency @ side_normals(aperture, math.pi / 2).T
+    squared = (frequency**2).sum(-1)[..., None]
+    weight = np.where(squared > 0, across**2 / np.where(squared > 0, squared, 1), 0.5)
+    product = weight * np.sinc(d * across) * np.sinc(d / math.sqrt(3) * along)
+    return product.sum(-1) / 1.5
+
+
+def mask_psf(frequency: Array, centers: Array, aperture: Aperture) -> Array:
+    """PSF relative to its peak at `frequency` (..., 2) [1/m]."""
+    phasors = np.exp(-2j * np.pi * (frequency @ centers.T)).mean(-1)
+    intensity: Array = phasors.real**2 + phasors.imag**2
+    return hole_amplitude(frequency, aperture) ** 2 * intensity
+
+
+def psf_widths(centers: Array, aperture: Aperture) -> Array:
+    """Full width at half maximum in directions all around [1/m]."""
+    angles = np.arange(_DIRECTIONS) * np.pi / _DIRECTIONS
+    directions = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    # A hole alone drops to one half within 0.52 / d. Steps small against the finest fringe find the first crossing.
+    limit, step = 0.6 / aperture.subaperture_diameter, 0.02 / aperture.extent
+    radii = np.arange(1, math.ceil(limit / step) + 1) * step
+    below = np.stack([mask_psf(radii[:, None] * e, centers, aperture) for e in directions]) < 0.5
+    high = radii[below.argmax(axis=1)]
+    low = high - step
+    for _ in range(40):
+        middle = (low + high) / 2
+        above = mask_psf(middle[:, None] * directions, centers, aperture) >= 0.5
+        low, high = np.where(above, middle, low), np.where(above, high, middle)
+    return np.asarray(low + high, dtype=np.float64)
+
+
+def peak_side_lobe(centers: Array, aperture: Aperture) -> float:
+    """Highest local maximum of the PSF besides the one at 0."""
+    scale = aperture.extent
+    highest = 0.0
+    for start, value in _grid_maxima(centers, aperture, 1 / (6 * scale)):
+        if value < 0.8 * highest:
+            break  # a maximum is at most so much higher than the best of six samples a fringe
+        result = minimize(lambda f: -float(mask_psf(f / scale, centers, aperture)), start * scale, method="BFGS")
+        if np.abs(result.x - start * scale).max() < 0.25:  # else it climbed a ridge, to another maximum
+            highest = max(highest, -float(result.fun))
+    return highest
+
+
+def _grid_maxima(centers: Array, aperture: Aperture, step: float) -> Iterator[tuple[Array, float]]:
+    """Local maxima of the PSF on a grid, but for the origin, from the highest down: (frequency [1/m], value)."""
+    n = math.ceil(2.5 / aperture.subaperture_diameter / step)
+    x = np.arange(-n, n + 1) * step
+    found = []
+    rows = max(1, _BLOCK // len(x))
+    for bottom in range(0, n + 1, rows):
+        y = np.arange(bottom - 1, min(bottom + rows, n + 1) + 1) * step  # with one row more on either side
+        columns = np.exp(-2j * np.pi * x[:, None] * centers[:, 0])
+        phasors = (np.exp(-2j * np.pi * y[:, None] * centers[:, 1]) @ columns.T) / len(centers)
+        plane = np.stack(np.broadcast_arrays(x, y[:, None]), axis=-1)
+        psf = np.abs(phasors) ** 2 * hole_amplitude(plane, aperture) ** 2
+        peak = (psf == maximum_filter(psf, size=3)) & (np.abs(plane) > step / 2).any(-1)
+        peak[[0, -1]] = False
+        found += zip(plane[peak], psf[peak].tolist(), strict=True)
+    return iter(sorted(found, key=lambda maximum: -maximum[1]))
