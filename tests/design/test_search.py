@@ -13,7 +13,7 @@ from torchmask.design.psd import NoisePSD, PowerLawPSD
 from torchmask.design.refine import refine_mask
 from torchmask.design.search import search_mask
 from torchmask.grid import Grid
-from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.aperture import FullAperture, SparseAperture
 
 
 def reference(n_pixels):
@@ -105,6 +105,23 @@ def test_impossible_requests_are_refused_with_the_reason(arguments, message):
 def test_unknown_method_lists_the_known_ones():
     with pytest.raises(ValueError, match="cma"):
         search_mask(COARSE, 6, 1.0, 0.15, method="annealing")
+
+
+@pytest.mark.parametrize("option", [{"seed": -1}, {"seed": 0.5}, {"budget": 0}])
+def test_bad_options_are_refused(option):
+    (name,) = option
+    with pytest.raises(ValueError, match=f"{name} is {option[name]}"):
+        search_mask(COARSE, 6, 1.0, 0.15, **option)
+
+
+def test_only_one_sparse_aperture_is_refined():
+    mask = SparseAperture.from_catalog("golay6", 1.0, 0.15)
+    with pytest.raises(TypeError, match="SparseAperture is needed, not FullAperture"):
+        refine_mask(COARSE, FullAperture(1.0))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="one mask"):
+        refine_mask(COARSE, SparseAperture(mask.centers.expand(2, -1, -1), mask.subaperture_diameter, 1.0))
+    with pytest.raises(ValueError, match="budget is 0"):
+        refine_mask(COARSE, mask, budget=0)
 
 
 def congruence(points, pattern):

@@ -229,7 +229,7 @@ def test_prints_as_markdown_with_what_all_rows_share_above(small):
     assert len(markdown) == 4
     assert len({(len(line), line.count("|")) for line in markdown}) == 1
     heading, row = ([cell.strip() for cell in markdown[k].split("|")] for k in (0, 3))
-    assert row[heading.index("wiener_mse")] == f"{table.rows[1].wiener_mse:.4g}"
+    assert row[heading.index("wiener_mse")] == f"{table.rows[1].wiener_mse:#.4g}"
     assert row[heading.index("N")] == "5"
     assert not {"infeasible", "seed"} & set(heading)  # without any entry, or the same in all rows
 

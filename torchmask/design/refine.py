@@ -132,6 +132,8 @@ def refine_mask(
     >>> better.relative_mse < float(criterion.relative(golay))
     True
     """
+    if not isinstance(aperture, SparseAperture):
+        raise TypeError(f"a SparseAperture is needed, not {type(aperture).__name__}")
     if aperture.centers.ndim != 2:
         raise ValueError(f"centers has shape {tuple(aperture.centers.shape)}: refine_mask takes one mask, (N, 2)")
     require_constraints(constraints)

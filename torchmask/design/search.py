@@ -88,6 +88,8 @@ def search_mask(
         budget = int(DEFAULT_BUDGETS[method] * min(1.0, 11 / n_subapertures)) if n_subapertures > 0 else 1
     if budget != int(budget) or budget < 1:
         raise ValueError(f"budget is {budget}: it must be a whole number of evaluations, at least 1")
+    if seed != int(seed) or seed < 0:
+        raise ValueError(f"seed is {seed}: it must be a whole number that is not negative")
     holes, fallback = require_room(n_subapertures, mask_diameter, fill_factor, constraints)
     rng = np.random.default_rng(seed)
     monitor = Monitor(f"design/{method}", budget, holes, callback)

@@ -38,6 +38,7 @@ _HEADINGS = {
     "photons_per_frame": "photons/frame",
     "wiener_error": "±",
 }
+_RESULTS = ("relative_mse", "above_floor", "wiener_mse", "wiener_error")
 _COLUMNS = tuple(field.name for field in fields(Design) if field.name != "centers")
 
 
@@ -70,11 +71,11 @@ class DesignTable:
         shared = [n for n in names if n in AXES and len({getattr(row, n) for row in self.rows}) == 1]
         names = [name for name in names if name not in shared]
         cells = [[_HEADINGS.get(name, name) for name in names]]
-        cells += [[_cell(getattr(row, name)) for name in names] for row in self.rows]
+        cells += [[_cell(name, getattr(row, name)) for name in names] for row in self.rows]
         widths = [max(3, *map(len, column)) for column in zip(*cells, strict=True)]
         cells.insert(1, ["-" * width for width in widths])
         lines = [" | ".join(map(str.ljust, line, widths)) for line in cells]
-        same = ", ".join(f"{_HEADINGS.get(name, name)} = {_cell(getattr(self.rows[0], name))}" for name in shared)
+        same = ", ".join(f"{_HEADINGS.get(name, name)} = {_cell(name, getattr(self.rows[0], name))}" for name in shared)
         return "\n".join([*([f"In all rows: {same}.", ""] if same else []), *(f"| {line} |" for line in lines)])
 
 
@@ -207,5 +208,9 @@ def measure(task: dict[str, Any]) -> dict[str, Any]:
     return {"wiener_mse": relative.mean(), "wiener_error": relative.std() / math.sqrt(len(values))}
 
 
-def _cell(value: Any) -> str:
-    return "" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
+def _cell(name: str, value: Any) -> str:
+    if value is None:
+        return ""
+    if name in _RESULTS:
+        return f"{value:#.4g}"  # with its zeros at the end
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
