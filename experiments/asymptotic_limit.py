@@ -253,11 +253,12 @@ def findings(config: Config, rows: Sequence[dict[str, Any]]) -> list[str]:
     for name in dict.fromkeys(row["mask"] for row in rows):
         screens = [row for row in rows if row["mask"] == name and row["model"] == "von_karman"]
         low, high = min(screens, key=lambda row: row["ratio"]), max(screens, key=lambda row: row["ratio"])
+        sampling = round(100 * low["sampling_error"], 2) + 0.0  # no "-0.00"
         lines.append(
             f"Von Karman screens, D/r0 = {config.d_over_r0:g}, {name}: the ratio goes from {low['ratio']:.4f} at "
             f"K = {low['n_frames']} to {high['ratio']:.4f} at K = {high['n_frames']}, of which the sampling of the "
-            f"pupil makes about {100 * low['sampling_error']:+.2f} %. Jensen does not bind here: these OTFs are not "
-            "those of independent uniform pistons."
+            f"pupil makes about {sampling:+.2f} %. Jensen does not bind here: these OTFs are not those of independent "
+            "uniform pistons."
         )
     return lines
 

@@ -173,7 +173,8 @@ def gallery(rows: Sequence[dict[str, Any]], masks: Sequence[SparseAperture]) -> 
         text = f"{row['relative_mse']:.4f}\n{row['above_floor']:.4f} above floor"
         axes[2 * line + 1, column].text(0.5, -0.02, text, transform=axes[2 * line + 1, column].transAxes, **CAPTION)
     sheet.get_layout_engine().set(h_pad=0.07)  # type: ignore[union-attr]
-    sheet.suptitle("Optimal masks, their u-v coverage and their relative MSE", x=0.012, ha="left", fontsize=11)
+    title = f"Optimal masks at N d²/D² = {masks[0].fill_factor:g}: holes, u-v coverage and relative MSE"
+    sheet.suptitle(title, x=0.012, ha="left", fontsize=11)
     return sheet
 
 

@@ -43,6 +43,7 @@ DIAMETER = 1.0  # of the pupils [m]: nothing here depends on it but r0 and the o
 WAVELENGTH = 550e-9
 KORFF = 0.341864 * 4 / math.pi  # E|OTF|^2 of a large pupil at high frequencies over (r0 / D)^2 times the perfect OTF
 _CHUNK = 20  # frames held in memory
+_LOWEST = 1e-3  # MTF that is drawn
 Shift = tuple[int, int]  # a baseline in pupil samples, (rows, columns)
 
 
@@ -248,7 +249,7 @@ def figure(config: Config, rows: Sequence[dict[str, Any]]) -> Figure:
     full.plot(x, y, color=FAINT, linestyle="--", linewidth=1, label="limit of large D/r$_0$")
     mtf_panel(masked, "Golay-6", rows)
     for ax in (full, masked):
-        ax.set(yscale="log", ylim=(1e-3, 1.3), xlim=(-0.02, 1.02), xlabel="baseline / D", ylabel="MTF")
+        ax.set(yscale="log", ylim=(_LOWEST, 1.3), xlim=(-0.02, 1.02), xlabel="baseline / D", ylabel="MTF")
         ax.legend(loc="lower left" if ax is masked else "lower right")
     own = [row for row in rows if row["pupil"] == "row"]
     r = np.array([row["redundancy"] for row in own])
@@ -286,6 +287,7 @@ def mtf_panel(ax: Axes, name: str, rows: Sequence[dict[str, Any]]) -> None:
         theory, value, error = (perfect * [row[key + part] for row in own] for part in ("_theory", "", "_error"))
         ax.plot(x, theory, color=color, **style)
         seen = value > 3 * error
+        label += " (below the axis)" if theory.max() < _LOWEST else ""
         ax.errorbar(
             x[seen], value[seen], error[seen], color=color, marker="o", markersize=3, linestyle="none", label=label
         )
