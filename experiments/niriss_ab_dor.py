@@ -1,13 +1,16 @@
 """AB Dor and its faint companion, from nine exposures of JWST/NIRISS through its seven-hole mask.
 
-    python experiments/niriss_ab_dor.py --data ../shared/real/niriss
-    python experiments/niriss_ab_dor.py --data ../shared/real/niriss --smoke    # everything, small, in seconds
+    python experiments/niriss_ab_dor.py --data FOLDER
+    python experiments/niriss_ab_dor.py --data FOLDER --smoke    # everything, small, in seconds
 
 Filter F480M as a few wavelengths, hexagonal holes, aberrations common to all exposures plus small ones of each, bad
 pixels left out. The calibrator HD 37093, a single star, goes the same way: it tells how the mask lies on the detector,
 how far the model can be trusted, and how faint a companion would be found. Beside the restored images, star and
-companion are fitted with everything else (`companion_fit`). Tables, figures and TensorBoard events go to a new folder,
-runs/<name>/. Files are AB-DOR_*.fits or ab-dor_*.fits and hd-37093_*.fits, with extensions SCI, ERR and DQ.
+companion are fitted with everything else (`companion_fit`, `companion_errors`). Tables, figures and TensorBoard events
+go to a new folder, runs/<name>/.
+
+The folder holds calibrated exposures of programme 1093, from the public archive of JWST, as ab-dor_*.fits and
+hd-37093_*.fits with extensions SCI, ERR and DQ.
 """
 
 from __future__ import annotations
@@ -24,10 +27,20 @@ from typing import Any
 import numpy as np
 import torch
 import tyro
+from companion_errors import (
+    MEASURED,
+    Limits,
+    agreement,
+    detection_limits,
+    injection_errors,
+    measurement,
+    places,
+    polar,
+    turn,
+)
 from companion_fit import CompanionModel, Exposures, Fit
-from niriss_figures import exposures_figure, images_figure, search_figure, upright
+from niriss_report import exposures_figure, findings, images_figure, search_figure, table, upright
 from rich.console import Console
-from rich.table import Table
 from torch import Tensor
 
 from torchmask.data.keywords import ARCSEC, FILTERS, pixel_matrix
@@ -43,15 +56,13 @@ from torchmask.tracking import RunLogger, fan_out
 
 MASK, FILTER = "jwst_niriss_ami_7", FILTERS[("NIRISS", "F480M")]  # (wavelength, width) [m], its source beside it
 GAIN = 1.61  # electrons per DN: NIRISS detector performance, JWST user documentation
-SIGNIFICANCE = 5.0  # times the scatter of the calibrator: what counts as found
-MAS = ARCSEC / 1000
 
 
 @dataclass(frozen=True)
 class Config:
     """Everything the result depends on."""
 
-    data: Path = Path("../shared/real/niriss")
+    data: Path = Path("niriss")
     """Folder of the exposures."""
     target: str = "ab-dor"
     """Files of the star are <target>_*.fits."""
@@ -166,143 +177,78 @@ def valley(points: Sequence[tuple[float, float]]) -> float:
     return float(np.clip(-b / (2 * a), x[low - 1], x[low + 1])) if a > 0 else float(x[y.argmin()])
 
 
-def polar(companion: Tensor) -> dict[str, float]:
-    """Separation [mas], position angle [deg, north through east] and magnitude difference."""
-    contrast, east, north = companion.tolist()
-    return {
-        "separation": math.hypot(east, north) / MAS,
-        "position_angle": math.degrees(math.atan2(east, north)) % 360,
-        "magnitude_difference": -2.5 * math.log10(contrast) if contrast > 0 else math.inf,
-    }
+def under(stage: str, callback: Callback) -> Callback:
+    """The same callback under another stage's name."""
+    return lambda record: callback(dataclasses.replace(record, stage=stage))
 
 
-def places(step: float, least: float = 0.1, most: float = 0.7) -> Tensor:
-    """Offsets (M, 2) to search, between two separations [arcsec]."""
-    n = math.ceil(most / step)
-    line = torch.arange(-n, n + 1, dtype=torch.float64) * step * ARCSEC
-    grid = torch.cartesian_prod(line, line)
-    separation = torch.linalg.vector_norm(grid, dim=1) / ARCSEC
-    return grid[(separation > least) & (separation < most)]
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """What a single star tells: the mask on the detector, the model and how far it can be trusted.
 
-
-@dataclass(frozen=True)
-class Limits:
-    """Faintest companion that would be found, by separation [arcsec] of annuli."""
-
-    separation: np.ndarray
-    contrast: np.ndarray
-
-    def __call__(self, offsets: Tensor) -> Tensor:
-        """Limiting contrast at offsets (..., 2) [rad]."""
-        away = torch.linalg.vector_norm(offsets, dim=-1) / ARCSEC
-        return torch.from_numpy(np.interp(away.numpy(), self.separation, self.contrast))
-
-
-def detection_limits(offsets: Tensor, contrast: Tensor) -> Limits:
-    """SIGNIFICANCE times the rms contrast that is found, annulus by annulus, where there is no companion."""
-    away = torch.linalg.vector_norm(offsets, dim=1) / ARCSEC
-    edges = torch.arange(0.1, float(away.max()) + 0.05, 0.1, dtype=torch.float64)
-    inside = [(away >= low - 0.025) & (away < low + 0.125) for low in edges[:-1]]
-    rms = [SIGNIFICANCE * float(contrast[ring].square().mean().sqrt()) for ring in inside]
-    return Limits((edges[:-1] + 0.05).numpy(), np.array(rms))
-
-
-def inject(exposures: Exposures, star: Fit, companion: Tensor) -> Exposures:
-    """The exposures with a companion made of the star's own light, shifted; bad pixels give the model's."""
-    light = torch.where(exposures.valid, exposures.frames, star.images) - star.own[:, 1, None, None]
-    nu = [torch.fft.fftfreq(n, dtype=torch.float64) for n in light.shape[1:]]
-    move = torch.einsum("tij,j->ti", exposures.to_pixels, companion[1:])
-    turn = nu[0][:, None] * move[:, 0, None, None] + nu[1] * move[:, 1, None, None]
-    moved = torch.fft.ifft2(torch.fft.fft2(light) * torch.exp(-2j * math.pi * turn)).real
-    return dataclasses.replace(exposures, frames=exposures.frames + companion[0] * moved)
-
-
-def turned(change: Tensor, companion: Tensor) -> Tensor:
-    """A difference in (contrast, east, north) as contrast, along and across the direction of a companion."""
-    outwards = companion[1:] / torch.linalg.vector_norm(companion[1:])
-    across = torch.stack([outwards[1], -outwards[0]])
-    return torch.stack([change[0], change[1:] @ outwards, change[1:] @ across])
-
-
-def floor_by_injection(
-    model: CompanionModel, exposures: Exposures, star: Fit, like: Tensor, n: int, step: float, callback: Callback
-) -> tuple[Tensor, list[dict[str, float]]]:
-    """Errors (n, 3) [contrast, along and across the separation [rad]] with which such a companion is found.
-
-    The same contrast and separation at n position angles beside the calibrator, each fitted from the nearest point
-    of the search grid.
+    contrast : of the companion that is found at each of `offsets`, where there is none
     """
-    radius, errors, rows = float(torch.linalg.vector_norm(like[1:])), [], []
-    for i in range(n):
-        angle = 2 * math.pi * (i + 0.5) / n
-        outwards = torch.tensor([math.sin(angle), math.cos(angle)], dtype=torch.float64)
-        truth = torch.cat([like[:1], radius * outwards])
-        start = torch.cat([like[:1], (truth[1:] / (step * ARCSEC)).round() * step * ARCSEC])
-        found = model.fit(inject(exposures, star, truth), start, star, steps=3).companion
-        wrong = found - truth
-        errors.append(turned(wrong, truth))
-        rows.append({"true_position_angle": math.degrees(angle)} | polar(found))
-        callback(Record("injection", i + 1, n, {"contrast_error": float(wrong[0] / like[0])}))
-    return torch.stack(errors), rows
+
+    pose: Pose
+    model: CompanionModel
+    exposures: Exposures
+    star: Fit
+    offsets: Tensor
+    contrast: Tensor
+    limits: Limits
 
 
-def measure(
-    config: Config, model: CompanionModel, target: Exposures, star: Fit, start: Tensor, floor: Tensor
+def calibrate(
+    config: Config, exposures: Exposures, grid: Grid, callback: Callback
+) -> tuple[Calibration, list[dict[str, Any]]]:
+    """Everything that is known before the target is looked at, and the orientations that were tried."""
+    pose, tried = find_pose(config, grid, exposures, callback)
+    callback = under(f"fit/{config.calibrator}", callback)
+    model = make_model(config, pose, grid, exposures, 0.02)
+    star = model.fit(exposures, callback=callback)
+    model.flux_error = model.flux_error_of(exposures, star)
+    star = model.fit(exposures, start=star, callback=callback)
+    offsets = places(config.step)
+    contrast, _ = model.search(exposures, star, offsets)
+    return Calibration(pose, model, exposures, star, offsets, contrast, detection_limits(offsets, contrast)), tried
+
+
+def characterise(
+    config: Config, known: Calibration, grid: Grid, target: Exposures, alone: Fit, start: Tensor, callback: Callback
 ) -> tuple[Fit, dict[str, Any]]:
-    """The companion with errors: from the exposures (jackknife, or the noise if that is more), and `floor`."""
-    fit = model.fit(target, start, star)
-    n = len(target.frames)
-    scatter = fit.jackknife - fit.jackknife.mean(0)
-    jackknife = (n - 1) / n * (scatter**2).sum(0)
-    statistical = torch.maximum(jackknife, fit.covariance.diagonal()).sqrt()
-    position = fit.companion[1:]
-    outwards = position / torch.linalg.vector_norm(position)
-    across = torch.stack([outwards[1], -outwards[0]])
-    radius = torch.linalg.vector_norm(position)
-
-    def spread(cartesian: Tensor, systematic: Tensor) -> dict[str, float]:
-        along = math.hypot(float((cartesian[1:] * outwards).norm()), float(systematic[1]))
-        turned = math.hypot(float((cartesian[1:] * across).norm()), float(systematic[2]))
-        share = math.hypot(float(cartesian[0]), float(systematic[0])) / abs(float(fit.companion[0]))
-        return {
-            "separation": along / MAS,
-            "position_angle": math.degrees(turned / float(radius)),
-            "magnitude_difference": 2.5 / math.log(10) * share,
-        }
-
-    none = torch.zeros(3, dtype=torch.float64)
-    errors = spread(statistical, none), spread(none, floor), spread(statistical, floor)
+    """The companion near `start`, its errors, and whether the two halves of the exposures agree on it."""
+    fitting = under(f"fit/{config.target}", callback)
+    fit = known.model.fit(target, start, alone, callback=fitting)
+    wrong, recovered = injection_errors(
+        known.model, known.exposures, known.star, fit.companion, config.n_injections, config.step, callback
+    )
+    fewer = dataclasses.replace(config, static_modes=max(3, config.static_modes - 4))
+    simpler = make_model(fewer, known.pose, grid, target, known.model.flux_error)
+    changed = simpler.fit(target, start, simpler.fit(target, callback=fitting), callback=fitting).companion
+    # What the calibrator shows, and what a choice of ours changes.
+    floor = torch.hypot(wrong.square().mean(0).sqrt(), turn(fit.companion) @ (changed - fit.companion))
+    halves = []
+    for first in (0, 1):
+        chosen = slice(first, None, 2)
+        own = dataclasses.replace(alone, own=alone.own[chosen])
+        halves.append(measurement(known.model.fit(target[chosen], start, own, callback=fitting), floor))
+    rest, _ = known.model.search(target, fit, known.offsets)
     return fit, {
-        "contrast": float(fit.companion[0]),
-        **polar(fit.companion),
-        **{f"{kind}_error": error for kind, error in zip(("statistical", "systematic", "total"), errors, strict=True)},
-        "chi_square": fit.chi_square.tolist(),
-        "exposures": n,
+        "companion": measurement(fit, floor),
+        "fewer_modes": polar(changed),
+        "injections": recovered,
+        "halves": halves,
+        "half_differences": agreement(*halves),
+        "rest": rest,
+        "rest_over_limit": float((rest / known.limits(known.offsets)).max()),
     }
 
 
-def agreement(one: dict[str, Any], other: dict[str, Any]) -> dict[str, float]:
-    """Differences of two measurements over their errors, those of the exposures alone."""
-    found = {}
-    for name in ("separation", "position_angle", "magnitude_difference"):
-        error = math.hypot(one["statistical_error"][name], other["statistical_error"][name])
-        difference = one[name] - other[name]
-        difference = (difference + 180) % 360 - 180 if name == "position_angle" else difference
-        found[name] = difference / error
-    return found
-
-
-def restore(
-    config: Config, pose: Pose, grid: Grid, exposures: Exposures, stage: str, callback: Callback
-) -> RestorationResult:
+def restore(config: Config, pose: Pose, grid: Grid, exposures: Exposures, callback: Callback) -> RestorationResult:
     """The image, without being told that there is a star or a companion."""
     # Its coarser pupil samples narrow the image of a hole, as larger holes would: the nominal size fits.
     pose = dataclasses.replace(pose, hole=Pose.hole)
     aperture, wavelengths = optics(config, pose, grid, exposures.to_pixels)
-
-    def named(record: Record) -> None:
-        callback(dataclasses.replace(record, stage=stage))
-
     method = MyopicDeconvolution(
         aperture,
         grid,
@@ -312,28 +258,27 @@ def restore(
         static_modes=config.static_modes,
         max_iterations=config.max_iterations,
     )
-    return method.restore(exposures.frames, valid=exposures.valid, callback=named)
+    return method.restore(exposures.frames, valid=exposures.valid, callback=callback)
 
 
-def look(result: RestorationResult, to_pixels: Tensor) -> dict[str, Any]:
-    """The brightest source beside the star in a restored image: light and centroid of 3 x 3 pixels."""
-    image = result.object
+def centroid(image: Tensor, row: int, column: int) -> tuple[float, Tensor]:
+    """Light of 3 x 3 pixels, and its centre (y, x)."""
+    box = image[row - 1 : row + 2, column - 1 : column + 2]
     offsets = torch.arange(-1, 2, dtype=torch.float64)
+    place = torch.stack([(box.sum(1) * offsets).sum(), (box.sum(0) * offsets).sum()]) / box.sum().clamp(min=1e-30)
+    return float(box.sum()), place + torch.tensor([row, column])
 
-    def centroid(row: int, column: int, reach: int = 1) -> tuple[float, Tensor]:
-        box = image[row - reach : row + reach + 1, column - reach : column + reach + 1]
-        place = torch.stack([(box.sum(1) * offsets).sum(), (box.sum(0) * offsets).sum()]) / box.sum().clamp(min=1e-30)
-        return float(box.sum()), place + torch.tensor([row, column])
 
+def look(image: Tensor, to_pixels: Tensor, most: float = 0.7) -> dict[str, Any]:
+    """The brightest source beside the star in a restored image, up to a separation [arcsec]."""
     row, column = divmod(int(image.argmax()), image.shape[1])
-    flux, star = centroid(row, column)
+    flux, star = centroid(image, row, column)
     rest = image.clone()
     rest[row - 1 : row + 2, column - 1 : column + 2] = 0
-    y, x = torch.meshgrid(*(torch.arange(n) for n in image.shape), indexing="ij")
-    rest[
-        torch.hypot((y - row).double(), (x - column).double()) > 0.7 * ARCSEC * float(to_pixels[0].norm()) / 2**0.5
-    ] = 0
-    light, place = centroid(*divmod(int(rest.argmax()), image.shape[1]))
+    y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in image.shape), indexing="ij")
+    pixels_per_radian = float(to_pixels[0].norm()) / 2**0.5
+    rest[torch.hypot(y - row, x - column) > most * ARCSEC * pixels_per_radian] = 0
+    light, place = centroid(image, *divmod(int(rest.argmax()), image.shape[1]))
     position = torch.linalg.inv(to_pixels.mean(0)) @ (place - star)
     return polar(torch.cat([torch.tensor([light / flux], dtype=torch.float64), position])) | {"star": star.tolist()}
 
@@ -344,132 +289,51 @@ def analyse(config: Config, log: RunLogger, callback: Callback) -> dict[str, Any
     single, single_grid = read(config.data, config.calibrator, config.crop)
     if config.smoke:
         target, single = target[:3], single[:2]
-    pose, tried = find_pose(config, single_grid, single, callback)
+    known, tried = calibrate(config, single, single_grid, callback)
     log.table("orientation", tried)
+    limit = known.limits(known.offsets)
 
-    model = make_model(config, pose, single_grid, single, 0.02)
-    star = model.fit(single)
-    model.flux_error = model.flux_error_of(single, star)
-    star = model.fit(single, start=star, steps=2)
-    offsets = places(config.step)
-    empty, _ = model.search(single, star, offsets)
-    limits = detection_limits(offsets, empty)
-
-    alone = model.fit(target)
-    contrast, noise = model.search(target, alone, offsets)
-    ratio = contrast / limits(offsets)
-    best = int(ratio.argmax())
-    ring = (limits.separation.tolist(), (-2.5 * np.log10(limits.contrast)).tolist())
-    calibrator_best = int((empty / limits(offsets)).argmax())
+    alone = known.model.fit(target, callback=under(f"fit/{config.target}", callback))
+    contrast, noise = known.model.search(target, alone, known.offsets)
+    best = int((contrast / limit).argmax())
+    calibrator_best = int((known.contrast / limit).argmax())
     results: dict[str, Any] = {
-        "pose": pose,
+        "pose": known.pose,
         "orientations_tried": tried,
-        "flux_error": model.flux_error,
+        "flux_error": known.model.flux_error,
         "calibrator": {
-            "chi_square": star.chi_square.tolist(),
-            "limits": {"separation": ring[0], "magnitude_difference": ring[1]},
-            "highest_over_limit": float((empty / limits(offsets))[calibrator_best]),
-            "highest_at": polar(torch.cat([empty[calibrator_best, None], offsets[calibrator_best]])),
+            "chi_square": known.star.chi_square.tolist(),
+            "limits": {
+                "separation": known.limits.separation.tolist(),
+                "magnitude_difference": (-2.5 * np.log10(known.limits.contrast)).tolist(),
+            },
+            "highest_over_limit": float((known.contrast / limit)[calibrator_best]),
+            "highest_at": polar(torch.cat([known.contrast[calibrator_best, None], known.offsets[calibrator_best]])),
         },
-        "found": bool(ratio[best] > 1),
-        "highest_over_limit": float(ratio[best]),
+        "found": bool(contrast[best] > limit[best]),
+        "highest_over_limit": float((contrast / limit)[best]),
         "highest_significance": float(contrast[best] / noise[best]),
         "companion": None,
     }
-    maps = {config.target: contrast, config.calibrator: empty}
-    marks: list[dict[str, float]] = []
-    shown = alone
+    maps, fit = {config.target: contrast, config.calibrator: known.contrast}, alone
     if results["found"]:
-        start = torch.cat([contrast[best, None], offsets[best]])
-        like = model.fit(target, start, alone).companion
-        errors, recovered = floor_by_injection(model, single, star, like, config.n_injections, config.step, callback)
-        fewer = dataclasses.replace(config, static_modes=max(3, config.static_modes - 4))
-        simpler = make_model(fewer, pose, grid, target, model.flux_error)
-        change = simpler.fit(target, start, simpler.fit(target)).companion - like
-        # What the calibrator shows, and what a choice of ours changes.
-        floor = torch.hypot(errors.square().mean(0).sqrt(), turned(change, like))
-        results["fewer_modes"] = polar(like + change)
-        shown, results["companion"] = measure(config, model, target, alone, start, floor)
-        results["injections"] = recovered
-        halves = [list(range(first, len(target.frames), 2)) for first in (0, 1)]
-        results["halves"] = [
-            measure(config, model, target[half], model.fit(target[half]), start, floor)[1] for half in halves
-        ]
-        results["half_differences"] = agreement(*results["halves"])
-        marks = [polar(shown.companion)]
-        maps[f"{config.target}, companion taken out"] = rest = model.search(target, shown, offsets)[0]
-        results["rest_over_limit"] = float((rest / limits(offsets)).max())
-    log.figure("search", search_figure(offsets, maps, limits.separation, limits.contrast))
-    log.figure("exposure", exposures_figure(target, shown, config.radius))
+        start = torch.cat([contrast[best, None], known.offsets[best]])
+        fit, measured = characterise(config, known, grid, target, alone, start, callback)
+        maps[f"{config.target}, companion taken out"] = measured.pop("rest")
+        results |= measured
+    marks = [polar(fit.companion)] if results["found"] else []
+    log.figure("search", search_figure(known.offsets, maps, known.limits, marks))
+    log.figure("exposure", exposures_figure(target, fit, config.radius))
 
     images, results["restored"] = {}, {}
     for name, exposures, its_grid in ((config.target, target, grid), (config.calibrator, single, single_grid)):
-        result = restore(config, pose, its_grid, exposures, f"restoration/{name}", callback)
-        seen = look(result, exposures.to_pixels)
+        result = restore(config, known.pose, its_grid, exposures, under(f"restoration/{name}", callback))
+        seen = look(result.object, exposures.to_pixels)
         images[name] = upright(result.object, seen["star"], exposures.to_pixels)
         results["restored"][name] = seen | {"summary": result.summary()}
         save_npz(log.directory / f"{name}.npz", {"object": result.object, "coefficients": result.coefficients})
     log.figure("restored", images_figure(images, marks))
     return results
-
-
-def findings(config: Config, results: dict[str, Any]) -> list[str]:
-    """What was found, in sentences."""
-    pose, own, single = results["pose"], results["companion"], results["calibrator"]
-    tried = results["orientations_tried"]
-    same, other = (min(r["chi_square"] for r in tried if (r["mirrored"] == pose.mirrored) == s) for s in (True, False))
-    lines = [
-        f"Mask on the detector: {'mirrored in x' if pose.mirrored else 'as in the catalogue, not mirrored'} (or that "
-        f"turned by 180 degrees, which makes the same image), rotated by {pose.rotation:+.2f} degrees from x to y, "
-        f"magnified by {pose.magnification:.4f}, holes of {pose.hole:.3f} m: chi-square {same:.2f}, against at least "
-        f"{other:.0f} if mirrored the other way.",
-        f"Model and exposures of {config.calibrator} differ by {100 * results['flux_error']:.1f} % of a pixel's flux "
-        "beyond the noise.",
-    ]
-    limits = single["limits"]
-    line = ", ".join(f"{m:.1f} mag at {s:.2f}" for s, m in zip(*limits.values(), strict=True))
-    lines.append(
-        f"{config.calibrator}: no companion above {SIGNIFICANCE:g} times the scatter (the highest point of the search "
-        f"reaches {single['highest_over_limit']:.2f} of that). Detection limit: {line} arcsec."
-    )
-    if own is None:
-        lines.append(
-            f"{config.target}: NO companion found; the highest point of the search reaches "
-            f"{results['highest_over_limit']:.2f} of the limit."
-        )
-    else:
-        total = own["total_error"]
-        lines.append(
-            f"{config.target}: a companion at {own['separation']:.1f} +- {total['separation']:.1f} mas, position angle "
-            f"{own['position_angle']:.2f} +- {total['position_angle']:.2f} degrees, "
-            f"{own['magnitude_difference']:.2f} +- {total['magnitude_difference']:.2f} mag fainter; it is "
-            f"{results['highest_over_limit']:.1f} times above the limit. Without it the highest point of the search "
-            f"reaches {results['rest_over_limit']:.2f} of the limit."
-        )
-        apart = max(abs(value) for value in results["half_differences"].values())
-        lines.append(
-            f"The two halves of the exposures {'agree' if apart < 3 else 'DISAGREE'}: they differ by at most "
-            f"{apart:.1f} of their errors from the exposures alone."
-        )
-    for name, seen in results["restored"].items():
-        lines.append(
-            f"Restored image of {name}: brightest beside the star at {seen['separation']:.0f} mas, position angle "
-            f"{seen['position_angle']:.0f} degrees, {seen['magnitude_difference']:.1f} mag fainter."
-        )
-    return lines
-
-
-def table(results: dict[str, Any]) -> Table:
-    """The companion from all exposures and from each half."""
-    sheet = Table("exposures", "separation [mas]", "position angle [deg]", "magnitude difference", "chi-square")
-    for row in [results["companion"], *results["halves"]]:
-        names = ("separation", "position_angle", "magnitude_difference")
-        values = [
-            f"{row[n]:.2f} +- {row['statistical_error'][n]:.2f} +- {row['systematic_error'][n]:.2f}" for n in names
-        ]
-        sheet.add_row(str(row["exposures"]), *values, f"{np.mean(row['chi_square']):.2f}")
-    sheet.caption = "errors: from the exposures; from companions put beside the calibrator and fewer aberrations"
-    return sheet
 
 
 def main(config: Config) -> int:
@@ -485,11 +349,11 @@ def main(config: Config) -> int:
         with RunLogger(directory) as log, Progress() as progress:
             log.log_config(config)
             results = analyse(config, log, fan_out(log, progress))
-            lines = findings(config, results)
+            lines = findings(config.target, config.calibrator, results)
             log.text("findings", "\n\n".join(lines))
             write_json(directory / "results.json", results | {"findings": lines})
             if results["companion"] is not None:
-                for name in ("separation", "position_angle", "magnitude_difference"):
+                for name in MEASURED:
                     log.scalar(f"companion/{name}", results["companion"][name])
     except KeyboardInterrupt:
         print(f"\ninterrupted: what is there lies in {directory}", file=sys.stderr)

@@ -4,6 +4,7 @@ import json
 import math
 from pathlib import Path
 
+import companion_errors
 import companion_fit
 import niriss_ab_dor
 import numpy as np
@@ -99,20 +100,24 @@ def test_companion_is_found_within_its_errors(model, single):
     truth = np.array([0.01, *polar_offset(0.31, 250.0)])
     exposures = stack(truth)
     star = model.fit(exposures, steps=3)
-    offsets = niriss_ab_dor.places(0.05)
+    offsets = companion_errors.places(0.05)
     contrast, error = model.search(exposures, star, offsets)
     best = int((contrast / error).argmax())
     start = torch.cat([contrast[best, None], offsets[best]])
-    errors, rows = niriss_ab_dor.floor_by_injection(model, *single, start, 4, 0.05, lambda record: None)
+    errors, rows = companion_errors.injection_errors(model, *single, start, 4, 0.05, lambda record: None)
     floor = errors.square().mean(0).sqrt()
     assert len(rows) == 4
-    found, measured = niriss_ab_dor.measure(niriss_ab_dor.Config(), model, exposures, star, start, floor)
+    found = model.fit(exposures, start, star)
+    measured = companion_errors.measurement(found, floor)
     total = measured["total_error"]
     assert abs(measured["separation"] - 310) < 3.5 * total["separation"] < 25
     assert abs(measured["position_angle"] - 250) < 3.5 * total["position_angle"] < 5
     assert abs(measured["magnitude_difference"] - 5) < 3.5 * total["magnitude_difference"] < 0.35
     assert found.chi_square.max() < 1.5  # as without companion, see below
     assert star.chi_square.min() > 1.5 * found.chi_square.max()
+    # It went on until going on changes nothing.
+    further = model.fit(exposures, found.companion, found)
+    assert ((further.companion - found.companion).abs() < 0.3 * found.covariance.diagonal().sqrt()).all()
     # With the companion taken out nothing as bright is left.
     rest, _ = model.search(exposures, found, offsets)
     assert rest.abs().max() < 0.25 * contrast.max()
@@ -124,11 +129,11 @@ def test_companion_is_found_within_its_errors(model, single):
 
 def test_single_star_has_no_companion_at_that_level(model, single):
     exposures, star = single
-    offsets = niriss_ab_dor.places(0.1)
+    offsets = companion_errors.places(0.1)
     contrast, _ = model.search(exposures, star, offsets)
     assert star.chi_square.max() < 1.5  # half a percent of the flux is left by the sampling of the holes
     assert contrast.abs().max() < 0.003
-    limits = niriss_ab_dor.detection_limits(offsets, contrast)
+    limits = companion_errors.detection_limits(offsets, contrast)
     assert (contrast.abs() < limits(offsets)).all()
     assert limits(offsets).max() < 0.008
 
@@ -174,7 +179,7 @@ def test_injected_companion_is_the_star_moved_and_dimmed(model, single):
     moved = torch.tensor([2.0, -3.0], dtype=torch.float64)  # whole pixels
     offset = torch.linalg.inv(exposures.to_pixels[0]) @ moved
     one = exposures[:1]
-    changed = niriss_ab_dor.inject(one, companion_fit_of(star), torch.cat([torch.tensor([0.1]), offset]))
+    changed = companion_errors.inject(one, companion_fit_of(star), torch.cat([torch.tensor([0.1]), offset]))
     light = torch.where(one.valid, one.frames, star.images[:1]) - star.own[:1, 1, None, None]
     assert torch.allclose(changed.frames - one.frames, 0.1 * light.roll((2, -3), (1, 2)), atol=1e-3)
 
@@ -183,6 +188,36 @@ def companion_fit_of(star):
     """The part of a fit that belongs to the first exposure."""
     return companion_fit.Fit(
         star.companion, star.covariance, star.shared, star.own[:1], star.images[:1], star.chi_square[:1], star.jackknife
+    )
+
+
+def test_errors_are_along_and_across_the_separation():
+    """A companion in the north-east whose jackknife scatters along the separation, and whose noise is across it."""
+    radius, spread, across = 1.5e-6, 1e-8, 2e-8
+    outwards = torch.tensor([0.6, 0.8], dtype=torch.float64)
+    companion = torch.cat([torch.tensor([0.01], dtype=torch.float64), radius * outwards])
+    jackknife = companion.repeat(4, 1)
+    jackknife[:, 1:] += spread * torch.tensor([1.0, -1.0, 1.0, -1.0], dtype=torch.float64)[:, None] * outwards
+    sideways = torch.tensor([0.8, -0.6], dtype=torch.float64)
+    covariance = torch.zeros(3, 3, dtype=torch.float64)
+    covariance[1:, 1:] = across**2 * torch.outer(sideways, sideways)
+    covariance[0, 0] = 1e-8
+    nothing = torch.zeros(4)
+    fit = companion_fit.Fit(companion, covariance, nothing, nothing, nothing, nothing, jackknife)
+    systematic = torch.tensor([0.0, 3 * spread, 0.0], dtype=torch.float64)
+    found = companion_errors.measurement(fit, systematic)
+    mas = ARCSEC / 1000
+    assert found["separation"] == pytest.approx(radius / mas)
+    assert found["position_angle"] == pytest.approx(math.degrees(math.atan2(0.6, 0.8)))
+    errors = found["statistical_error"]
+    assert errors["separation"] == pytest.approx(3**0.5 * spread / mas)  # (n - 1) / n times n squares
+    assert errors["position_angle"] == pytest.approx(math.degrees(across / radius))
+    assert errors["magnitude_difference"] == pytest.approx(2.5 / math.log(10) * 1e-4 / 0.01)
+    assert found["total_error"]["separation"] == pytest.approx(12**0.5 * spread / mas)
+    other = companion_errors.measurement(fit, systematic)
+    other["position_angle"] -= 359.0
+    assert companion_errors.agreement(found, other)["position_angle"] == pytest.approx(
+        -1 / (2**0.5 * errors["position_angle"]), rel=1e-6
     )
 
 
