@@ -18,7 +18,7 @@ from rich.table import Table
 
 from torchmask import viz
 from torchmask.cli.design import make_criterion, search
-from torchmask.cli.options import CommonOptions, SearchOptions
+from torchmask.cli.options import ConfigOptions, SearchOptions
 from torchmask.cli.report import log_design, log_observation
 from torchmask.cli.run import Run, new_run
 from torchmask.design.psd import NoisePSD
@@ -77,6 +77,7 @@ class Config:
     design: SearchOptions = field(default_factory=SearchOptions)
     imaging: ImagingOptions = field(default_factory=ImagingOptions)
     scene: SceneOptions = field(default_factory=SceneOptions)
+    """The target."""
     restoration: RestorationOptions = field(default_factory=RestorationOptions)
     preset: Literal["default", "paper"] = "default"
     """`paper`: CMA-ES alone, piston and tip-tilt only, no aberration prior, as the seed method has it."""
@@ -91,7 +92,7 @@ class Config:
 
 
 @dataclass(frozen=True)
-class Options(Config, CommonOptions):
+class Options(Config, ConfigOptions):
     """Design a mask, observe a scene through turbulence with it, restore the image, and compare with a full pupil.
 
     The full pupil reaches the same spatial frequencies and receives photons in proportion to its area. All results,

@@ -10,7 +10,7 @@ from pathlib import Path
 import tyro
 
 from torchmask import viz
-from torchmask.cli.options import CommonOptions
+from torchmask.cli.options import DebugOptions
 from torchmask.design.manufacture import save_dxf, save_fits, save_json, save_svg
 from torchmask.design.redundancy import analyse_redundancy
 from torchmask.io import atomic_write
@@ -21,7 +21,7 @@ _ANY_SIZE = (1.0, 0.1)  # mask diameter [m] and fill factor at which a mask with
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(CommonOptions):
+class Options(DebugOptions):
     """List the catalogue of masks, or show one of them, and write it to a file."""
 
     name: tyro.conf.Positional[str | None] = None

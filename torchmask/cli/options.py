@@ -18,17 +18,23 @@ MASK_SUFFIXES = (".json", ".dxf", ".fits")
 
 
 @dataclass(frozen=True, kw_only=True)
-class CommonOptions:
-    """Where options come from, and how errors are shown."""
+class DebugOptions:
+    """How errors are shown."""
 
-    config: Path | None = None
-    """A config.yaml that an earlier run wrote: its values stand for all options not given here."""
     debug: tyro.conf.FlagCreatePairsOff[bool] = False
     """Show where an error comes from, with its traceback."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunOptions(CommonOptions):
+class ConfigOptions(DebugOptions):
+    """Where options come from."""
+
+    config: Path | None = None
+    """A config.yaml that an earlier run wrote: its values stand for all options not given here."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(ConfigOptions):
     """Where results go."""
 
     out: Path | None = None

@@ -91,8 +91,7 @@ class Options(MaskOptions, FITSOptions, RunOptions):
     tolerance: float = 1e-4
     """Converged when 100 iterations lower the cost by less than this fraction."""
     resume: Path | None = None
-    """Folder of an interrupted run, whose options stand for all that are not given here: go on from its last state,
-    written every 100 iterations, to the same result as without the interruption."""
+    """Folder of an interrupted run: go on with its options from its checkpoint, of every 100th iteration."""
 
 
 def run(options: Options) -> None:

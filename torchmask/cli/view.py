@@ -12,7 +12,7 @@ import tyro
 
 from torchmask import viz
 from torchmask.cli.masks import describe
-from torchmask.cli.options import ARCSEC, CommonOptions
+from torchmask.cli.options import ARCSEC, DebugOptions
 from torchmask.cli.report import restored_figure
 from torchmask.data.fits import read_fits
 from torchmask.design.manufacture import load_mask
@@ -30,7 +30,7 @@ _NYQUIST = 0.5  # cycles/pixel, the cut-off of a codesign run
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(CommonOptions):
+class Options(DebugOptions):
     """Say what a file holds, and draw it: a mask, a stack, a restored image, a run folder or one of its checkpoints."""
 
     path: tyro.conf.Positional[Path]
