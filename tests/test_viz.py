@@ -216,11 +216,11 @@ def test_comparison_shows_what_is_scored():
     panels = {ax.get_title(loc="left"): np.asarray(ax.images[0].get_array()) for ax in figure.axes}
     assert list(panels) == [
         "truth",
-        f"mask, one exposure\nscore {score(frame, truth, 0.3):.3f}",
-        f"mask, restored\nscore {score(restored, truth, 0.3):.3f}",
+        f"mask\none exposure, score {score(frame, truth, 0.3):.3f}",
+        f"mask\nrestored, score {score(restored, truth, 0.3):.3f}",
         "truth at the diffraction limit",
-        f"full, one exposure\nscore {score(frame, truth, 0.3):.3f}",
-        "full, restored\nscore 0.000",
+        f"full\none exposure, score {score(frame, truth, 0.3):.3f}",
+        "full\nrestored, score 0.000",
     ]
 
     def shown(image: torch.Tensor) -> np.ndarray:

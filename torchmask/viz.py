@@ -275,11 +275,11 @@ def _comparison_images(
     for k, (name, (frame, restored)) in enumerate(results.items()):
         raw = as_array(frame).astype(float)
         images[f"frame {k}"] = (
-            f"{name}, one exposure\nscore {score(raw, reference, cutoff):.3f}",
+            f"{name}\none exposure, score {score(raw, reference, cutoff):.3f}",
             raw * (reference.sum() / raw.sum()),
         )
         images[f"restored {k}"] = (
-            f"{name}, restored\nscore {score(restored, reference, cutoff):.3f}",
+            f"{name}\nrestored, score {score(restored, reference, cutoff):.3f}",
             align(restored, reference, cutoff).numpy(),
         )
     return images
