@@ -81,7 +81,7 @@ def test_a_killed_sweep_loses_at_most_the_running_tasks(tmp_path):
     assert len(finished(tmp_path)) == 10
     assert {path: path.stat().st_mtime_ns for path in done} == before  # what was there is read, not computed
     started = len(list((tmp_path / "marks").glob("*.started")))
-    # Computed twice: at most the two running tasks, and two whose results were on the way to a process that waits its turn.
+    # Computed twice: at most the two running tasks, and two whose results were on the way to a process that waits.
     assert started <= 10 + 2 + 2
 
 
