@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 import statistics
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -199,6 +200,8 @@ def measure(config: Config, n: int, n_pixels: int, population: int) -> str:
 
 
 def main(config: Config) -> None:
+    if config.device.startswith("cuda") and not torch.cuda.is_available():
+        sys.exit(f"criterion: device is {config.device}, but torch {torch.__version__} sees no CUDA device here")
     if config.threads is not None:
         torch.set_num_threads(config.threads)
     if config.smoke:
