@@ -2,6 +2,8 @@
 PYTHON ?= python3
 BIN := .venv/bin
 export OMP_NUM_THREADS ?= 1
+# Threads that wait for each other sleep: spinning, they take the time of whatever else runs.
+export OMP_WAIT_POLICY ?= passive
 
 .venv/.torch: constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv

@@ -203,11 +203,10 @@ def calibrate(
 ) -> tuple[Calibration, list[dict[str, Any]]]:
     """Everything that is known before the target is looked at, and the orientations that were tried."""
     pose, tried = find_pose(config, grid, exposures, callback)
-    callback = under(f"fit/{config.calibrator}", callback)
     model = make_model(config, pose, grid, exposures, 0.02)
-    star = model.fit(exposures, callback=callback)
+    star = model.fit(exposures, callback=under("fit/single_star", callback))
     model.flux_error = model.flux_error_of(exposures, star)
-    star = model.fit(exposures, start=star, callback=callback)
+    star = model.fit(exposures, start=star, callback=under("fit/single_star_weighted", callback))
     offsets = places(config.step)
     contrast, _ = model.search(exposures, star, offsets)
     return Calibration(pose, model, exposures, star, offsets, contrast, detection_limits(offsets, contrast)), tried
@@ -217,21 +216,22 @@ def characterise(
     config: Config, known: Calibration, grid: Grid, target: Exposures, alone: Fit, start: Tensor, callback: Callback
 ) -> tuple[Fit, dict[str, Any]]:
     """The companion near `start`, its errors, and whether the two halves of the exposures agree on it."""
-    fitting = under(f"fit/{config.target}", callback)
-    fit = known.model.fit(target, start, alone, callback=fitting)
+    fit = known.model.fit(target, start, alone, callback=under("fit/companion", callback))
     wrong, recovered = injection_errors(
         known.model, known.exposures, known.star, fit.companion, config.n_injections, config.step, callback
     )
     fewer = dataclasses.replace(config, static_modes=max(3, config.static_modes - 4))
     simpler = make_model(fewer, known.pose, grid, target, known.model.flux_error)
-    changed = simpler.fit(target, start, simpler.fit(target, callback=fitting), callback=fitting).companion
+    plain = simpler.fit(target, callback=under("fit/fewer_modes_star", callback))
+    changed = simpler.fit(target, start, plain, callback=under("fit/fewer_modes", callback)).companion
     # What the calibrator shows, and what a choice of ours changes.
     floor = torch.hypot(wrong.square().mean(0).sqrt(), turn(fit.companion) @ (changed - fit.companion))
     halves = []
     for first in (0, 1):
         chosen = slice(first, None, 2)
         own = dataclasses.replace(alone, own=alone.own[chosen])
-        halves.append(measurement(known.model.fit(target[chosen], start, own, callback=fitting), floor))
+        half = known.model.fit(target[chosen], start, own, callback=under(f"fit/half_{first + 1}", callback))
+        halves.append(measurement(half, floor))
     rest, _ = known.model.search(target, fit, known.offsets)
     return fit, {
         "companion": measurement(fit, floor),
@@ -293,7 +293,7 @@ def analyse(config: Config, log: RunLogger, callback: Callback) -> dict[str, Any
     log.table("orientation", tried)
     limit = known.limits(known.offsets)
 
-    alone = known.model.fit(target, callback=under(f"fit/{config.target}", callback))
+    alone = known.model.fit(target, callback=under("fit/star", callback))
     contrast, noise = known.model.search(target, alone, known.offsets)
     best = int((contrast / limit).argmax())
     calibrator_best = int((known.contrast / limit).argmax())
