@@ -172,6 +172,14 @@ def test_units_become_electrons(tmp_path, mask, cube, unit, factor):
     torch.testing.assert_close(frames, factor * torch.from_numpy(cube).double(), rtol=1e-12, atol=0)
 
 
+def test_pixels_without_a_unit_are_taken_for_electrons_and_it_is_said(tmp_path, mask, cube):
+    path = write(tmp_path / "a.fits", cube, BUNIT=None)
+    with pytest.warns(UserWarning, match="no BUNIT and no GAIN in the header: pixels are taken for electrons"):
+        frames = Observation.from_fits(path, mask).frames
+    np.testing.assert_array_equal(frames.numpy(), cube)
+    assert torch.equal(Observation.from_fits(path, mask, unit="electron").frames, frames)
+
+
 @pytest.mark.parametrize(
     ("cards", "message"),
     [

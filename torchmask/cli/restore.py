@@ -32,7 +32,7 @@ class FITSOptions:
     """What the header of a FITS file may lack, and calibration. What is given wins over the header."""
 
     unit: str | None = None
-    """Of the pixels, such as "adu", "electron / s" or "250 electron"; None: from the header (BUNIT)."""
+    """Such as "adu", "electron / s" or "250 electron"; None: BUNIT, else adu if a gain is known, else electron."""
     gain: float | None = None
     """Electrons per adu; None: from the header (EGAIN, GAIN)."""
     exposure_time: float | None = None

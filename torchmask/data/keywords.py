@@ -123,7 +123,7 @@ def electrons_per_unit(
 
     `unit` or BUNIT: electrons or photons; adu, DN or counts (times GAIN [electrons]); any of them per second (times
     the exposure time of a frame [s]); MJy/sr (through JWST's PHOTMJSR). Without either: adu if a gain is known, else
-    electrons.
+    electrons, with a warning.
 
     Raises ValueError if the unit is not known or what its conversion needs is missing.
     """
@@ -131,8 +131,11 @@ def electrons_per_unit(
 
     text = unit or str(header.get("BUNIT", "")).strip()
     gain = number(header, ("EGAIN", "GAIN"), path) if gain is None else gain
+    if not text and gain is None:
+        warnings.warn("no BUNIT and no GAIN in the header: pixels are taken for electrons; unit tells", stacklevel=2)
+        return 1.0
     if not text:
-        return 1.0 if gain is None else gain
+        return gain
 
     def electrons(counted: Any) -> float:
         if counted in (units.electron, units.photon):

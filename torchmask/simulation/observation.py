@@ -132,7 +132,7 @@ class Observation:
             [rad]. Header: PIXELSCL [arcsec], or CD, PC or CDELT.
         unit : str, optional
             Unit of the pixels, such as "adu", "electron / s" or "250 electron". Header: BUNIT; without it the pixels
-            are in adu where a gain is known, and in electrons where none is.
+            are in adu where a gain is known, and in electrons (with a warning) where none is.
         gain : float, optional
             Electrons per adu (DN, count). Header: EGAIN, GAIN.
         exposure_time : float, optional
