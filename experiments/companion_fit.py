@@ -24,10 +24,8 @@ from torchmask.restoration.model import ExposureModel
 STATIC_RMS, OWN_RMS = 0.3, 0.02  # [rad] expected sizes of the common aberrations, and of those of one exposure
 OWN_MODES = 3  # piston, tip and tilt of every hole
 BLUR, BLUR_RMS = 0.1, 0.1  # [pixel^2] variance of the spread of charge along an axis, and how well it is known
-STEPS, TOLERANCE = (
-    40,
-    0.1,
-)  # of Gauss-Newton at most, until one lowers the squared residuals by less: no error bar sees it
+STEPS = 40  # of Gauss-Newton, at most
+TOLERANCE = 0.1  # the last one lowers the squared residuals by less, which no error bar sees
 _MARGIN = 2.0  # of the field around the exposures, which sets how finely the holes are sampled: to half a percent
 _HALVINGS = 6  # of a step that makes the fit worse
 
