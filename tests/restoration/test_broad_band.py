@@ -127,7 +127,7 @@ def test_static_modes_are_the_same_coefficients_in_every_frame():
 def test_gradient_of_common_aberrations_is_that_of_one_variable():
     """Central differences in one common aberration of all frames against the sum over frames; the prior counts once."""
     model, image, _, frames, precision = setup(n_frames=3, mixing=torch.eye(12, dtype=torch.float64), n_static=4)
-    problem = JointProblem(model, frames, precision, tv_weight=1.0)
+    problem = JointProblem(model, frames, precision, torch.zeros(3, 12, dtype=torch.float64), tv_weight=1.0)
     generator = torch.Generator().manual_seed(4)
     z = 0.3 * torch.randn(3, 12, dtype=torch.float64, generator=generator)
     z[:, 8:] = z[0, 8:]

@@ -91,7 +91,7 @@ class ExposureModel(nn.Module):
         device: torch.device | str | None = None,
     ) -> None:
         super().__init__()
-        self.grid = grid
+        self.grid, self.n_modes = grid, n_modes
         rows, columns = (fast_size(math.ceil(side * (1 + margin))) for side in grid.shape)
         self.field = Grid((rows, columns), grid.pixel_scale, grid.wavelength)
         band = _band(grid, wavelengths, weights)
@@ -136,17 +136,33 @@ class ExposureModel(nn.Module):
         """K, the number of aberrations of a frame."""
         return self.basis.shape[1]
 
+    def unwrapped(self, z: Tensor, centre: Tensor) -> Tensor:
+        """z (T, K) with full waves taken off the holes' pistons where that brings it closer to `centre`.
+
+        Frames of one wavelength do not change; those of several would, and are left alone.
+        """
+        if self.n_wavelengths > 1:
+            return z
+        own = self.n_parameters - self.n_static
+        waves = 2 * math.pi * torch.linalg.pinv(self.mixing[:, :own].to(z))[:, :: self.n_modes]  # (own, N)
+        z = z.clone()
+        for _ in range(2):  # a wave off one hole may ask for one off its neighbour
+            for wave in waves.T:
+                away = z[:, :own] - centre[:, :own]
+                z[:, :own] -= (away @ wave / wave.square().sum()).round()[:, None] * wave
+        return z
+
     def chunks(self, n_frames: int) -> Iterator[slice]:
         """Slices of the frames whose work arrays stay small."""
         size = max(1, _CHUNK // (self.n_wavelengths * math.prod(self.field.shape)))
         return (slice(start, min(start + size, n_frames)) for start in range(0, n_frames, size))
 
-    def _pupil(self, z: Tensor) -> Tensor:
+    def pupil_field(self, z: Tensor) -> Tensor:
         """Complex field (T, P) on the open samples of the pupil."""
         phase = z.to(self.basis.dtype) @ self.basis.T
         return torch.complex(self.weights * phase.cos(), self.weights * phase.sin())  # faster than torch.polar
 
-    def _amplitude(self, field: Tensor) -> Tensor:
+    def amplitude(self, field: Tensor) -> Tensor:
         """Focal amplitude (T, wavelength, H', W') of a pupil field (T, P)."""
         rasters = (self.n_wavelengths, *self.field.shape)
         pupil = field.new_zeros(len(field), math.prod(rasters)).index_add(1, self.index, field)
@@ -154,7 +170,7 @@ class ExposureModel(nn.Module):
 
     def psf(self, z: Tensor) -> Tensor:
         """PSFs (T, H', W') of unit sum, origin at [0, 0], for z (T, K)."""
-        return _intensity(self._amplitude(self._pupil(z)))
+        return _intensity(self.amplitude(self.pupil_field(z)))
 
     def forward(self, image: Tensor, z: Tensor) -> Tensor:
         """Frames (T, H, W) of the object `image` (H', W') through the aberrations z (T, K)."""
@@ -191,11 +207,11 @@ class ExposureModel(nn.Module):
         shape = self.field.shape
         spectrum = torch.fft.rfft2(image.to(self.basis.dtype))
         conjugate = spectrum.conj().resolve_conj()
-        pupil = self._pupil(z)
+        pupil = self.pupil_field(z)
 
         @torch.no_grad()  # which holds for one thread only
         def compare(part: slice) -> tuple[Tensor, Tensor | None, Tensor | None]:
-            amplitude = self._amplitude(pupil[part])
+            amplitude = self.amplitude(pupil[part])
             transfer = torch.fft.rfft2(_intensity(amplitude))
             model = torch.fft.irfft2(transfer * spectrum, s=shape)
             error = model[:, : self.grid.shape[0], : self.grid.shape[1]] - frames[part]
@@ -208,7 +224,7 @@ class ExposureModel(nn.Module):
             if not want_aberrations:
                 return value, by_object, None
             psf_gradient = torch.fft.irfft2(back * conjugate, s=shape)
-            return value, by_object, self._pull_back(pupil[part], amplitude, psf_gradient)
+            return value, by_object, self.pull_back(pupil[part], amplitude, psf_gradient)
 
         values, by_object, slopes = zip(*parallel(compare, self.chunks(len(z))), strict=True)
         return Misfit(
@@ -217,7 +233,7 @@ class ExposureModel(nn.Module):
             (torch.cat(slopes) @ self.basis).to(z.dtype) if want_aberrations else None,
         )
 
-    def _pull_back(self, field: Tensor, amplitude: Tensor, psf_gradient: Tensor) -> Tensor:
+    def pull_back(self, field: Tensor, amplitude: Tensor, psf_gradient: Tensor) -> Tensor:
         """Gradient with respect to the phase (T, P) from that with respect to the PSF (T, H', W')."""
         back = torch.fft.ifft2(amplitude * psf_gradient[:, None], norm="forward").flatten(1).index_select(1, self.index)
         return 2 * (back.imag * field.real - back.real * field.imag)
@@ -235,8 +251,8 @@ class ExposureModel(nn.Module):
         conjugate = torch.fft.rfft2(image.to(self.basis.dtype)).conj().resolve_conj()
         total, pixel = torch.zeros_like(z[0]), 0.0
         for part in self.chunks(len(z)):
-            field = self._pupil(z[part])
-            amplitude = self._amplitude(field)
+            field = self.pupil_field(z[part])
+            amplitude = self.amplitude(field)
             weight = (precision[part] if len(precision) > 1 else precision).expand(len(field), *self.grid.shape)
             for _ in range(4):
                 noise = (
@@ -244,7 +260,7 @@ class ExposureModel(nn.Module):
                     * weight.sqrt()
                 )
                 back = torch.fft.irfft2(torch.fft.rfft2(noise, s=shape) * conjugate, s=shape)
-                gradient = self._pull_back(field, amplitude, back) @ self.basis
+                gradient = self.pull_back(field, amplitude, back) @ self.basis
                 total += (gradient**2).sum(0).to(z.dtype) / 4
             energy = (_intensity(amplitude) ** 2).sum((1, 2))
             pixel += float((energy * weight.mean((1, 2))).sum())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -16,7 +17,7 @@ from torchmask.record import Callback
 from torchmask.restoration.initialization import check_frames
 from torchmask.restoration.model import ExposureModel
 from torchmask.restoration.parallel import each_on_a_core
-from torchmask.restoration.priors import whitening
+from torchmask.restoration.priors import root, whitening
 from torchmask.restoration.result import RestorationResult
 from torchmask.restoration.run import Restoration
 
@@ -144,17 +145,22 @@ class MyopicDeconvolution(nn.Module):
 
         columns = mixing(n_modes, self.r0)
         static = mixing(static_modes, aperture.subaperture_diameter) if static_modes else columns[:, :0]
-        self.model: ExposureModel = ExposureModel(
-            aperture,
-            grid,
-            self.n_modes,
-            torch.cat([columns, static.to(columns)], dim=1),
-            wavelengths=wavelengths,
-            weights=weights,
-            n_static=static.shape[1],
-            dtype=dtype,
-            device=device,
-        )
+        self._build = partial(ExposureModel, aperture, grid, self.n_modes, wavelengths=wavelengths, weights=weights)
+        mixed = torch.cat([columns, static.to(columns)], dim=1)
+        self.model: ExposureModel = self._build(mixed, n_static=static.shape[1], dtype=dtype, device=device)
+
+    def model_of_errors(self, covariance: Tensor) -> ExposureModel:
+        """The model in which the errors of estimated coefficients, of `covariance` (N J, N J) [rad^2], are white."""
+        size = self.aperture.n_subapertures * self.n_modes
+        if tuple(covariance.shape) != (size, size):
+            raise ValueError(
+                f"covariance has shape {tuple(covariance.shape)}: it must be ({size}, {size}), sub-aperture by "
+                f"sub-aperture, of {self.aperture.n_subapertures} x {self.n_modes} coefficients"
+            )
+        if self.model.n_static:
+            raise ValueError("covariance is given with static_modes: what is common to all frames is in the estimate")
+        basis = self.model.basis
+        return self._build(root(covariance.to(basis.device, torch.float64)), dtype=basis.dtype, device=basis.device)
 
     def restore(
         self,
@@ -162,8 +168,10 @@ class MyopicDeconvolution(nn.Module):
         *,
         valid: Tensor | None = None,
         coefficients: Tensor | None = None,
+        covariance: Tensor | None = None,
         known_object: Tensor | None = None,
         start: RestorationResult | None = None,
+        n_samples: int = 0,
         checkpoint: str | Path | None = None,
         callback: Callback | None = None,
     ) -> RestorationResult:
@@ -177,11 +185,18 @@ class MyopicDeconvolution(nn.Module):
             False where a pixel is dead or saturated; it is left out, whatever its value.
         coefficients : (T, N, J) tensor, optional
             Known aberrations [rad rms], which stay as they are: non-blind deconvolution.
+        covariance : (N J, N J) tensor, optional
+            Of the errors of `coefficients` [rad^2], sub-aperture by sub-aperture, the same for all frames, such as a
+            wave-front sensor has: they are refined then, with these errors as their prior in place of turbulence.
+            Errors below 1 mrad count as 1 mrad.
         known_object : (H, W) tensor, optional
             Known object, up to its flux, which stays as it is: only the aberrations are restored.
         start : RestorationResult, optional
             Goes on from there (warm start). It may come from the first T' <= T of these frames: the aberrations of the
             new frames are then fitted to its object before everything is refined together.
+        n_samples : int
+            Drawn from the posterior for the standard deviations of object and coefficients, which cost about as much
+            as 60 iterations each; 8 are enough. 0: no standard deviations.
         checkpoint : path, optional
             An .npz file, written every 100 iterations. If it exists, the restoration goes on from it, and ends in the
             same result as if it had never been interrupted.
@@ -192,7 +207,8 @@ class MyopicDeconvolution(nn.Module):
         ------
         ValueError
             If a shape is wrong, a valid pixel is not finite, a frame holds no light, both object and aberrations are
-            known, or the checkpoint is damaged or belongs to other frames or settings.
+            known, `covariance` is not one or stands without coefficients or beside static modes, or the checkpoint is
+            damaged or belongs to other frames or settings.
 
         Warns
         -----
@@ -201,8 +217,12 @@ class MyopicDeconvolution(nn.Module):
         """
         started = time.perf_counter()
         frames, valid = check_frames(frames, valid, self.grid)
-        if coefficients is not None and known_object is not None:
+        if n_samples < 0 or n_samples == 1:
+            raise ValueError(f"n_samples is {n_samples}: 0 for no standard deviations, or at least 2")
+        if covariance is not None and coefficients is None:
+            raise ValueError("covariance is given without coefficients: it is that of their errors, give both")
+        if coefficients is not None and known_object is not None and covariance is None:
             raise ValueError("coefficients and known_object are both given: nothing is left to restore")
         with each_on_a_core(self.model.basis.device) as parallel:
-            run = Restoration(self, frames, valid, callback, parallel)
-            return run(coefficients, known_object, start, checkpoint, started)
+            run = Restoration(self, frames, valid, covariance, callback, parallel)
+            return run(coefficients, known_object, start, n_samples, checkpoint, started)

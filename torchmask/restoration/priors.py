@@ -8,6 +8,9 @@ from torch import Tensor
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.von_karman import modal_covariance
 
+_LEAST_ERROR = 1e-3  # rad
+_ROUNDING = 1e-6  # of a covariance that may come from float32
+
 
 def total_variation(image: Tensor, epsilon: float = 0.01) -> tuple[Tensor, Tensor]:
     """Isotropic smoothed total variation of `image` (..., H, W) and its gradient.
@@ -46,3 +49,19 @@ def whitening(aperture: Aperture, n_modes: int, r0: float, outer_scale: float) -
     remove = remove - torch.outer(common.flatten(), common.flatten())
     values, vectors = torch.linalg.eigh(remove @ covariance @ remove)
     return (vectors[:, 1:] * values[1:].clamp(min=0).sqrt()).flip(1)
+
+
+def root(covariance: Tensor) -> Tensor:
+    """Symmetric square root R (K, K) [rad] of a covariance (K, K) [rad^2], whose least error is taken as 1 mrad.
+
+    Raises ValueError if the covariance is not finite, not symmetric or has negative eigenvalues.
+    """
+    if not bool(torch.isfinite(covariance).all()):
+        raise ValueError("covariance holds values that are not finite")
+    largest = float(covariance.abs().max())
+    if float((covariance - covariance.T).abs().max()) > _ROUNDING * largest:
+        raise ValueError("covariance is not symmetric")
+    values, vectors = torch.linalg.eigh(covariance)
+    if float(values[0]) < -_ROUNDING * largest * len(values):
+        raise ValueError(f"covariance has an eigenvalue of {float(values[0]):.3g} rad^2: none may be negative")
+    return (vectors * values.clamp(min=_LEAST_ERROR**2).sqrt()) @ vectors.T

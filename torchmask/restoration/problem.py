@@ -41,9 +41,10 @@ class State:
 
 @dataclass(frozen=True)
 class JointProblem:
-    """1/2 sum precision/excess (gain * forward - frames)^2 + tv_weight TV(image) + prior/2 ||z||^2, image >= 0.
+    """1/2 sum precision/excess (gain * forward - frames)^2 + tv_weight TV(image) + prior/2 |z - centre|^2, image >= 0.
 
     frames : (T, H, W) in units of their mean; precision : (T or 1, H or 1, W or 1)
+    centre : (T, K) expected aberrations
     free : which of "object" and "aberrations" may change
     static : whether those aberrations may change that are common to all frames
     parallel : how to go over the frames, as `map` does
@@ -52,10 +53,16 @@ class JointProblem:
     model: ExposureModel
     frames: Tensor
     precision: Tensor
+    centre: Tensor
     tv_weight: float
     free: tuple[str, ...] = ("object", "aberrations")
     static: bool = True
     parallel: Map = map
+
+    def of_frames(self, part: slice | Tensor, **changes: Any) -> JointProblem:
+        """The problem of some of the frames, with other fields changed as `dataclasses.replace` does."""
+        precision = self.precision[part] if len(self.precision) > 1 else self.precision
+        return replace(self, frames=self.frames[part], precision=precision, centre=self.centre[part], **changes)
 
     def scaled_data(self, state: State) -> tuple[Tensor, Tensor]:
         """Frames and precision with the gains divided out of the model: (frames / g, precision g^2 / excess)."""
@@ -63,7 +70,7 @@ class JointProblem:
         return self.frames / gains, self.precision * (gains**2 / state.excess[:, None, None].to(gains))
 
     def prior(self, state: State) -> float | Tensor:
-        """Weight of z^2 / 2 of every frame: common aberrations do not follow the turbulence, and count once."""
+        """Weight of a frame's (z - centre)^2 / 2: common aberrations do not follow the turbulence, and count once."""
         n_static = self.model.n_static
         if not n_static:
             return state.prior
@@ -98,13 +105,14 @@ class JointProblem:
             parallel=self.parallel,
         )
         variation, slope = total_variation(image)
-        value = misfit.value.sum() + self.tv_weight * variation + 0.5 * (self.prior(state) * z**2).sum()
+        away = z - self.centre
+        value = misfit.value.sum() + self.tv_weight * variation + 0.5 * (self.prior(state) * away**2).sum()
         image_gradient = torch.zeros_like(image)
         z_gradient = torch.zeros_like(z)
         if misfit.object_gradient is not None:
             image_gradient = misfit.object_gradient + self.tv_weight * slope
         if misfit.aberration_gradient is not None:
-            z_gradient = misfit.aberration_gradient + self.prior(state) * z
+            z_gradient = misfit.aberration_gradient + self.prior(state) * away
             if self.model.n_static:  # of a function of their mean, which keeps equal what is equal
                 common = z_gradient[:, -self.model.n_static :]
                 common[:] = common.mean(0) if self.static else 0.0
@@ -114,7 +122,7 @@ class JointProblem:
         """Misfit and prior of each frame, (T,)."""
         frames, precision = self.scaled_data(state)
         misfit = self.model.misfit(state.image, state.z, frames, precision, want_object=False, want_aberrations=False)
-        return misfit.value.to(state.z) + 0.5 * (self.prior(state) * state.z**2).sum(1)
+        return misfit.value.to(state.z) + 0.5 * (self.prior(state) * (state.z - self.centre) ** 2).sum(1)
 
     def descend(self, state: State, n_iterations: int, progress: Callable[[float, int, Any], None]) -> State:
         """L-BFGS from `state`; `progress(cost, evaluations, function giving (image, z))` after every iteration."""

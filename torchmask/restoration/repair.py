@@ -26,14 +26,7 @@ def repair(problem: JointProblem, state: State, excess: Tensor, first_excess: fl
     bad = (excess > _OUTLYING * excess.quantile(0.25)).nonzero().flatten()
     if not len(bad):
         return state, 0
-    precision = problem.precision
-    part = replace(
-        problem,
-        frames=problem.frames[bad],
-        precision=precision[bad] if len(precision) > 1 else precision,
-        free=("aberrations",),
-        static=False,
-    )
+    part = problem.of_frames(bad, free=("aberrations",), static=False)
     generator = torch.Generator().manual_seed(seed)
     n_evaluations = 0
 
@@ -43,11 +36,12 @@ def repair(problem: JointProblem, state: State, excess: Tensor, first_excess: fl
 
     now = replace(state, z=state.z[bad], gains=state.gains[bad], excess=state.excess[bad])
     best, least = now.z, part.frame_costs(now)
-    spread = float(state.z.square().mean().sqrt())
+    spread = float((state.z - problem.centre).square().mean(1).sqrt().median())  # whatever lost frames have come to
     own = problem.model.n_parameters - problem.model.n_static
     for _ in range(_STARTS):
         noise = torch.randn(now.z.shape, dtype=now.z.dtype, device="cpu", generator=generator).to(now.z)
-        fresh = torch.cat([spread * noise[:, :own], now.z[:, own:]], dim=1)  # what is common to all frames stays
+        fresh = part.centre + spread * noise
+        fresh[:, own:] = now.z[:, own:]  # what is common to all frames stays
         trial = replace(now, z=fresh, excess=torch.full_like(now.excess, first_excess))
         for _ in range(_ROUNDS):
             trial = part.descend(trial, _ITERATIONS, count)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,9 @@ class RestorationResult:
     converged, message : whether and why it stopped
     n_evaluations : of cost and gradient
     seconds : wall time
+    object_std : (H, W) standard deviation of the object below the diffraction limit [electrons], its position and
+        brightness, which frames cannot tell, taken as found; None unless samples were asked for
+    coefficients_std : (N, J) that of the coefficients of a frame [rad rms], or None
 
     Examples
     --------
@@ -61,16 +64,19 @@ class RestorationResult:
     message: str
     n_evaluations: int
     seconds: float
+    object_std: Tensor | None = None
+    coefficients_std: Tensor | None = None
 
     def save(self, path: str | Path) -> None:
         """Write everything to a new .npz file, without pickle. Errors as in `torchmask.io.save_npz`."""
-        save_npz(path, {item.name: getattr(self, item.name) for item in fields(self)})
+        values = {item.name: getattr(self, item.name) for item in fields(self)}
+        save_npz(path, {name: value for name, value in values.items() if value is not None})
 
     @classmethod
     def load(cls, path: str | Path) -> RestorationResult:
         """Read what `save` wrote; tensors on the CPU. Raises ValueError for a missing, damaged or foreign file."""
-        names = [item.name for item in fields(cls)]
-        stored = load_npz(path, required=names)
+        stored = load_npz(path, required=[item.name for item in fields(cls) if item.default is MISSING])
+        names = [item.name for item in fields(cls) if item.name in stored]
         values: dict[str, Any] = {name: torch.from_numpy(stored[name]) for name in names if stored[name].ndim}
         values.update({name: stored[name].item() for name in names if not stored[name].ndim})
         return cls(**values)

@@ -23,6 +23,7 @@ from torchmask.restoration.initialization import (
     turbulence_strength,
 )
 from torchmask.restoration.parallel import Map
+from torchmask.restoration.posterior import standard_deviations
 from torchmask.restoration.problem import JointProblem, State
 from torchmask.restoration.repair import repair
 from torchmask.restoration.result import RestorationResult
@@ -55,9 +56,18 @@ class Restoration:
     """Holds frames (T, H, W) in units of their mean pixel; calling it restores the object behind them."""
 
     def __init__(
-        self, method: MyopicDeconvolution, frames: Tensor, valid: Tensor, callback: Callback | None, parallel: Map
+        self,
+        method: MyopicDeconvolution,
+        frames: Tensor,
+        valid: Tensor,
+        covariance: Tensor | None,
+        callback: Callback | None,
+        parallel: Map,
     ) -> None:
-        self.method, self.model, self.callback = method, method.model, callback
+        self.method, self.callback = method, callback
+        self.estimated = covariance is not None  # aberrations, with errors: the prior is theirs, not that of turbulence
+        self.model = method.model if covariance is None else method.model_of_errors(covariance)
+        self.prior = self.estimated or method.aberration_prior
         self.unit = float(frames.mean())
         bluest = replace(method.grid, wavelength=self.model.shortest_wavelength)
         self.variance = expected_variance(frames, bluest, method.aperture, method.readout_noise)
@@ -67,7 +77,8 @@ class Restoration:
         self.frames, self.valid = (frames / self.unit).to(basis), valid.to(basis.device)
         weight = valid.new_ones(1, 1, 1) if bool(valid.all()) else valid
         precision = weight.to(basis) * (self.unit**2 / self.variance)
-        self.problem = JointProblem(self.model, self.frames, precision, method.tv_weight, parallel=parallel)
+        centre = torch.zeros(len(frames), self.model.n_parameters, dtype=torch.float64, device=basis.device)
+        self.problem = JointProblem(self.model, self.frames, precision, centre, method.tv_weight, parallel=parallel)
         change = self.frames - self.frames.mean((1, 2), keepdim=True) * self.frames.mean(0)
         self._first_excess = max(1.0, float((change**2 * precision).mean()) / _CONTINUATION)
         self._symmetric = method.aperture.n_subapertures == 1  # under point reflection, and of many modes
@@ -77,20 +88,25 @@ class Restoration:
         coefficients: Tensor | None,
         known_object: Tensor | None,
         start: RestorationResult | None,
+        n_samples: int,
         checkpoint: str | Path | None,
         started: float,
     ) -> RestorationResult:
-        free = [name for name, known in (("object", known_object), ("aberrations", coefficients)) if known is None]
-        self.problem = replace(self.problem, free=tuple(free))
+        known = {"object": known_object is not None, "aberrations": coefficients is not None and not self.estimated}
+        self.problem = replace(self.problem, free=tuple(name for name in known if not known[name]))
+        begin = self._begin(coefficients, known_object)
         if checkpoint is not None and Path(checkpoint).exists():
             progress = self._resume(checkpoint)
         else:
-            progress = self._begin(coefficients, known_object, start)
+            progress = _Progress(begin) if start is None else self._warm(begin, start)
         while not progress.message:
             self._advance(progress)
             if checkpoint is not None:
                 self._keep(progress, checkpoint)
-        return self._result(progress, time.perf_counter() - started)
+        result = self._result(progress)
+        if n_samples:
+            result = replace(result, **self._deviations(progress.state, n_samples))
+        return replace(result, seconds=time.perf_counter() - started)
 
     def _advance(self, progress: _Progress) -> None:
         """One segment, then what is brought up to date between two."""
@@ -106,9 +122,8 @@ class Restoration:
         progress.state = state = problem.descend(state, min(SEGMENT, left), step)
         after = float(problem.cost(state, state.image, state.z)[0])
         decrease = (before - after) / abs(after)
-        both = len(problem.free) == 2
-        if both and progress.centrings < _CENTRINGS and left > SEGMENT:
-            if len(progress.costs) >= _BLURRED:
+        if "aberrations" in problem.free and progress.centrings < _CENTRINGS and left > SEGMENT:
+            if "object" not in problem.free or len(progress.costs) >= _BLURRED:
                 self._relocate(progress)
         elif decrease < method.tolerance:
             progress.message = f"converged: the last {SEGMENT} iterations lowered the cost by a fraction {decrease:.1e}"
@@ -124,9 +139,11 @@ class Restoration:
         excess = self.problem.calibrate(progress.state).excess
         state, evaluations = repair(self.problem, progress.state, excess, self._first_excess, seed=progress.centrings)
         progress.n_evaluations += evaluations
-        progress.state = centre_on_pixels(self.problem, state)
-        if progress.state is state:  # it is where it belongs
+        if "object" in self.problem.free:
+            state = centre_on_pixels(self.problem, state)
+        if state is progress.state:  # all is where it belongs
             progress.centrings = _CENTRINGS
+        progress.state = state
 
     def _update(self, state: State) -> State:
         """Gains, excess noise and strength of the turbulence as the state itself tells them.
@@ -135,16 +152,17 @@ class Restoration:
         """
         state = self.problem.calibrate(state)
         state = replace(state, excess=state.excess.mean().expand_as(state.excess).clone())
-        if self.method.known_r0 or not self.method.aberration_prior or "aberrations" not in self.problem.free:
+        if state.prior and "aberrations" in self.problem.free:
+            state = replace(state, z=self.model.unwrapped(state.z, self.problem.centre))
+        r0_is_open = self.method.aberration_prior and not self.method.known_r0 and not self.estimated
+        if not r0_is_open or "aberrations" not in self.problem.free:
             return state
         own = self.model.n_parameters - self.model.n_static
         mixing = self.model.mixing[:, :own]
         strength = turbulence_strength(self._coefficients(state.z[:, :own], mixing), mixing)
         return state if strength is None else replace(state, prior=1 / strength)
 
-    def _begin(
-        self, coefficients: Tensor | None, known_object: Tensor | None, start: RestorationResult | None
-    ) -> _Progress:
+    def _begin(self, coefficients: Tensor | None, known_object: Tensor | None) -> State:
         grid, shape = self.method.grid, (len(self.frames), self.model.n_parameters)
         image = mean_frame(self.frames, self.model.field).double()
         z = torch.zeros(shape, dtype=torch.float64, device=image.device)
@@ -159,6 +177,8 @@ class Restoration:
             if tuple(coefficients.shape) != expected:
                 raise ValueError(f"coefficients has shape {tuple(coefficients.shape)}: it must be {expected}")
             z = self._whiten(coefficients)
+            if self.estimated:
+                self.problem = replace(self.problem, centre=z)
         if known_object is not None:
             if tuple(known_object.shape) != grid.shape:
                 raise ValueError(f"known_object has shape {tuple(known_object.shape)}: it must be {grid.shape}")
@@ -166,10 +186,8 @@ class Restoration:
             image = image / float(self.model(image, z).mean())
         gains = self.frames.mean((1, 2)).double()
         gains = gains / gains.mean()
-        prior = 1.0 if self.method.aberration_prior else 0.0
         excess = torch.full_like(gains, self._first_excess)
-        state = State(image, z, gains, prior, excess)
-        return _Progress(state) if start is None else self._warm(state, start)
+        return State(image, z, gains, 1.0 if self.prior else 0.0, excess)
 
     def _warm(self, state: State, start: RestorationResult) -> _Progress:
         """Go on from `start`; frames that it does not know are first fitted to its object."""
@@ -191,14 +209,7 @@ class Restoration:
             z[known:, own:] = z[0, own:]
         progress = _Progress(replace(state, image=image, z=z), centrings=_CENTRINGS)
         if known < len(z) and "aberrations" in self.problem.free:
-            precision = self.problem.precision
-            fresh = replace(
-                self.problem,
-                frames=self.frames[known:],
-                precision=precision[known:] if len(precision) > 1 else precision,
-                free=("aberrations",),
-                static=False,
-            )
+            fresh = self.problem.of_frames(slice(known, None), free=("aberrations",), static=False)
 
             def count(cost: float, evaluations: int, variables: Any) -> None:
                 progress.n_evaluations += evaluations
@@ -237,7 +248,7 @@ class Restoration:
         """Tells whether a checkpoint belongs to these frames and settings."""
         digest = hashlib.sha256(self.frames.cpu().numpy().tobytes() + self.model.basis.cpu().numpy().tobytes())
         digest.update(self.model.weights.cpu().numpy().tobytes())
-        digest.update(self.problem.precision.cpu().numpy().tobytes())
+        digest.update(self.problem.precision.cpu().numpy().tobytes() + self.problem.centre.cpu().numpy().tobytes())
         digest.update(repr((self.problem.free, self.method.tv_weight, self.method.aberration_prior)).encode())
         return digest.hexdigest()
 
@@ -260,7 +271,16 @@ class Restoration:
             message = ""  # a larger budget than before: go on
         return _Progress(State(image, z, gains, float(stored["prior"]), excess), costs, *counts, message)
 
-    def _result(self, progress: _Progress, seconds: float) -> RestorationResult:
+    def _deviations(self, state: State, n_samples: int) -> dict[str, Tensor]:
+        """Standard deviations of the object [electrons] and of the coefficients [rad]."""
+        rows, columns = self.method.grid.shape
+        cutoff = min(0.5, self.method.grid.cutoff(self.method.aperture.extent))
+        photons = min(1.0, self.unit / self.variance)
+        image, z = standard_deviations(self.problem, state, cutoff, photons, n_samples)
+        spread = torch.stack([self._coefficients(sample) for sample in z]).square().mean((0, 1)).sqrt()
+        return {"object_std": image[:rows, :columns] * self.unit, "coefficients_std": spread}
+
+    def _result(self, progress: _Progress) -> RestorationResult:
         method, state = self.method, progress.state
         rows, columns = method.grid.shape
         gains = state.gains[:, None, None].to(self.frames)
@@ -277,11 +297,11 @@ class Restoration:
             residuals=residuals,
             chi_square=(residuals**2).sum((1, 2)) / n_valid,
             tv_weight=method.tv_weight,
-            r0=method.r0 * state.prior ** (3 / 5) if method.aberration_prior else math.nan,
+            r0=method.r0 * state.prior ** (3 / 5) if method.aberration_prior and not self.estimated else math.nan,
             noise=self.variance**0.5,
             cost=torch.tensor(progress.costs, dtype=torch.float64, device="cpu"),
             converged=progress.message.startswith("converged"),
             message=progress.message,
             n_evaluations=progress.n_evaluations,
-            seconds=seconds,
+            seconds=0.0,
         )

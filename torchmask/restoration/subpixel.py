@@ -58,7 +58,8 @@ def centre_on_pixels(problem: JointProblem, state: State) -> State:
             if (trial := settle(offset))[0] < best[0]:
                 best, place = trial, offset
     z = state.z - tilt(problem.model, place).to(state.z)
-    gain = stay[0] - best[0] + 0.5 * float((problem.prior(state) * (state.z**2 - z**2)).sum())
+    change = (state.z - problem.centre) ** 2 - (z - problem.centre) ** 2
+    gain = stay[0] - best[0] + 0.5 * float((problem.prior(state) * change).sum())
     return replace(state, image=best[1], z=z) if gain > 0 else state
 
 

@@ -1,0 +1,48 @@
+"""The model to first order against automatic differentiation, and its adjoint."""
+
+import math
+
+import pytest
+import torch
+
+from torchmask.grid import Grid
+from torchmask.optics.aperture import SparseAperture
+from torchmask.restoration.linearization import Linearization
+from torchmask.restoration.model import ExposureModel
+
+GRID = Grid.nyquist(1.0, 550e-9, (20, 24))
+
+
+def setup(dtype=torch.float64, **options):
+    angles = torch.arange(4, dtype=dtype) * math.pi / 2
+    mask = SparseAperture(torch.stack([angles.cos(), angles.sin()], -1) * 0.37, 0.25, 1.0)
+    model = ExposureModel(mask, GRID, 3, dtype=dtype, **options)
+    generator = torch.Generator().manual_seed(0)
+    shape = (5, 3, model.n_parameters)
+    image = torch.rand(model.field.shape, dtype=dtype, generator=generator)
+    changes = torch.randn(5, *model.field.shape, dtype=dtype, generator=generator)
+    z = 0.5 * torch.randn(shape[1:], dtype=dtype, generator=generator)
+    return model, image, z, changes, torch.randn(shape, dtype=dtype, generator=generator), generator
+
+
+@pytest.mark.parametrize("wavelengths", [None, [560e-9, 600e-9]])
+def test_forward_is_the_derivative(wavelengths):
+    model, image, z, images, zs, _ = setup(wavelengths=wavelengths)
+    linear = Linearization(model, image, z).forward(images, zs)
+    for number in range(len(images)):
+        exact = torch.autograd.functional.jvp(model, (image, z), (images[number], zs[number]))[1]
+        torch.testing.assert_close(linear[number], exact, rtol=1e-10, atol=1e-12 * float(exact.abs().max()))
+
+
+@pytest.mark.parametrize(("dtype", "rounding"), [(torch.float64, 1e-12), (torch.float32, 1e-4)])
+def test_adjoint(dtype, rounding):
+    """<J x, y> = <x, J^T y>, to the rounding of sums of a few thousand terms."""
+    model, image, z, images, zs, generator = setup(dtype)
+    tangent = Linearization(model, image, z)
+    frames = torch.randn(5, 3, *GRID.shape, dtype=dtype, generator=generator)
+    by_image, by_z = tangent.adjoint(frames)
+    forward = tangent.forward(images, zs)
+    left = (forward * frames).sum((1, 2, 3))
+    right = (images * by_image).sum((1, 2)) + (zs * by_z).sum((1, 2))
+    size = forward.flatten(1).norm(dim=1) * frames.flatten(1).norm(dim=1)
+    assert float(((left - right).abs() / size).max()) < rounding

@@ -1,0 +1,214 @@
+"""Standard deviations against closed forms, and against the errors of whole restorations."""
+
+import math
+
+import pytest
+import torch
+
+from torchmask.grid import Grid
+from torchmask.metrics import align, lowpass
+from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.detector import Detector
+from torchmask.optics.turbulence import TurbulencePhase
+from torchmask.restoration.model import ExposureModel
+from torchmask.restoration.myopic import MyopicDeconvolution
+from torchmask.restoration.posterior import (
+    _filter,
+    _power,
+    _prior_noise,
+    _sample,
+    conjugate_gradients,
+    divergence,
+    gradient,
+    smooth,
+)
+from torchmask.restoration.priors import whitening
+from torchmask.restoration.problem import JointProblem, State
+from torchmask.simulation.observation import simulate_observation
+from torchmask.simulation.scene import SceneOptions, make_scene
+
+GRID = Grid.nyquist(1.0, 550e-9, 48)
+
+
+def mask(n=5):
+    angles = torch.arange(n, dtype=torch.float64) * 2 * math.pi / n
+    return SparseAperture(torch.stack([angles.cos(), angles.sin()], -1) * 0.38, 0.22, 1.0)
+
+
+def problem(n_static=0, free=("object", "aberrations"), n_frames=3, photons=1e4):
+    """A block seen through a field without margin, so that convolutions are periodic."""
+    columns = whitening(mask(), 3, 0.3, 20.0)
+    model = ExposureModel(mask(), GRID, 3, columns, margin=0.0, n_static=n_static)
+    generator = torch.Generator().manual_seed(0)
+    image = torch.full(GRID.shape, 0.2, dtype=torch.float64)
+    image[18:30, 16:34] = 3.0
+    z = 0.5 * torch.randn(n_frames, model.n_parameters, dtype=torch.float64, generator=generator)
+    if n_static:
+        z[:, -n_static:] = z[0, -n_static:]
+    precision = torch.full((n_frames, 1, 1), photons, dtype=torch.float64)
+    ones = torch.ones(n_frames, dtype=torch.float64)
+    centre = torch.zeros_like(z)
+    stated = JointProblem(model, model(image, z), precision, centre, tv_weight=1.0, free=free)
+    return stated, State(image, z, ones, 1.0, ones)
+
+
+def test_gradient_and_divergence_are_adjoint():
+    generator = torch.Generator().manual_seed(0)
+    image, dy, dx = (torch.randn(7, 9, dtype=torch.float64, generator=generator) for _ in range(3))
+    left = sum(float((a * b).sum()) for a, b in zip(gradient(image), (dy, dx), strict=True))
+    assert left == pytest.approx(float((image * divergence(dy, dx)).sum()), rel=1e-12)
+
+
+def test_smooth_is_a_gaussian_of_that_width():
+    point = torch.zeros(64, 48, dtype=torch.float64)
+    point[20, 30] = 1
+    y, x = torch.meshgrid(torch.arange(64.0) - 20, torch.arange(48.0) - 30, indexing="ij")
+    expected = torch.exp(-(y**2 + x**2) / (2 * 3.0**2)) / (2 * math.pi * 3.0**2)
+    torch.testing.assert_close(smooth(point, 3.0), expected.double(), rtol=0, atol=1e-8)  # float32 distances
+
+
+def test_conjugate_gradients_solve():
+    generator = torch.Generator().manual_seed(0)
+    root = torch.randn(12, 12, dtype=torch.float64, generator=generator)
+    matrix = root @ root.T + torch.eye(12, dtype=torch.float64)
+    right = torch.randn(4, 12, dtype=torch.float64, generator=generator)
+    found = conjugate_gradients(lambda x: x @ matrix, right, lambda x: x / matrix.diagonal())
+    torch.testing.assert_close(found, torch.linalg.solve(matrix, right.T).T, rtol=1e-9, atol=1e-9)
+
+
+def test_noise_of_the_prior_has_its_hessian_as_covariance():
+    generator = torch.Generator().manual_seed(0)
+    prior = torch.rand(5, 6, dtype=torch.float64, generator=generator) + 0.5
+    n = 20000
+    noise = _prior_noise(prior, n, generator).flatten(1)
+    units = torch.eye(30, dtype=torch.float64).view(30, 5, 6)
+    hessian = divergence(*(prior * slope for slope in gradient(units))).flatten(1)
+    spread = hessian.diagonal().sqrt()
+    error = (noise.T @ noise / n - hessian).abs() / torch.outer(spread, spread)
+    assert float(error.max()) < 5 * math.sqrt(2 / n)  # a sample variance is off by sqrt(2 / n); 5 sigma of 465 entries
+
+
+def test_the_object_alone_has_the_closed_form():
+    """With known PSFs and an even prior the posterior is diagonal in frequency: variance 1 / (power + prior |k|^2)."""
+    stated, state = problem(free=("object",))
+    power, prior = _power(stated, state), torch.full(GRID.shape, 40.0, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(1)
+    objects, aberrations = _sample(stated, state, power, prior, 0.0, 12, generator)
+    assert not bool(aberrations.any())
+    nu = torch.fft.fftfreq(48, dtype=torch.float64)
+    smoothness = 4 * ((math.pi * nu[:, None]).sin() ** 2 + (math.pi * nu[None]).sin() ** 2)
+    full_power = torch.fft.fft2(torch.fft.irfft2(power, s=GRID.shape)).real
+    expected = 1 / (full_power + 40.0 * smoothness)
+    # 12 samples of each of the frequencies, half of which are independent
+    relative = math.sqrt(2 * float((expected**2).sum()) / float(expected.sum()) ** 2 / 12)
+    measured = float(objects.square().mean())
+    assert measured == pytest.approx(float(expected.mean()), rel=4 * relative)
+    assert relative < 0.03
+
+
+def test_aberrations_alone_have_the_inverse_of_their_hessian():
+    """With a known object the frames are apart, and the Hessian is a small matrix."""
+    stated, state = problem(free=("aberrations",), n_frames=1)
+    model = stated.model
+    jacobian = torch.autograd.functional.jacobian(lambda z: model(state.image, z).flatten(), state.z)[:, 0]
+    hessian = 1e4 * jacobian.T @ jacobian + torch.eye(model.n_parameters, dtype=torch.float64)
+    expected = torch.linalg.inv(hessian).diagonal()
+    prior = torch.ones(GRID.shape, dtype=torch.float64)
+    n = 400
+    _, samples = _sample(stated, state, _power(stated, state), prior, 0.0, n, torch.Generator().manual_seed(2))
+    ratio = samples[:, 0].square().mean(0) / expected
+    assert float((ratio - 1).abs().max()) < 4.5 * math.sqrt(2 / n)
+
+
+def test_common_aberrations_are_alike_and_better_known():
+    single = problem(n_frames=4)
+    common = problem(n_static=3, n_frames=4)
+    prior = torch.full(GRID.shape, 40.0, dtype=torch.float64)
+    spread = []
+    for stated, state in (single, common):
+        _, z = _sample(stated, state, _power(stated, state), prior, 0.0, 40, torch.Generator().manual_seed(3))
+        spread.append(z[..., -3:].square().mean().sqrt())
+    assert float((z[..., -3:] - z[:, :1, -3:]).abs().max()) < 1e-12
+    assert float(spread[1]) < 0.75 * float(spread[0])  # 0.5 if the four frames said the same
+
+
+def test_an_unknown_object_leaves_aberrations_less_known_and_the_other_way_round():
+    prior = torch.full(GRID.shape, 1.0, dtype=torch.float64)
+    results = {}
+    for free in (("object",), ("aberrations",), ("object", "aberrations")):
+        stated, state = problem(free=free, photons=300.0)
+        generator = torch.Generator().manual_seed(3)
+        objects, z = _sample(stated, state, _power(stated, state), prior, 0.0, 30, generator)
+        results[free] = float(lowpass(objects, 0.3).square().mean()), float(z.square().mean())
+    both = results["object", "aberrations"]
+    assert both[0] > 1.02 * results["object",][0]
+    assert both[1] > 1.02 * results["aberrations",][1]
+
+
+def inside(observation, result):
+    """The share of bright pixels whose error is below one standard deviation."""
+    truth, found = lowpass(observation.object, 0.5), align(result.object, observation.object, 0.5)
+    gain = float(found.norm() / lowpass(result.object, 0.5).norm())
+    bright = truth > 0.1 * float(torch.quantile(truth.flatten(), 0.995))
+    return float(((found - truth).abs() < gain * result.object_std)[bright].double().mean())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("photons", [1e5, 1e6, 1e7])
+def test_about_two_thirds_of_bright_pixels_lie_within_one_sigma(photons):
+    grid, apertures = Grid.nyquist(1.0, 550e-9, 64), SparseAperture.from_catalog("golay9", 1.0, 0.15)
+    scene = make_scene(grid.shape, photons, SceneOptions(size=0.5))
+    turbulence, generator = TurbulencePhase(1 / 7, 20.0), torch.Generator().manual_seed(0)
+    seen = simulate_observation(scene, apertures, grid, turbulence, Detector(1.5), 10, generator)
+    result = MyopicDeconvolution(apertures, grid).restore(seen.frames, n_samples=8)
+    assert 0.5 < inside(seen, result) < 0.85
+
+
+def test_coefficients_scatter_as_said():
+    """Errors of the coefficients over their standard deviations, from frames that the model itself has made."""
+    aperture = mask()
+    columns = whitening(aperture, 3, 1.5, 20.0)
+    generator = torch.Generator().manual_seed(5)
+    z = torch.randn(6, columns.shape[1], dtype=torch.float64, generator=generator)
+    true = (z @ columns.T).unflatten(1, (5, 3))
+    model = ExposureModel(aperture, GRID, 3)
+    image = torch.zeros(model.field.shape, dtype=torch.float64)
+    image[18:30, 16:34], image[20:24, 20:42] = 3000.0, 5000.0
+    frames = torch.poisson(model(image, true.flatten(1)).clamp(min=0), generator=generator)
+    method = MyopicDeconvolution(aperture, GRID, 3, r0=1.5, outer_scale=20.0)
+    result = method.restore(frames, known_object=image[:48, :48], n_samples=30)
+    error = result.coefficients - true
+    error[..., 0] -= error[..., 0].mean(1, keepdim=True)
+    pull = float((error / result.coefficients_std).square().mean().sqrt())
+    # 90 errors, of which 84 are independent: rms 1 within 4 sigma, and 1 % of bias
+    assert pull == pytest.approx(1, abs=4 / math.sqrt(2 * 84) + 0.01)
+    assert result.object_std is not None
+    assert not bool(result.object_std.any())  # it is known
+
+
+def test_deviations_are_kept_and_asked_for(tmp_path):
+    aperture, frames = mask(), torch.full((2, 48, 48), 20.0, dtype=torch.float64)
+    frames[:, 16:30, 20:28] = 1000.0
+    frames = torch.poisson(frames, generator=torch.Generator().manual_seed(0))
+    method = MyopicDeconvolution(aperture, GRID, 3, max_iterations=3)
+    plain = method.restore(frames)
+    assert plain.object_std is None
+    assert plain.coefficients_std is None
+    result = method.restore(frames, n_samples=2)
+    assert result.object_std.shape == (48, 48)
+    assert result.coefficients_std.shape == (5, 3)
+    result.save(tmp_path / "result.npz")
+    again = type(result).load(tmp_path / "result.npz")
+    assert torch.equal(again.object_std, result.object_std)
+    plain.save(tmp_path / "plain.npz")
+    assert type(result).load(tmp_path / "plain.npz").object_std is None
+    for bad in (-1, 1):
+        with pytest.raises(ValueError, match="at least 2"):
+            method.restore(frames, n_samples=bad)
+
+
+def test_filter_is_periodic_convolution():
+    image = torch.rand(6, 8, dtype=torch.float64)
+    kernel = torch.zeros(6, 8, dtype=torch.float64)
+    kernel[0, 1] = 1
+    torch.testing.assert_close(_filter(image, torch.fft.rfft2(kernel)), image.roll(1, 1))
