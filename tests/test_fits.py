@@ -347,6 +347,7 @@ def test_selection_keeps_the_best_in_their_order(tmp_path, mask, keep_by):
     ("options", "message"),
     [
         ({"keep": 0.0}, r"keep is 0.0"),
+        ({"target": (900, 3)}, r"target is \(900, 3\).*give crop \[pixels\] too"),
         ({"keep": 1.5}, r"keep is 1.5"),
         ({"keep_by": "luck"}, r"keep_by is 'luck'"),
         ({"crop": 1}, r"crop is 1"),

@@ -233,6 +233,32 @@ def test_impossible_requests_are_refused_and_leave_nothing(tmp_path, capsys):
     )
 
 
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (["--imaging.d-over-r0", "0"], "d_over_r0 is 0.0: it must be positive"),
+        (["--imaging.outer-scale", "-1"], "outer_scale is -1.0"),
+        (["--imaging.readout-noise", "-1"], "readout_noise is -1.0"),
+        (["--imaging.n-frames", "0"], "n_frames is 0"),
+        (["--imaging.n-pixels", "24"], "spans 1.75 pupil samples"),
+        (["--restoration.n-modes", "-3"], "is -3: it must be"),
+        (["--restoration.max-iterations", "0"], "max_iterations is 0"),
+        (["--design.n-subapertures", "0"], "n_subapertures is 0"),
+        (["--design.fill-factor", "2"], "fill_factor is 2.0"),
+    ],
+)
+def test_codesign_refuses_before_it_searches(tmp_path, capsys, monkeypatch, given, message):
+    def never(*_, **__):
+        raise AssertionError("the search began")
+
+    monkeypatch.setattr("torchmask.design.search.evolve", never)  # of the default method, cma
+    assert main(["codesign", *given, "--runs", str(tmp_path / "runs")]) == 1
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert re.search(message, err), err
+    assert not (tmp_path / "runs").exists()
+
+
 def test_nothing_is_overwritten(runs, capsys):
     before = contents(runs)
     for command in ("design", "simulate", "restore"):

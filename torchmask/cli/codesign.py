@@ -26,8 +26,9 @@ from torchmask.design.search import SearchResult
 from torchmask.grid import Grid
 from torchmask.io import save_npz
 from torchmask.metrics import score, ssim
-from torchmask.optics.aperture import Aperture, FullAperture
+from torchmask.optics.aperture import Aperture, FullAperture, SparseAperture
 from torchmask.optics.detector import Detector
+from torchmask.optics.packing import hole_diameter
 from torchmask.optics.turbulence import TurbulencePhase
 from torchmask.record import Callback
 from torchmask.restoration.myopic import MyopicDeconvolution
@@ -118,6 +119,39 @@ def image_grid(config: Config) -> Grid:
     return Grid.nyquist(config.imaging.diameter, config.imaging.wavelength, config.imaging.n_pixels)
 
 
+def outside(config: Config) -> tuple[TurbulencePhase, Detector]:
+    """What comes between the scene and the frames."""
+    imaging = config.imaging
+    if not imaging.d_over_r0 > 0:
+        raise ValueError(f"imaging.d_over_r0 is {imaging.d_over_r0}: it must be positive")
+    turbulence = TurbulencePhase(imaging.diameter / imaging.d_over_r0, imaging.outer_scale * imaging.diameter)
+    return turbulence, Detector(imaging.readout_noise)
+
+
+def inversion(config: Config, aperture: Aperture, n_modes: int | None) -> MyopicDeconvolution:
+    """The restoration, told what an observer knows: instrument, read-out noise and turbulence."""
+    imaging, options = config.imaging, config.restoration
+    return MyopicDeconvolution(
+        aperture,
+        image_grid(config),
+        n_modes=n_modes,
+        r0=imaging.diameter / imaging.d_over_r0,
+        outer_scale=imaging.outer_scale * imaging.diameter,
+        readout_noise=imaging.readout_noise,
+        aberration_prior=options.prior,
+        max_iterations=options.max_iterations,
+    )
+
+
+def check(config: Config) -> None:
+    """Raise ValueError for what the stages after the search would refuse: the search takes long."""
+    outside(config)
+    design, diameter = config.design, config.imaging.diameter
+    size = hole_diameter(design.n_subapertures, diameter, design.fill_factor)
+    hole = SparseAperture(torch.zeros(1, 2, dtype=torch.float64), size, diameter)
+    inversion(config, hole, config.restoration.n_modes or 1)
+
+
 def design_mask(config: Config, callback: Callback) -> SearchResult:
     """Search for the mask that minimises MSE_a, with photon noise alone as in the reference case."""
     imaging = config.imaging
@@ -131,33 +165,18 @@ def observe(config: Config, scene: torch.Tensor, aperture: Aperture, callback: C
 
     One seed: mask and full pupil look through the same screens.
     """
-    imaging = config.imaging
+    turbulence, detector = outside(config)
+    generator = torch.Generator().manual_seed(config.seed)
+    n_frames = config.imaging.n_frames
     return simulate_observation(
-        scene,
-        aperture,
-        image_grid(config),
-        TurbulencePhase(imaging.diameter / imaging.d_over_r0, imaging.outer_scale * imaging.diameter),
-        Detector(imaging.readout_noise),
-        imaging.n_frames,
-        torch.Generator().manual_seed(config.seed),
-        callback=callback,
+        scene, aperture, image_grid(config), turbulence, detector, n_frames, generator, callback=callback
     )
 
 
 def restore(config: Config, observation: Observation, callback: Callback) -> RestorationResult:
-    """Restore the object from the frames and what an observer knows: instrument, read-out noise and turbulence."""
-    options = config.restoration
-    inversion = MyopicDeconvolution(
-        observation.aperture,
-        observation.grid,
-        n_modes=options.n_modes,
-        r0=observation.r0,
-        outer_scale=observation.outer_scale,
-        readout_noise=observation.readout_noise,
-        aberration_prior=options.prior,
-        max_iterations=options.max_iterations,
-    )
-    return inversion.restore(observation.frames, callback=callback)
+    """Restore the object from the frames."""
+    method = inversion(config, observation.aperture, config.restoration.n_modes)
+    return method.restore(observation.frames, callback=callback)
 
 
 def under(stage: str, callback: Callback) -> Callback:
@@ -229,6 +248,7 @@ def run(config: Config) -> None:
     """Run in a new folder; an interrupted run leaves there what it reached."""
     directory = config.runs / (config.name or datetime.now().strftime("codesign-%Y%m%d-%H%M%S"))
     config = with_presets(config)
+    check(config)
     scene = make_scene(image_grid(config).shape, config.imaging.n_photons, config.scene)
     with new_run("codesign", config, directory, config.seed) as output:
         output.summary.append(f"look at it with: tensorboard --logdir {config.runs}")

@@ -39,6 +39,8 @@ def observation_fields(
 ) -> dict[str, Any]:
     """The fields of the Observation that `Observation.from_fits` documents."""
     _check_options(wavelength, pixel_scale, gain, exposure_time, readout_noise, crop, keep, keep_by)
+    if target is not None and crop is None:
+        raise ValueError(f"target is {target}, the middle of the field to cut out: give crop [pixels] too")
     files = [read_fits(path) for path in ([paths] if isinstance(paths, str | Path) else list(paths))]
     if not files:
         raise ValueError("paths is empty: give at least one FITS file")
