@@ -131,11 +131,11 @@ def electrons_per_unit(
 
     text = unit or str(header.get("BUNIT", "")).strip()
     gain = number(header, ("EGAIN", "GAIN"), path) if gain is None else gain
-    if not text and gain is None:
+    if not text:
+        if gain is not None:
+            return gain
         warnings.warn("no BUNIT and no GAIN in the header: pixels are taken for electrons; unit tells", stacklevel=2)
         return 1.0
-    if not text:
-        return gain
 
     def electrons(counted: Any) -> float:
         if counted in (units.electron, units.photon):
