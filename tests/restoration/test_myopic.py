@@ -18,6 +18,7 @@ from torchmask.record import Record
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.result import RestorationResult
 from torchmask.simulation.observation import Observation, simulate_observation
+from torchmask.simulation.scene import SceneOptions, make_scene
 
 GRID = Grid.nyquist(1.0, 550e-9, 48)
 R0, OUTER_SCALE, READOUT = 0.25, 20.0, 1.5
@@ -186,6 +187,46 @@ def test_interrupted_and_resumed_is_the_same(observation, tmp_path):
     assert resumed.n_evaluations == whole.n_evaluations
     with pytest.raises(ValueError, match="other frames or settings"):
         method.restore(observation.frames * 1.1, checkpoint=path)
+
+
+def test_a_missed_object_gets_a_second_start(observation, tmp_path, monkeypatch):
+    """Here nothing is missed, so the threshold is lowered: the better of both is kept, resumed or not."""
+    method = MyopicDeconvolution(mask(), GRID, N_MODES, r0=R0, readout_noise=READOUT, max_iterations=400)
+    once = method.restore(observation.frames)
+    assert len(once.cost) <= 400
+    monkeypatch.setattr("torchmask.restoration.run._MISSED", -1.0)
+    twice = method.restore(observation.frames)
+    assert len(once.cost) < len(twice.cost) <= 800
+    assert torch.equal(twice.cost[: len(once.cost)], once.cost)
+    assert "two starts" in twice.message
+    assert float(twice.chi_square.mean()) <= float(once.chi_square.mean()) + 1e-12
+
+    def interrupt(record: Record) -> None:
+        if record.step == len(once.cost) + 150:
+            raise KeyboardInterrupt
+
+    path = tmp_path / "state.npz"
+    with pytest.raises(KeyboardInterrupt):
+        method.restore(observation.frames, checkpoint=path, callback=interrupt)
+    resumed = method.restore(observation.frames, checkpoint=path)
+    assert torch.equal(resumed.object, twice.object)
+    assert torch.equal(resumed.cost, twice.cost)
+    assert resumed.message == twice.message
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not STACKS.is_dir(), reason="the mask of the reference stacks lies beside the checkout")
+def test_the_second_start_finds_what_the_first_has_missed(monkeypatch):
+    stack = Observation.load(STACKS / "skylab_1e7_mask.npz")
+    diameter = stack.aperture.mask_diameter
+    grid = Grid.nyquist(diameter, stack.grid.wavelength, 64)
+    turbulence = TurbulencePhase(diameter / 10, 20 * diameter)
+    generator = torch.Generator().manual_seed(2)
+    scene = make_scene(grid.shape, 1e7, SceneOptions(size=0.5))
+    seen = simulate_observation(scene, stack.aperture, grid, turbulence, Detector(READOUT), 10, generator)
+    result = MyopicDeconvolution(stack.aperture, grid).restore(seen.frames)
+    assert errors(seen, result.object)[0] < 0.1
+    assert "two starts" in result.message
 
 
 def test_records_hold_the_state(observation):

@@ -59,6 +59,8 @@ class MyopicDeconvolution(nn.Module):
     aberration_prior : bool
         False leaves out 1/2 ||z||^2; z are the Zernike coefficients then.
     max_iterations : int
+        Of a start. A restoration that leaves 0.5 % of the change from frame to frame unexplained has missed the object:
+        it starts once more, from random aberrations, and the better of both is kept.
     tolerance : float
         Converged when 100 iterations lower the cost by less than this fraction.
     dtype : torch.dtype

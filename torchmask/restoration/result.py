@@ -26,7 +26,7 @@ class RestorationResult:
     tv_weight : mu, in units of frames of mean 1
     r0 : Fried parameter of the prior on the aberrations [m], NaN without prior
     noise : electrons rms per pixel, averaged over the stack
-    cost : (iterations,) what was minimised
+    cost : (iterations,) what was minimised, one start after the other
     converged, message : whether and why it stopped
     n_evaluations : of cost and gradient
     seconds : wall time

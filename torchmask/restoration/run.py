@@ -6,16 +6,15 @@ import hashlib
 import math
 import time
 import warnings
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from torchmask.io import load_npz, save_npz
 from torchmask.record import Callback, Record
+from torchmask.restoration.checkpoint import Progress, load_checkpoint, save_checkpoint
 from torchmask.restoration.initialization import (
     border_brightness,
     expected_variance,
@@ -34,22 +33,12 @@ if TYPE_CHECKING:
 
 SEGMENT = 100  # iterations between restarts of the descent
 _BLURRED = 300  # iterations after which the object is sharp enough to look for its place and for lost frames
-_CENTRINGS = 3  # how often that is done
+_RELOCATIONS = 3  # how often that is done
 _CONTINUATION = 30.0  # the first noise variance: what the mean frame leaves unexplained over this
-_START = 0.7  # rms of the first whitened aberrations of a point-symmetric pupil
+_START = 0.7  # rms of the first whitened aberrations of a point-symmetric pupil, and of a second start
+_MISSED = 0.005  # of the change from frame to frame, left unexplained by the fit: the object is another one
 _SEED = 0
 _BRIGHT_BORDER = 0.5  # of the mean pixel
-
-
-@dataclass
-class _Progress:
-    """Everything a later segment depends on; what a checkpoint holds."""
-
-    state: State
-    costs: list[float] = field(default_factory=list)
-    n_evaluations: int = 0
-    centrings: int = 0
-    message: str = ""  # why it stopped, empty until then
 
 
 class Restoration:
@@ -80,7 +69,8 @@ class Restoration:
         centre = torch.zeros(len(frames), self.model.n_parameters, dtype=torch.float64, device=basis.device)
         self.problem = JointProblem(self.model, self.frames, precision, centre, method.tv_weight, parallel=parallel)
         change = self.frames - self.frames.mean((1, 2), keepdim=True) * self.frames.mean(0)
-        self._first_excess = max(1.0, float((change**2 * precision).mean()) / _CONTINUATION)
+        self._change = float((change**2 * precision).mean())
+        self._first_excess = max(1.0, self._change / _CONTINUATION)
         self._symmetric = method.aperture.n_subapertures == 1  # under point reflection, and of many modes
 
     def __call__(
@@ -98,20 +88,23 @@ class Restoration:
         if checkpoint is not None and Path(checkpoint).exists():
             progress = self._resume(checkpoint)
         else:
-            progress = _Progress(begin) if start is None else self._warm(begin, start)
+            progress = Progress(begin) if start is None else self._warm(begin, start)
+        may_restart = len(self.problem.free) == 2 and not self.estimated and start is None
         while not progress.message:
             self._advance(progress)
+            if progress.message and may_restart and progress.iterations > _BLURRED:
+                self._compare(progress)
             if checkpoint is not None:
-                self._keep(progress, checkpoint)
+                save_checkpoint(checkpoint, progress, self._fingerprint())
         result = self._result(progress)
         if n_samples:
             result = replace(result, **self._deviations(progress.state, n_samples))
         return replace(result, seconds=time.perf_counter() - started)
 
-    def _advance(self, progress: _Progress) -> None:
+    def _advance(self, progress: Progress) -> None:
         """One segment, then what is brought up to date between two."""
         method, problem = self.method, self.problem
-        state, left = progress.state, method.max_iterations - len(progress.costs)
+        state, left = progress.state, method.max_iterations - progress.iterations
         before = float(problem.cost(state, state.image, state.z)[0])
 
         def step(cost: float, evaluations: int, variables: Any) -> None:
@@ -122,8 +115,8 @@ class Restoration:
         progress.state = state = problem.descend(state, min(SEGMENT, left), step)
         after = float(problem.cost(state, state.image, state.z)[0])
         decrease = (before - after) / abs(after)
-        if "aberrations" in problem.free and progress.centrings < _CENTRINGS and left > SEGMENT:
-            if "object" not in problem.free or len(progress.costs) >= _BLURRED:
+        if "aberrations" in problem.free and progress.relocations < _RELOCATIONS and left > SEGMENT:
+            if "object" not in problem.free or progress.iterations >= _BLURRED:
                 self._relocate(progress)
         elif decrease < method.tolerance:
             progress.message = f"converged: the last {SEGMENT} iterations lowered the cost by a fraction {decrease:.1e}"
@@ -133,16 +126,38 @@ class Restoration:
             return
         progress.state = self._update(progress.state)
 
-    def _relocate(self, progress: _Progress) -> None:
+    def _compare(self, progress: Progress) -> None:
+        """At the end of a start: another one if this has missed the object, then the better of both."""
+        excess = self.problem.calibrate(progress.state).excess.mean()
+        if progress.rival is None:
+            if float(excess - 1) > _MISSED * self._change:
+                progress.rival, progress.began = progress.state, len(progress.costs)
+                progress.relocations, progress.message = 0, ""
+                first = self._begin(None, None)
+                progress.state = replace(first, z=self._random(first.z, _SEED + 1))
+            return
+        if float(self.problem.calibrate(progress.rival).excess.mean()) < float(excess):
+            progress.state = progress.rival
+        progress.message += "; the better of two starts, of which one or both missed the object"
+
+    def _random(self, z: Tensor, seed: int) -> Tensor:
+        """First aberrations like z (T, K) that are not zero."""
+        noise = torch.randn(z.shape, dtype=z.dtype, device="cpu", generator=torch.Generator().manual_seed(seed))
+        z = noise.to(z) * (_START if self.method.aberration_prior else _START / 7)
+        own = self.model.n_parameters - self.model.n_static
+        z[:, own:] = z[0, own:]
+        return z
+
+    def _relocate(self, progress: Progress) -> None:
         """What no descent does: frames in a local minimum start anew, the object moves between the pixels."""
-        progress.centrings += 1
+        progress.relocations += 1
         excess = self.problem.calibrate(progress.state).excess
-        state, evaluations = repair(self.problem, progress.state, excess, self._first_excess, seed=progress.centrings)
+        state, evaluations = repair(self.problem, progress.state, excess, self._first_excess, seed=progress.relocations)
         progress.n_evaluations += evaluations
         if "object" in self.problem.free:
             state = centre_on_pixels(self.problem, state)
         if state is progress.state:  # all is where it belongs
-            progress.centrings = _CENTRINGS
+            progress.relocations = _RELOCATIONS
         progress.state = state
 
     def _update(self, state: State) -> State:
@@ -168,10 +183,7 @@ class Restoration:
         z = torch.zeros(shape, dtype=torch.float64, device=image.device)
         if self._symmetric:
             # Zero is a saddle point there: the sign of the even modes of a point-symmetric pupil cannot be seen.
-            noise = torch.randn(shape, dtype=z.dtype, device="cpu", generator=torch.Generator().manual_seed(_SEED))
-            z = noise.to(z) * (_START if self.method.aberration_prior else _START / 7)
-            own = self.model.n_parameters - self.model.n_static
-            z[:, own:] = z[0, own:]
+            z = self._random(z, _SEED)
         if coefficients is not None:
             expected = (len(z), self.method.aperture.n_subapertures, self.method.n_modes)
             if tuple(coefficients.shape) != expected:
@@ -189,7 +201,7 @@ class Restoration:
         excess = torch.full_like(gains, self._first_excess)
         return State(image, z, gains, 1.0 if self.prior else 0.0, excess)
 
-    def _warm(self, state: State, start: RestorationResult) -> _Progress:
+    def _warm(self, state: State, start: RestorationResult) -> Progress:
         """Go on from `start`; frames that it does not know are first fitted to its object."""
         known, field_shape = len(start.coefficients), tuple(state.image.shape)
         expected = (self.method.aperture.n_subapertures, self.method.n_modes)
@@ -207,7 +219,7 @@ class Restoration:
             z[:known] = self._whiten(start.coefficients)
             own = self.model.n_parameters - self.model.n_static
             z[known:, own:] = z[0, own:]
-        progress = _Progress(replace(state, image=image, z=z), centrings=_CENTRINGS)
+        progress = Progress(replace(state, image=image, z=z), relocations=_RELOCATIONS)
         if known < len(z) and "aberrations" in self.problem.free:
             fresh = self.problem.of_frames(slice(known, None), free=("aberrations",), static=False)
 
@@ -218,7 +230,7 @@ class Restoration:
             z[known:] = fresh.descend(part, SEGMENT, count).z
         return progress
 
-    def _record(self, progress: _Progress, variables: Any) -> None:
+    def _record(self, progress: Progress, variables: Any) -> None:
         if self.callback is None:
             return
         step, arrays = len(progress.costs), {}
@@ -227,7 +239,7 @@ class Restoration:
             rows, columns = self.method.grid.shape
             arrays = {"object": image[:rows, :columns] * self.unit, "coefficients": self._coefficients(z)}
         scalars = {"cost": progress.costs[-1]}
-        self.callback(Record("restoration", step, self.method.max_iterations, scalars, arrays))
+        self.callback(Record("restoration", step, progress.began + self.method.max_iterations, scalars, arrays))
 
     def _coefficients(self, z: Tensor, mixing: Tensor | None = None) -> Tensor:
         flat = z @ (self.model.mixing if mixing is None else mixing).to(z).T
@@ -252,24 +264,11 @@ class Restoration:
         digest.update(repr((self.problem.free, self.method.tv_weight, self.method.aberration_prior)).encode())
         return digest.hexdigest()
 
-    def _keep(self, progress: _Progress, path: str | Path) -> None:
-        arrays = {name: getattr(progress.state, name) for name in ("image", "z", "gains", "prior", "excess")}
-        arrays |= {name: getattr(progress, name) for name in ("costs", "n_evaluations", "centrings", "message")}
-        save_npz(path, arrays | {"fingerprint": self._fingerprint()}, replace=True)
-
-    def _resume(self, path: str | Path) -> _Progress:
-        names = ("image", "z", "gains", "prior", "excess", "costs", "n_evaluations", "centrings", "message")
-        stored = load_npz(path, required=(*names, "fingerprint"))
-        if stored["fingerprint"].item() != self._fingerprint():
-            raise ValueError(f"{path} is the checkpoint of other frames or settings: give another name or remove it")
-        device = self.frames.device
-        image, z, gains, excess = (torch.from_numpy(stored[n]).to(device) for n in ("image", "z", "gains", "excess"))
-        costs = np.atleast_1d(stored["costs"]).tolist()
-        counts = (int(stored["n_evaluations"]), int(stored["centrings"]))
-        message = str(stored["message"].item())
-        if message.startswith("stopped") and len(costs) < self.method.max_iterations:
-            message = ""  # a larger budget than before: go on
-        return _Progress(State(image, z, gains, float(stored["prior"]), excess), costs, *counts, message)
+    def _resume(self, path: str | Path) -> Progress:
+        progress = load_checkpoint(path, self._fingerprint(), self.frames.device)
+        if progress.message.startswith("stopped") and progress.iterations < self.method.max_iterations:
+            progress.message = ""  # a larger budget than before: go on
+        return progress
 
     def _deviations(self, state: State, n_samples: int) -> dict[str, Tensor]:
         """Standard deviations of the object [electrons] and of the coefficients [rad]."""
@@ -280,7 +279,7 @@ class Restoration:
         spread = torch.stack([self._coefficients(sample) for sample in z]).square().mean((0, 1)).sqrt()
         return {"object_std": image[:rows, :columns] * self.unit, "coefficients_std": spread}
 
-    def _result(self, progress: _Progress) -> RestorationResult:
+    def _result(self, progress: Progress) -> RestorationResult:
         method, state = self.method, progress.state
         rows, columns = method.grid.shape
         gains = state.gains[:, None, None].to(self.frames)

@@ -1,0 +1,68 @@
+"""How far a restoration has come, on disk, so that it can go on after an interruption."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from torchmask.io import load_npz, save_npz
+from torchmask.restoration.problem import State
+
+
+@dataclass
+class Progress:
+    """Everything a later segment of a restoration depends on.
+
+    began : iterations before the present start; rival : where an earlier start ended
+    relocations : how often lost frames and the object's place have been looked for
+    message : why it stopped, empty until then
+    """
+
+    state: State
+    costs: list[float] = field(default_factory=list)
+    n_evaluations: int = 0
+    relocations: int = 0
+    began: int = 0
+    rival: State | None = None
+    message: str = ""
+
+    @property
+    def iterations(self) -> int:
+        """Of the present start."""
+        return len(self.costs) - self.began
+
+
+_NUMBERS = ("n_evaluations", "relocations", "began")
+
+
+def save_checkpoint(path: str | Path, progress: Progress, fingerprint: str) -> None:
+    """Write or replace an .npz file; `fingerprint` says which frames and settings it belongs to."""
+    arrays: dict[str, Any] = {name: getattr(progress, name) for name in ("costs", "message", *_NUMBERS)}
+    for prefix, state in (("", progress.state), ("rival_", progress.rival)):
+        if state is not None:
+            arrays |= {prefix + item.name: getattr(state, item.name) for item in fields(State)}
+    save_npz(path, arrays | {"fingerprint": fingerprint}, replace=True)
+
+
+def load_checkpoint(path: str | Path, fingerprint: str, device: torch.device) -> Progress:
+    """Read what `save_checkpoint` wrote. Raises ValueError if it is damaged or of another fingerprint."""
+    names = [item.name for item in fields(State)]
+    stored = load_npz(path, required=(*names, "costs", "message", *_NUMBERS, "fingerprint"))
+    if stored["fingerprint"].item() != fingerprint:
+        raise ValueError(f"{path} is the checkpoint of other frames or settings: give another name or remove it")
+
+    def state(prefix: str) -> State:
+        values = (stored[prefix + name] for name in names)
+        return State(*(torch.from_numpy(v).to(device) if v.ndim else float(v) for v in values))  # type: ignore[arg-type]
+
+    return Progress(
+        state(""),
+        np.atleast_1d(stored["costs"]).tolist(),
+        *(int(stored[name]) for name in _NUMBERS),
+        rival=state("rival_") if "rival_z" in stored else None,
+        message=str(stored["message"].item()),
+    )
