@@ -70,7 +70,7 @@ class AsymptoticMSE(nn.Module):
         super().__init__()
         if not math.isfinite(n_frames) or n_frames != int(n_frames) or n_frames < 1:
             raise ValueError(f"n_frames is {n_frames}: it must be a whole number of at least 1")
-        self.grid = grid
+        self.grid: Grid = grid
         self.n_frames: int = int(n_frames)
         self._object_model = None if isinstance(object_psd, Tensor) else object_psd
         self.register_buffer("object_psd", evaluate_psd(object_psd, grid, "object_psd"))

@@ -150,9 +150,9 @@ class PSF(nn.Module):
 
     def __init__(self, aperture: Aperture, grid: Grid, oversampling: int = 1) -> None:
         super().__init__()
-        self.aperture = aperture
-        self.grid = grid
-        self.oversampling = oversampling
+        self.aperture: Aperture = aperture
+        self.grid: Grid = grid
+        self.oversampling: int = oversampling
         self.samples()  # refuses an impossible grid now rather than at the first forward
 
     def samples(self) -> PupilSamples:

@@ -168,10 +168,10 @@ class ZernikePhase(nn.Module):
     def __init__(self, aperture: Aperture, grid: Grid, n_modes: int, oversampling: int = 1) -> None:
         super().__init__()
         _require_modes(n_modes)
-        self.aperture = aperture
-        self.grid = grid
-        self.n_modes = n_modes
-        self.oversampling = oversampling
+        self.aperture: Aperture = aperture
+        self.grid: Grid = grid
+        self.n_modes: int = n_modes
+        self.oversampling: int = oversampling
         with torch.no_grad():
             self.register_buffer("basis", self._evaluate(), persistent=False)
         self.register_buffer("basis_centers", aperture.centers.detach().clone(), persistent=False)

@@ -16,13 +16,14 @@ class Linearization:
     """
 
     def __init__(self, model: ExposureModel, image: Tensor, z: Tensor, parallel: Map = map) -> None:
-        self.model, self.parallel = model, parallel
-        self.spectrum = torch.fft.rfft2(image.to(model.basis.dtype))
-        self.parts = list(model.chunks(len(z)))
-        self.pupils = [model.pupil_field(z[part]) for part in self.parts]
-        self.amplitudes = [model.amplitude(pupil) for pupil in self.pupils]
+        self.model: ExposureModel = model
+        self.parallel: Map = parallel
+        self.spectrum: Tensor = torch.fft.rfft2(image.to(model.basis.dtype))
+        self.parts: list[slice] = list(model.chunks(len(z)))
+        self.pupils: list[Tensor] = [model.pupil_field(z[part]) for part in self.parts]
+        self.amplitudes: list[Tensor] = [model.amplitude(pupil) for pupil in self.pupils]
         powers = [(amplitude.real**2 + amplitude.imag**2).sum(1) for amplitude in self.amplitudes]
-        self.transfers = [torch.fft.rfft2(power) for power in powers]
+        self.transfers: list[Tensor] = [torch.fft.rfft2(power) for power in powers]
 
     def forward(self, image: Tensor, z: Tensor) -> Tensor:
         """Changes of the frames (S, T, H, W) for those of the object (S, H', W') and the aberrations (S, T, K)."""

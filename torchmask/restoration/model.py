@@ -91,12 +91,14 @@ class ExposureModel(nn.Module):
         device: torch.device | str | None = None,
     ) -> None:
         super().__init__()
-        self.grid, self.n_modes = grid, n_modes
+        self.grid: Grid = grid
+        self.n_modes: int = n_modes
         rows, columns = (fast_size(math.ceil(side * (1 + margin))) for side in grid.shape)
-        self.field = Grid((rows, columns), grid.pixel_scale, grid.wavelength)
+        self.field: Grid = Grid((rows, columns), grid.pixel_scale, grid.wavelength)
         band = _band(grid, wavelengths, weights)
-        self.n_wavelengths, self.n_static = len(band), n_static
-        self.shortest_wavelength = min(wavelength for wavelength, _ in band)
+        self.n_wavelengths: int = len(band)
+        self.n_static: int = n_static
+        self.shortest_wavelength: float = min(wavelength for wavelength, _ in band)
         kwargs = {"dtype": dtype or aperture.centers.dtype, "device": device}
         if mixing is None:
             n = aperture.n_subapertures * n_modes

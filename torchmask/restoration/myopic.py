@@ -119,19 +119,21 @@ class MyopicDeconvolution(nn.Module):
             )
         if static_modes < 0:
             raise ValueError(f"static_modes is {static_modes}: it must be at least 0")
+        if n_modes is not None and n_modes < 1:
+            raise ValueError(f"n_modes is {n_modes}: it must be at least 1, or None for the default")
         symmetric = aperture.n_subapertures == 1
         n_modes = n_modes or (231 if symmetric else 6)
         self.known_r0: bool = r0 is not None
         # Masks are made for holes of about r0; a full pupil that needs a restoration spans several.
         self.r0: float = r0 or aperture.subaperture_diameter / (7 if symmetric else 1)
         self.outer_scale: float = outer_scale or 20 * aperture.mask_diameter
-        self.readout_noise = readout_noise
-        self.tv_weight = tv_weight
-        self.aberration_prior = aberration_prior
-        self.max_iterations = max_iterations
-        self.tolerance = tolerance
-        self.aperture = aperture
-        self.grid = grid
+        self.readout_noise: float | None = readout_noise
+        self.tv_weight: float = tv_weight
+        self.aberration_prior: bool = aberration_prior
+        self.max_iterations: int = max_iterations
+        self.tolerance: float = tolerance
+        self.aperture: Aperture = aperture
+        self.grid: Grid = grid
         self.n_modes: int = max(n_modes, static_modes)
 
         def mixing(modes: int, r0: float) -> Tensor:

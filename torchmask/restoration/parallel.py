@@ -17,7 +17,7 @@ def each_on_a_core(device: torch.device) -> Iterator[Map]:
     """A `map` whose calls run on as many threads as torch may use, one core each.
 
     The arrays of a few frames are too small to be shared between cores: torch's own threads then cost more than they
-    bring. For the time of the context torch uses one thread; results are the same for any number of them.
+    bring. For the time of the context torch uses one thread, so that what runs in it does not depend on their number.
     """
     n_threads = torch.get_num_threads()
     if device.type != "cpu" or n_threads == 1:

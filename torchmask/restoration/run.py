@@ -21,6 +21,7 @@ from torchmask.restoration.initialization import (
     mean_frame,
     turbulence_strength,
 )
+from torchmask.restoration.model import ExposureModel
 from torchmask.restoration.parallel import Map
 from torchmask.restoration.posterior import standard_deviations
 from torchmask.restoration.problem import JointProblem, State
@@ -53,21 +54,25 @@ class Restoration:
         callback: Callback | None,
         parallel: Map,
     ) -> None:
-        self.method, self.callback = method, callback
-        self.estimated = covariance is not None  # aberrations, with errors: the prior is theirs, not that of turbulence
-        self.model = method.model if covariance is None else method.model_of_errors(covariance)
-        self.prior = self.estimated or method.aberration_prior
-        self.unit = float(frames.mean())
+        self.method: MyopicDeconvolution = method
+        self.callback: Callback | None = callback
+        self.estimated: bool = covariance is not None  # with errors, whose prior replaces that of turbulence
+        self.model: ExposureModel = method.model if covariance is None else method.model_of_errors(covariance)
+        self.prior: bool = self.estimated or method.aberration_prior
+        self.unit: float = float(frames.mean())
         bluest = replace(method.grid, wavelength=self.model.shortest_wavelength)
-        self.variance = expected_variance(frames, bluest, method.aperture, method.readout_noise)
+        self.variance: float = expected_variance(frames, bluest, method.aperture, method.readout_noise)
         if border_brightness(frames) > _BRIGHT_BORDER:
             warnings.warn("the frames are bright at the border: does the object reach beyond the field?", stacklevel=3)
         basis = self.model.basis
-        self.frames, self.valid = (frames / self.unit).to(basis), valid.to(basis.device)
+        self.frames: Tensor = (frames / self.unit).to(basis)
+        self.valid: Tensor = valid.to(basis.device)
         weight = valid.new_ones(1, 1, 1) if bool(valid.all()) else valid
         precision = weight.to(basis) * (self.unit**2 / self.variance)
         centre = torch.zeros(len(frames), self.model.n_parameters, dtype=torch.float64, device=basis.device)
-        self.problem = JointProblem(self.model, self.frames, precision, centre, method.tv_weight, parallel=parallel)
+        self.problem: JointProblem = JointProblem(
+            self.model, self.frames, precision, centre, method.tv_weight, parallel=parallel
+        )
         change = self.frames - self.frames.mean((1, 2), keepdim=True) * self.frames.mean(0)
         self._change = float((change**2 * precision).mean())
         self._first_excess = max(1.0, self._change / _CONTINUATION)
