@@ -1,5 +1,6 @@
 """FITS in and out: headers, units, calibration, cropping, selection, what is refused, and the real observations."""
 
+import dataclasses
 import math
 from pathlib import Path
 
@@ -511,6 +512,19 @@ def test_restored_image_lies_where_the_frames_did_on_the_sky(tmp_path, mask, cub
     again = Observation.from_fits(tmp_path / "r.fits", mask)
     assert torch.equal(again.frames[0], result.object)
     assert again.grid.pixel_scale == pytest.approx(observation.grid.pixel_scale, rel=1e-12)
+
+
+def test_standard_deviations_are_an_extension(tmp_path, mask, cube):
+    observation = Observation.from_fits(write(tmp_path / "a.fits", cube, HEADER | SKY), mask, crop=8)
+    result = dataclasses.replace(result_for(observation), object_std=torch.rand(8, 8, dtype=torch.float64))
+    save_restored(tmp_path / "r.fits", result, observation)
+    with fits.open(tmp_path / "r.fits", checksum=True) as hdus:
+        assert [hdu.name for hdu in hdus] == ["PRIMARY", "ERR"]
+        assert np.array_equal(hdus["ERR"].data, result.object_std)
+        assert hdus["ERR"].header["BUNIT"] == "electron"
+        assert hdus["ERR"].header["CRVAL1"] == hdus[0].header["CRVAL1"]
+    again = Observation.from_fits(tmp_path / "r.fits", mask)
+    assert torch.equal(again.errors[0], result.object_std)
 
 
 def test_nothing_is_overwritten_or_left_half_done(tmp_path, mask, cube):

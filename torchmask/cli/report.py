@@ -75,8 +75,11 @@ def restored_figure(
     residuals: Any | None = None,
     pixel_scale: float | None = None,
     title: str = "restored",
+    deviation: Any | None = None,
 ) -> Figure:
     """A restored image (H, W), beside it the first and the mean of `frames` (T, H, W), and the rms of `residuals`.
+
+    The standard deviation of the image stands between, if there is one.
 
     Light is shown with a square root, each image up to its own 99.5th percentile; residuals (T, H, W) are in units of
     the noise, so that 1 is what noise alone leaves. `pixel_scale` [rad] labels the axes with angles.
@@ -86,11 +89,17 @@ def restored_figure(
     if frames is not None:
         stack = as_array(frames)
         lights = {"first frame": stack[0], f"mean of {len(stack)} frames": stack.mean(0), **lights}
-    figure, axes = drawing.row_of_axes([1.0] * (len(lights) + (residuals is not None)), height=3.2)
+    panels = len(lights) + (residuals is not None) + (deviation is not None)
+    figure, axes = drawing.row_of_axes([1.0] * panels, height=3.2)
     unit, extent = drawing.sky_extent((restored.shape[0], restored.shape[1]), pixel_scale)
     for ax, (name, values) in zip(axes, lights.items(), strict=False):
         ax.imshow(viz.stretch(values), cmap="gray", vmin=0, vmax=1, extent=extent)
         drawing.image_axes(ax, name, f"x [{unit}]", f"y [{unit}]" if ax is axes[0] else "")
+    if deviation is not None:
+        ax = axes[len(lights)]
+        ax.imshow(as_array(deviation), cmap="magma", vmin=0, extent=extent)
+        drawing.image_axes(ax, "standard deviation", f"x [{unit}]", "")
+        drawing.colorbar(figure, [ax], "electrons")
     if residuals is not None:
         rms = np.sqrt((as_array(residuals) ** 2).mean(0))
         axes[-1].imshow(rms, cmap="magma", vmin=0, vmax=max(2.0, float(np.percentile(rms, 99.5))), extent=extent)

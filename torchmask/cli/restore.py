@@ -90,6 +90,8 @@ class Options(MaskOptions, FITSOptions, RunOptions):
     """Upper limit of iterations."""
     tolerance: float = 1e-4
     """Converged when 100 iterations lower the cost by less than this fraction."""
+    n_samples: int = 0
+    """Drawn for the standard deviations of the image, extension ERR of restored.fits: 8 are enough; 0: none."""
     resume: Path | None = None
     """Folder of an interrupted run: go on with its options from its checkpoint, of every 100th iteration."""
 
@@ -120,7 +122,11 @@ def run(options: Options) -> None:
         if checkpoint is not None:
             shutil.copyfile(checkpoint, state)
         result = inversion.restore(
-            observation.frames, valid=observation.valid, checkpoint=state, callback=output.callback
+            observation.frames,
+            valid=observation.valid,
+            n_samples=options.n_samples,
+            checkpoint=state,
+            callback=output.callback,
         )
         result.save(output.directory / "restored.npz")
         save_restored(output.directory / "restored.fits", result, observation, history(options, result))
@@ -196,7 +202,10 @@ def metrics(observation: Observation, result: RestorationResult) -> dict[str, An
 def _log(observation: Observation, result: RestorationResult, table: dict[str, Any], output: Run) -> None:
     """Figures, and the final metrics for TensorBoard."""
     logger, scale = output.logger, observation.grid.pixel_scale
-    logger.figure("restored", restored_figure(result.object, observation.frames, result.residuals, scale))
+    logger.figure(
+        "restored",
+        restored_figure(result.object, observation.frames, result.residuals, scale, deviation=result.object_std),
+    )
     logger.figure("cost", viz.history_figure({"restoration": result.cost.tolist()}, "cost"))
     if observation.object is not None:
         cutoff = observation.grid.cutoff(observation.aperture.mask_diameter)

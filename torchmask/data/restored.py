@@ -39,6 +39,7 @@ def save_restored(
     -----
     The image is in electrons per pixel and frame (BUNIT). CHISQ is the mean over the frames of the mean square residual
     in units of the noise, CHISQMAX that of the worst frame; CONVERGD says whether the restoration came to rest.
+    Standard deviations, if the restoration was asked for them, are an extension ERR.
 
     Examples
     --------
@@ -63,6 +64,7 @@ def save_restored(
             "observation that it was restored from"
         )
     hdu = fits.PrimaryHDU(as_array(result.object).astype("float64"))
+    hdus = fits.HDUList([hdu])
     for name, value in observation.header.items():
         if name not in hdu.header:
             hdu.header[name] = value
@@ -86,7 +88,13 @@ def save_restored(
     lines = [history] if isinstance(history, str) else list(history)
     for line in ["restored by torchmask.MyopicDeconvolution", *lines]:
         hdu.header.add_history(line.encode("ascii", "replace").decode().replace("\n", " "))
+    if result.object_std is not None:
+        errors = fits.ImageHDU(as_array(result.object_std).astype("float64"), name="ERR")
+        for name in (*observation.header, "BUNIT", "PIXELSCL"):
+            if name in hdu.header and name not in errors.header:
+                errors.header[name] = (hdu.header[name], hdu.header.comments[name])
+        hdus.append(errors)
     content = BytesIO()  # astropy does not know the mode that atomic_write opens files in
-    hdu.writeto(content, checksum=True)
+    hdus.writeto(content, checksum=True)
     with atomic_write(path) as file:
         file.write(content.getvalue())
