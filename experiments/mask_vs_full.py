@@ -71,7 +71,7 @@ class Config:
     """Electrons per frame through the mask."""
     d_over_r0: tuple[float, ...] = (3.0, 7.0, 15.0)
     """Strengths of the turbulence, D / r0."""
-    seeds: tuple[int, ...] = (0, 1, 2)
+    seeds: tuple[int, ...] = (0, 1)
     """Of the turbulence and the noise."""
     views: int = 2
     """How many of the two views of the packaged satellite are scenes: 0, 1 or 2."""
@@ -81,7 +81,7 @@ class Config:
     """Short exposures, T."""
     n_pixels: int = 96
     """Of the image, per side."""
-    iterations: int = 300
+    iterations: int = 600
     """At most, of every restoration."""
     restarts: int = 2
     """Starts of the full pupil."""
