@@ -276,7 +276,8 @@ def test_an_object_beyond_the_field_is_noticed():
         ({"tv_weight": 0.0}, "tv_weight"),
         ({"readout_noise": math.nan}, "readout_noise"),
         ({"max_iterations": 0}, "max_iterations"),
-        ({"n_modes": -3}, "whole number"),
+        ({"n_modes": 0}, "n_modes is 0"),
+        ({"static_modes": -1}, "static_modes is -1"),
     ],
 )
 def test_refuses_settings(options, words):

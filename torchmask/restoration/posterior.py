@@ -20,11 +20,12 @@ from torch import Tensor
 
 from torchmask.metrics import lowpass
 from torchmask.restoration.linearization import Linearization
+from torchmask.restoration.priors import divergence, gradient
 from torchmask.restoration.problem import JointProblem, State
 
 _REACH = 1.0  # resolution elements (1 / cut-off) over which an object's gradients are alike
 _ROUNDS, _FEW = 3, 6  # of expectation maximisation, and its samples, which the mean over the reach makes enough
-_LEAST = 1e-6  # of the largest: dark parts have a prior too, and aberrations without curvature a scale
+_LEAST = 1e-6  # of the largest: dark parts have a prior too, and aberrations without curvature a scale and a hold
 _ITERATIONS = 50  # of conjugate gradients: variances of what is below the cut-off are within 3 % of their limit then
 
 Operator = Callable[[Tensor], Tensor]
@@ -41,55 +42,37 @@ def standard_deviations(
     """
     generator = torch.Generator().manual_seed(0)
     reach = _REACH / cutoff
-    power = _power(problem, state)
+    slope, power = problem.object_quadratic(state)
     prior = _gradient_prior(power, state.image, reach, generator)
     objects, aberrations = _sample(problem, state, power, prior, photon_share, n_samples, generator)
-    off = lowpass(_bias(problem, state, power, prior), cutoff).square() if "object" in problem.free else 0.0
+    off = lowpass(_bias(state.image, slope, power, prior), cutoff).square() if "object" in problem.free else 0.0
     variance = smooth(lowpass(objects, cutoff).square().mean(0) + off, reach)
     return variance.clamp(min=0).sqrt(), aberrations
 
 
-def _power(problem: JointProblem, state: State) -> Tensor:
-    """The misfit's Hessian in the object alone, for known PSFs and a full field, over frequencies."""
-    precision = problem.scaled_data(state)[1]
-    power = torch.zeros_like(torch.fft.rfft2(state.image).real)
-    for part in problem.model.chunks(len(state.z)):
-        transfer = torch.fft.rfft2(problem.model.psf(state.z[part]))
-        weight = precision[part].mean((1, 2), keepdim=True)
-        power += ((transfer.real**2 + transfer.imag**2) * weight).sum(0).to(power)
-    return power
-
-
 def _gradient_prior(power: Tensor, image: Tensor, reach: float, generator: torch.Generator) -> Tensor:
     """Inverse variance (H', W') of each component of the object's gradient, from its local mean over `reach` pixels."""
-    known, lost = _energy(image), torch.zeros_like(image)
+    known = _energy(image)
     least = _LEAST * float(known.max())
     prior = 2 / smooth(known, reach).clamp(min=least)
     for _ in range(_ROUNDS):
-
-        def hessian(x: Tensor, prior: Tensor = prior) -> Tensor:
-            return _filter(x, power) + _curvature(x, prior)
-
         drawn = _filter(_white((_FEW, *image.shape), image, generator), power.sqrt())
         drawn = drawn + _prior_noise(prior, _FEW, generator)
-        lost = _energy(conjugate_gradients(hessian, drawn, _object_preconditioner(power, prior))).mean(0)
+        lost = _energy(_solve_for_object(power, prior, drawn)).mean(0)
         prior = 2 / smooth(known + lost, reach).clamp(min=least)
     return prior
 
 
-def _bias(problem: JointProblem, state: State, power: Tensor, prior: Tensor) -> Tensor:
+def _bias(image: Tensor, slope: Tensor, power: Tensor, prior: Tensor) -> Tensor:
     """How far the mean of the posterior lies from the restored object, whose prior was another one, for known PSFs."""
-    frames, precision = problem.scaled_data(state)
-    slope = problem.model.misfit(
-        state.image, state.z, frames, precision, want_aberrations=False, parallel=problem.parallel
-    ).object_gradient
-    assert slope is not None
+    return _solve_for_object(power, prior, -(slope + _curvature(image, prior))[None])[0]
 
-    def hessian(x: Tensor) -> Tensor:
-        return _filter(x, power) + _curvature(x, prior)
 
-    right = -(slope + _curvature(state.image, prior))
-    return conjugate_gradients(hessian, right[None], _object_preconditioner(power, prior))[0]
+def _solve_for_object(power: Tensor, prior: Tensor, right: Tensor) -> Tensor:
+    """Objects (S, H', W') at which data and prior pull with `right` (S, H', W'), for known PSFs."""
+    return conjugate_gradients(
+        lambda x: _filter(x, power) + _curvature(x, prior), right, _object_preconditioner(power, prior)
+    )
 
 
 def _sample(
@@ -107,7 +90,8 @@ def _sample(
     tangent = Linearization(model, state.image, state.z, problem.parallel)
     z_prior = torch.as_tensor(problem.prior(state)).to(state.z)
     curvature = model.curvature(state.image, state.z, precision, generator)[0] + z_prior
-    curvature = curvature.clamp(min=_LEAST * float(curvature.max()))
+    least = _LEAST * float(curvature.max())
+    curvature, hold = curvature.clamp(min=least), torch.where(z_prior > 0, z_prior, least)
     by_object, by_aberrations = (float(name in problem.free) for name in ("object", "aberrations"))
     n, shape = state.image.numel(), (n_samples, *state.z.shape)
     settle = _object_preconditioner(power, prior)
@@ -121,7 +105,7 @@ def _sample(
     def hessian(x: Tensor) -> Tensor:
         image, z = split(x)
         by_image, by_z = tangent.adjoint(precision * tangent.forward(image, z))
-        return join(by_image + _curvature(image, prior), by_z + z_prior * z)
+        return join(by_image + _curvature(image, prior), by_z + hold * z)
 
     def precondition(x: Tensor) -> Tensor:
         image, z = split(x)
@@ -198,19 +182,9 @@ def conjugate_gradients(hessian: Operator, right: Tensor, precondition: Operator
     return x
 
 
-def gradient(image: Tensor) -> tuple[Tensor, Tensor]:
-    """Forward differences of (..., H, W), periodic, along rows and columns."""
-    return image.roll(-1, -2) - image, image.roll(-1, -1) - image
-
-
 def _energy(image: Tensor) -> Tensor:
     dy, dx = gradient(image)
     return dy**2 + dx**2
-
-
-def divergence(dy: Tensor, dx: Tensor) -> Tensor:
-    """The adjoint of `gradient`."""
-    return dy.roll(1, -2) - dy + dx.roll(1, -1) - dx
 
 
 def smooth(image: Tensor, width: float) -> Tensor:

@@ -19,9 +19,7 @@ def total_variation(image: Tensor, epsilon: float = 0.01) -> tuple[Tensor, Tenso
     (Rudin, Osher & Fatemi, Physica D 60, 259, 1992). Values are (...), the gradient has the shape of `image`.
     """
     dy, dx, length = _slopes(image, epsilon)
-    dy, dx = dy / length, dx / length
-    gradient = dy.roll(1, -2) - dy + dx.roll(1, -1) - dx
-    return (length - epsilon).sum(dim=(-2, -1)), gradient
+    return (length - epsilon).sum(dim=(-2, -1)), divergence(dy / length, dx / length)
 
 
 def total_variation_curvature(image: Tensor, epsilon: float = 0.01) -> Tensor:
@@ -30,8 +28,18 @@ def total_variation_curvature(image: Tensor, epsilon: float = 0.01) -> Tensor:
     return 2 * inverse + inverse.roll(1, -2) + inverse.roll(1, -1)
 
 
+def gradient(image: Tensor) -> tuple[Tensor, Tensor]:
+    """Forward differences of (..., H, W), periodic, along rows and columns."""
+    return image.roll(-1, -2) - image, image.roll(-1, -1) - image
+
+
+def divergence(dy: Tensor, dx: Tensor) -> Tensor:
+    """The adjoint of `gradient`."""
+    return dy.roll(1, -2) - dy + dx.roll(1, -1) - dx
+
+
 def _slopes(image: Tensor, epsilon: float) -> tuple[Tensor, Tensor, Tensor]:
-    dy, dx = image.roll(-1, -2) - image, image.roll(-1, -1) - image
+    dy, dx = gradient(image)
     return dy, dx, torch.sqrt(dy**2 + dx**2 + epsilon**2)
 
 

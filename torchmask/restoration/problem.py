@@ -118,6 +118,23 @@ class JointProblem:
                 common[:] = common.mean(0) if self.static else 0.0
         return value, image_gradient, z_gradient
 
+    def object_quadratic(self, state: State) -> tuple[Tensor, Tensor]:
+        """The misfit around `state` as a function of the object: gradient (H', W') and Hessian over frequencies.
+
+        The gradient is exact, the Hessian (H', W'/2 + 1) that of a full field, which is diagonal in frequency.
+        """
+        frames, precision = self.scaled_data(state)
+        slope = self.model.misfit(
+            state.image, state.z, frames, precision, want_aberrations=False, parallel=self.parallel
+        ).object_gradient
+        assert slope is not None
+        power = torch.zeros_like(torch.fft.rfft2(state.image).real)
+        for part in self.model.chunks(len(state.z)):
+            transfer = torch.fft.rfft2(self.model.psf(state.z[part]))
+            weight = precision[part].mean((1, 2), keepdim=True)
+            power += ((transfer.real**2 + transfer.imag**2) * weight).sum(0).to(power)
+        return slope, power
+
     def frame_costs(self, state: State) -> Tensor:
         """Misfit and prior of each frame, (T,)."""
         frames, precision = self.scaled_data(state)

@@ -37,15 +37,7 @@ def centre_on_pixels(problem: JointProblem, state: State) -> State:
     For each position the object is settled in the quadratic approximation of the misfit in the object, for known PSFs
     and a full field: that needs no more frames, only FFTs of the object.
     """
-    frames, precision = problem.scaled_data(state)
-    misfit = problem.model.misfit(state.image, state.z, frames, precision, want_aberrations=False)
-    gradient = misfit.object_gradient
-    assert gradient is not None
-    power = torch.zeros_like(torch.fft.rfft2(state.image).real)
-    for part in problem.model.chunks(len(state.z)):
-        transfer = torch.fft.rfft2(problem.model.psf(state.z[part]))
-        weight = (precision[part] if len(precision) > 1 else precision).mean((1, 2))[:, None, None]
-        power += ((transfer.real**2 + transfer.imag**2) * weight).sum(0).to(power)
+    gradient, power = problem.object_quadratic(state)
 
     def settle(offset: tuple[float, float]) -> tuple[float, Tensor]:
         return _settle(shift(state.image, offset), shift(gradient, offset), power, problem.tv_weight)
