@@ -143,7 +143,7 @@ class ExposureModel(nn.Module):
 
         Frames of one wavelength do not change; those of several would, and are left alone.
         """
-        if self.n_wavelengths > 1:
+        if self.n_wavelengths > 1 or len(self.mixing) == self.n_modes:  # one hole, whose piston is that of all
             return z
         own = self.n_parameters - self.n_static
         waves = 2 * math.pi * torch.linalg.pinv(self.mixing[:, :own].to(z))[:, :: self.n_modes]  # (own, N)

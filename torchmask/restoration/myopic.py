@@ -120,7 +120,7 @@ class MyopicDeconvolution(nn.Module):
         if static_modes < 0:
             raise ValueError(f"static_modes is {static_modes}: it must be at least 0")
         if n_modes is not None and n_modes < 1:
-            raise ValueError(f"n_modes is {n_modes}: it must be at least 1, or None for the default")
+            raise ValueError(f"n_modes is {n_modes}: it must be a whole number of at least 1, or None for the default")
         symmetric = aperture.n_subapertures == 1
         n_modes = n_modes or (231 if symmetric else 6)
         self.known_r0: bool = r0 is not None
