@@ -110,7 +110,8 @@ def test_refuses_frames(change, words):
 
 def test_refuses_a_mask_of_valid_pixels_that_does_not_fit():
     frames = blurred(3, torch.Generator().manual_seed(1))
-    for valid in (torch.ones(GRID.shape), torch.ones(4, 4, dtype=torch.bool)):
+    ones = torch.ones(2, *GRID.shape, dtype=torch.bool)  # for three frames
+    for valid in (torch.ones(GRID.shape), ones[0, :4, :4], ones):
         with pytest.raises(ValueError, match="valid"):
             check_frames(frames, valid, GRID)
 

@@ -187,6 +187,9 @@ def test_interrupted_and_resumed_is_the_same(observation, tmp_path):
     assert resumed.n_evaluations == whole.n_evaluations
     with pytest.raises(ValueError, match="other frames or settings"):
         method.restore(observation.frames * 1.1, checkpoint=path)
+    spread = method.restore(observation.frames, checkpoint=path, n_samples=2)  # of what is there, without a step more
+    assert torch.equal(spread.object, whole.object)
+    assert torch.equal(spread.object_std, method.restore(observation.frames, checkpoint=path, n_samples=2).object_std)
 
 
 def test_a_missed_object_gets_a_second_start(observation, tmp_path, monkeypatch):
@@ -212,6 +215,44 @@ def test_a_missed_object_gets_a_second_start(observation, tmp_path, monkeypatch)
     assert torch.equal(resumed.object, twice.object)
     assert torch.equal(resumed.cost, twice.cost)
     assert resumed.message == twice.message
+
+
+def test_a_checkpoint_belongs_to_what_was_known(observation, known, tmp_path):
+    method = MyopicDeconvolution(mask(), GRID, N_MODES, r0=R0, readout_noise=READOUT, max_iterations=2)
+    for number, name in enumerate(("known_object", "coefficients")):
+        given = {"known_object": observation.object, "coefficients": known.coefficients}[name]
+        path = tmp_path / f"{number}.npz"
+        result = method.restore(observation.frames, checkpoint=path, **{name: given})
+        assert torch.equal(method.restore(observation.frames, checkpoint=path, **{name: given}).object, result.object)
+        with pytest.raises(ValueError, match="other frames or settings"):
+            method.restore(observation.frames, checkpoint=path, **{name: given.flip(1)})
+    path = tmp_path / "open.npz"
+    MyopicDeconvolution(mask(), GRID, r0=None, max_iterations=2).restore(observation.frames, checkpoint=path)
+    with pytest.raises(ValueError, match="other frames or settings"):  # the first guess, taken for known now
+        MyopicDeconvolution(mask(), GRID, r0=0.22, max_iterations=2).restore(observation.frames, checkpoint=path)
+
+
+def test_a_descent_at_rest_comes_to_an_end(observation):
+    """With tolerance 0 too, when no step lowers the cost any more."""
+    method = MyopicDeconvolution(
+        mask(), GRID, 1, readout_noise=READOUT, aberration_prior=False, max_iterations=2000, tolerance=0
+    )
+    result = method.restore(observation.frames[:1], known_object=observation.object)
+    assert result.converged
+    assert len(result.cost) < 2000
+
+
+def test_a_second_start_that_is_worse_changes_nothing(observation, monkeypatch):
+    for name, value in {"_BLURRED": 50, "_RELOCATIONS": 0, "_MISSED": math.inf}.items():
+        monkeypatch.setattr(f"torchmask.restoration.run.{name}", value)
+    method = MyopicDeconvolution(mask(), GRID, 3, r0=R0, readout_noise=READOUT, tolerance=0.05)
+    once = method.restore(observation.frames[:4])
+    monkeypatch.setattr("torchmask.restoration.run._MISSED", -1.0)
+    monkeypatch.setattr("torchmask.restoration.run._START", 30.0)  # nothing is to be found from there
+    twice = method.restore(observation.frames[:4])
+    assert once.converged
+    assert twice.message == once.message + "; the better of two starts, of which one or both missed the object"
+    assert torch.equal(twice.object, once.object)
 
 
 @pytest.mark.slow
@@ -293,6 +334,11 @@ def test_refuses_shapes_that_disagree(observation, known):
         method.restore(observation.frames, coefficients=known.coefficients[..., :4])
     with pytest.raises(ValueError, match="known_object has shape"):
         method.restore(observation.frames, known_object=torch.ones(3, 3))
+    with pytest.raises(ValueError, match="coefficients hold values"):
+        method.restore(observation.frames, coefficients=known.coefficients * math.nan)
+    for nothing in (torch.zeros(GRID.shape), torch.full(GRID.shape, math.nan)):
+        with pytest.raises(ValueError, match="known_object holds"):
+            method.restore(observation.frames, known_object=nothing)
     population = SparseAperture(mask().centers.expand(2, 5, 2), 0.22, 1.0)
     with pytest.raises(ValueError, match="one mask"):
         MyopicDeconvolution(population, GRID)

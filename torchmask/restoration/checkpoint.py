@@ -17,7 +17,7 @@ from torchmask.restoration.problem import State
 class Progress:
     """Everything a later segment of a restoration depends on.
 
-    began : iterations before the present start; rival : where an earlier start ended
+    began : iterations before the present start; rival : where an earlier start ended, and rival_message why
     relocations : how often lost frames and the object's place have been looked for
     message : why it stopped, empty until then
     """
@@ -28,6 +28,7 @@ class Progress:
     relocations: int = 0
     began: int = 0
     rival: State | None = None
+    rival_message: str = ""
     message: str = ""
 
     @property
@@ -37,11 +38,12 @@ class Progress:
 
 
 _NUMBERS = ("n_evaluations", "relocations", "began")
+_TEXTS = ("rival_message", "message")
 
 
 def save_checkpoint(path: str | Path, progress: Progress, fingerprint: str) -> None:
     """Write or replace an .npz file; `fingerprint` says which frames and settings it belongs to."""
-    arrays: dict[str, Any] = {name: getattr(progress, name) for name in ("costs", "message", *_NUMBERS)}
+    arrays: dict[str, Any] = {name: getattr(progress, name) for name in ("costs", *_NUMBERS, *_TEXTS)}
     for prefix, state in (("", progress.state), ("rival_", progress.rival)):
         if state is not None:
             arrays |= {prefix + item.name: getattr(state, item.name) for item in fields(State)}
@@ -51,7 +53,7 @@ def save_checkpoint(path: str | Path, progress: Progress, fingerprint: str) -> N
 def load_checkpoint(path: str | Path, fingerprint: str, device: torch.device) -> Progress:
     """Read what `save_checkpoint` wrote. Raises ValueError if it is damaged or of another fingerprint."""
     names = [item.name for item in fields(State)]
-    stored = load_npz(path, required=(*names, "costs", "message", *_NUMBERS, "fingerprint"))
+    stored = load_npz(path, required=(*names, "costs", *_NUMBERS, *_TEXTS, "fingerprint"))
     if stored["fingerprint"].item() != fingerprint:
         raise ValueError(f"{path} is the checkpoint of other frames or settings: give another name or remove it")
 
@@ -59,10 +61,6 @@ def load_checkpoint(path: str | Path, fingerprint: str, device: torch.device) ->
         values = (stored[prefix + name] for name in names)
         return State(*(torch.from_numpy(v).to(device) if v.ndim else float(v) for v in values))  # type: ignore[arg-type]
 
-    return Progress(
-        state(""),
-        np.atleast_1d(stored["costs"]).tolist(),
-        *(int(stored[name]) for name in _NUMBERS),
-        rival=state("rival_") if "rival_z" in stored else None,
-        message=str(stored["message"].item()),
-    )
+    rival = state("rival_") if "rival_z" in stored else None
+    others = {name: stored[name].item() for name in (*_NUMBERS, *_TEXTS)}
+    return Progress(state(""), np.atleast_1d(stored["costs"]).tolist(), rival=rival, **others)

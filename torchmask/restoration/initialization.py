@@ -29,9 +29,11 @@ def check_frames(frames: Tensor, valid: Tensor | None, grid: Grid) -> tuple[Tens
     if valid is None:
         valid = torch.ones_like(frames, dtype=torch.bool)
     else:
-        if valid.dtype != torch.bool or tuple(valid.shape[-2:]) != grid.shape or valid.ndim not in (2, 3):
+        valid = torch.as_tensor(valid, device=frames.device)
+        if valid.dtype != torch.bool or tuple(valid.shape) not in (grid.shape, tuple(frames.shape)):
             raise ValueError(
-                f"valid is {valid.dtype} of shape {tuple(valid.shape)}: it must be bool, (H, W) or (T, H, W)"
+                f"valid is {valid.dtype} of shape {tuple(valid.shape)}: it must be bool, of shape {grid.shape} or "
+                f"{tuple(frames.shape)}"
             )
         valid = valid.expand(frames.shape)
         frames = _fill(frames, valid)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchmask.restoration.problem import JointProblem, State
 
-_OUTLYING = 1.25  # times the median residual variance of the frames
+_OUTLYING = 1.25  # times the residual variance of the frames that fit well, the lower quartile
 _STARTS = 6
 _ROUNDS, _ITERATIONS = 3, 30  # of falling noise, without which most random starts fall into poor minima
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from torchmask.io import as_array
 from torchmask.record import Callback, Record
 from torchmask.restoration.checkpoint import Progress, load_checkpoint, save_checkpoint
 from torchmask.restoration.initialization import (
@@ -90,8 +91,9 @@ class Restoration:
         known = {"object": known_object is not None, "aberrations": coefficients is not None and not self.estimated}
         self.problem = replace(self.problem, free=tuple(name for name in known if not known[name]))
         begin = self._begin(coefficients, known_object)
+        given = [tensor for tensor in (coefficients, known_object) if tensor is not None]
         if checkpoint is not None and Path(checkpoint).exists():
-            progress = self._resume(checkpoint)
+            progress = self._resume(checkpoint, self._fingerprint(given))
         else:
             progress = Progress(begin) if start is None else self._warm(begin, start)
         may_restart = len(self.problem.free) == 2 and not self.estimated and start is None
@@ -100,7 +102,7 @@ class Restoration:
             if progress.message and may_restart and progress.iterations > _BLURRED:
                 self._compare(progress)
             if checkpoint is not None:
-                save_checkpoint(checkpoint, progress, self._fingerprint())
+                save_checkpoint(checkpoint, progress, self._fingerprint(given))
         result = self._result(progress)
         if n_samples:
             result = replace(result, **self._deviations(progress.state, n_samples))
@@ -109,7 +111,7 @@ class Restoration:
     def _advance(self, progress: Progress) -> None:
         """One segment, then what is brought up to date between two."""
         method, problem = self.method, self.problem
-        state, left = progress.state, method.max_iterations - progress.iterations
+        state, done = progress.state, progress.iterations
         before = float(problem.cost(state, state.image, state.z)[0])
 
         def step(cost: float, evaluations: int, variables: Any) -> None:
@@ -117,16 +119,18 @@ class Restoration:
             progress.n_evaluations += evaluations
             self._record(progress, variables)
 
-        progress.state = state = problem.descend(state, min(SEGMENT, left), step)
+        progress.state = state = problem.descend(state, min(SEGMENT, method.max_iterations - done), step)
         after = float(problem.cost(state, state.image, state.z)[0])
         decrease = (before - after) / abs(after)
-        if "aberrations" in problem.free and progress.relocations < _RELOCATIONS and left > SEGMENT:
-            if "object" not in problem.free or progress.iterations >= _BLURRED:
+        goes_on = progress.iterations < method.max_iterations
+        if goes_on and "aberrations" in problem.free and progress.relocations < _RELOCATIONS:
+            at_rest = progress.iterations == done
+            if at_rest or "object" not in problem.free or progress.iterations >= _BLURRED:
                 self._relocate(progress)
-        elif decrease < method.tolerance:
+        elif decrease <= method.tolerance:
             progress.message = f"converged: the last {SEGMENT} iterations lowered the cost by a fraction {decrease:.1e}"
             return
-        if left <= SEGMENT:
+        if not goes_on:
             progress.message = f"stopped at max_iterations = {method.max_iterations}"
             return
         progress.state = self._update(progress.state)
@@ -136,13 +140,13 @@ class Restoration:
         excess = self.problem.calibrate(progress.state).excess.mean()
         if progress.rival is None:
             if float(excess - 1) > _MISSED * self._change:
-                progress.rival, progress.began = progress.state, len(progress.costs)
-                progress.relocations, progress.message = 0, ""
+                progress.rival, progress.rival_message = progress.state, progress.message
+                progress.began, progress.relocations, progress.message = len(progress.costs), 0, ""
                 first = self._begin(None, None)
                 progress.state = replace(first, z=self._random(first.z, _SEED + 1))
             return
         if float(self.problem.calibrate(progress.rival).excess.mean()) < float(excess):
-            progress.state = progress.rival
+            progress.state, progress.message = progress.rival, progress.rival_message
         progress.message += "; the better of two starts, of which one or both missed the object"
 
     def _random(self, z: Tensor, seed: int) -> Tensor:
@@ -193,6 +197,8 @@ class Restoration:
             expected = (len(z), self.method.aperture.n_subapertures, self.method.n_modes)
             if tuple(coefficients.shape) != expected:
                 raise ValueError(f"coefficients has shape {tuple(coefficients.shape)}: it must be {expected}")
+            if not bool(torch.isfinite(coefficients).all()):
+                raise ValueError("coefficients hold values that are not finite")
             z = self._whiten(coefficients)
             if self.estimated:
                 self.problem = replace(self.problem, centre=z)
@@ -200,6 +206,8 @@ class Restoration:
             if tuple(known_object.shape) != grid.shape:
                 raise ValueError(f"known_object has shape {tuple(known_object.shape)}: it must be {grid.shape}")
             image = mean_frame(known_object[None].to(image), self.model.field)
+            if not 0 < float(image.sum()) < math.inf:
+                raise ValueError("known_object holds values that are not finite, or no light")
             image = image / float(self.model(image, z).mean())
         gains = self.frames.mean((1, 2)).double()
         gains = gains / gains.mean()
@@ -261,16 +269,17 @@ class Restoration:
         z = (flat - static @ common.T) @ torch.linalg.pinv(own).T
         return torch.cat([z, static.expand(len(z), -1)], dim=1)
 
-    def _fingerprint(self) -> str:
-        """Tells whether a checkpoint belongs to these frames and settings."""
-        digest = hashlib.sha256(self.frames.cpu().numpy().tobytes() + self.model.basis.cpu().numpy().tobytes())
-        digest.update(self.model.weights.cpu().numpy().tobytes())
-        digest.update(self.problem.precision.cpu().numpy().tobytes() + self.problem.centre.cpu().numpy().tobytes())
-        digest.update(repr((self.problem.free, self.method.tv_weight, self.method.aberration_prior)).encode())
+    def _fingerprint(self, given: list[Tensor]) -> str:
+        """Tells whether a checkpoint belongs to these frames and settings, and to what is `given` besides."""
+        method = self.method
+        settings = (self.problem.free, method.tv_weight, method.aberration_prior, method.known_r0)
+        digest = hashlib.sha256(repr(settings).encode())
+        for tensor in (self.frames, self.problem.precision, self.model.basis, self.model.weights, *given):
+            digest.update(as_array(tensor).tobytes())
         return digest.hexdigest()
 
-    def _resume(self, path: str | Path) -> Progress:
-        progress = load_checkpoint(path, self._fingerprint(), self.frames.device)
+    def _resume(self, path: str | Path, fingerprint: str) -> Progress:
+        progress = load_checkpoint(path, fingerprint, self.frames.device)
         if progress.message.startswith("stopped") and progress.iterations < self.method.max_iterations:
             progress.message = ""  # a larger budget than before: go on
         return progress
