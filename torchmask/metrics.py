@@ -28,7 +28,7 @@ def lowpass(image: Any, cutoff: float) -> Tensor:
         raise ValueError(
             f"cutoff is {cutoff}: it must be positive, in cycles/pixel (diameter * pixel_scale / wavelength)"
         )
-    image = torch.as_tensor(image)
+    image = image if isinstance(image, Tensor) else torch.as_tensor(image)  # which also moves to a default device
     nu_y, nu_x = _frequencies(image.shape, torch.float64, image.device)
     kept = torch.hypot(nu_y, nu_x) <= cutoff * (1 + _ROUNDING)
     return torch.fft.irfft2(torch.fft.rfft2(image) * kept, s=image.shape[-2:])
@@ -101,7 +101,7 @@ def ssim(estimate: Any, truth: Any, cutoff: float) -> float:
 def _checked(estimate: Any, truth: Any) -> tuple[Tensor, Tensor]:
     images = []
     for name, values in (("estimate", estimate), ("truth", truth)):
-        image = torch.as_tensor(values).detach().to("cpu", torch.float64)
+        image = torch.as_tensor(values, device="cpu").detach().double()
         if image.ndim != 2:
             raise ValueError(f"{name} has shape {tuple(image.shape)}: it must be one image, (rows, columns)")
         if not bool(torch.isfinite(image).all()):
@@ -146,13 +146,13 @@ def _registration(image: Tensor, reference: Tensor) -> Tensor:
         return -(_shift(image, offset) * reference).sum() / norm
 
     def value_and_gradient(offset: np.ndarray) -> tuple[float, np.ndarray]:
-        leaf = torch.tensor(offset, requires_grad=True)
+        leaf = torch.from_numpy(offset.copy()).requires_grad_()
         value = loss(leaf)
         (gradient,) = torch.autograd.grad(value, leaf)
         return float(value.detach()), gradient.numpy()
 
     def hessian(offset: np.ndarray) -> np.ndarray:
-        return torch.autograd.functional.hessian(loss, torch.tensor(offset)).numpy()  # type: ignore[union-attr]
+        return torch.autograd.functional.hessian(loss, torch.from_numpy(offset.copy())).numpy()  # type: ignore[union-attr]
 
     options = {"initial_trust_radius": 0.25, "max_trust_radius": 0.5, "gtol": 1e-9}
     result = minimize(value_and_gradient, start, jac=True, hess=hessian, method="trust-exact", options=options)

@@ -232,6 +232,21 @@ def test_a_checkpoint_belongs_to_what_was_known(observation, known, tmp_path):
         MyopicDeconvolution(mask(), GRID, r0=0.22, max_iterations=2).restore(observation.frames, checkpoint=path)
 
 
+def test_another_default_device_sees_nothing_of_it(observation):
+    """From the constructor to the standard deviations and the score, all arrays are made where the inputs are."""
+    aperture = mask()
+
+    def restored():
+        method = MyopicDeconvolution(aperture, GRID, 3, static_modes=3, max_iterations=3)
+        result = method.restore(observation.frames, n_samples=2)
+        return result.object, result.object_std, torch.tensor(errors(observation, result.object), device="cpu")
+
+    expected = restored()
+    with torch.device("meta"):
+        for one, other in zip(expected, restored(), strict=True):
+            assert torch.equal(one, other)
+
+
 def test_a_descent_at_rest_comes_to_an_end(observation):
     """With tolerance 0 too, when no step lowers the cost any more."""
     method = MyopicDeconvolution(

@@ -48,7 +48,7 @@ def von_karman_covariance(distance: Tensor, r0: float, outer_scale: float) -> Te
     """
     require_turbulence(r0, outer_scale)
     variance = _VARIANCE_CONSTANT * (outer_scale / r0) ** (5 / 3)
-    return torch.as_tensor(variance * _correlation(_argument(distance, outer_scale))).to(distance)
+    return torch.as_tensor(variance * _correlation(_argument(distance, outer_scale)), device="cpu").to(distance)
 
 
 def von_karman_structure_function(distance: Tensor, r0: float, outer_scale: float) -> Tensor:
@@ -65,7 +65,8 @@ def von_karman_structure_function(distance: Tensor, r0: float, outer_scale: floa
     k = np.arange(1, 12)
     even = (small[..., None] / 2) ** (2 * k) / (special.gamma(k + 1) * special.poch(1 / 6, k))
     odd = special.gamma(1 / 6) / special.gamma(11 / 6) * (small / 2) ** (5 / 3) * special.hyp0f1(11 / 6, small**2 / 4)
-    return torch.as_tensor(2 * variance * np.where(x < 1, odd - even.sum(-1), 1 - _correlation(x))).to(distance)
+    values = 2 * variance * np.where(x < 1, odd - even.sum(-1), 1 - _correlation(x))
+    return torch.as_tensor(values, device="cpu").to(distance)
 
 
 def _argument(distance: Tensor, outer_scale: float) -> np.ndarray:
@@ -128,7 +129,7 @@ def modal_covariance(aperture: Aperture, n_modes: int, r0: float, outer_scale: f
     shared, highest = _SHARED + bend, (_HIGHEST + bend) / (1 - aperture.central_obstruction)  # rings have finer modes
     total = _gram(aperture, n_modes, r0, outer_scale, centers, 0.0, shared)
     own = _gram(aperture, n_modes, r0, outer_scale, torch.zeros_like(centers[:1]), shared, highest)
-    total = total + torch.kron(torch.eye(len(centers), dtype=torch.float64), own)
+    total = total + torch.kron(torch.eye(len(centers), dtype=own.dtype, device=own.device), own)
     return ((total + total.T) / 2).to(aperture.centers.device)
 
 
@@ -140,7 +141,7 @@ def _gram(
     points, weights = quadrature(aperture, math.ceil(stop) + order + 16)
     modes = weights[:, None] * aperture_modes(aperture, points, n_modes)  # (Q, J)
     reach = float(torch.cdist(places, places).max()) + diameter
-    total = torch.zeros(len(places) * n_modes, len(places) * n_modes, dtype=torch.float64)
+    total = modes.new_zeros(len(places) * n_modes, len(places) * n_modes)
     for frequency, area in _panels(start / (math.pi * diameter), stop / (math.pi * diameter), outer_scale, reach):
         turns = math.pi * float(frequency[-1])
         n_angles = math.ceil(turns * reach) + 2 * order + 24  # on half a turn: the other half is the conjugate
@@ -181,7 +182,7 @@ def _panels(start: float, stop: float, outer_scale: float, reach: float) -> Iter
 
 def _directions(n_angles: int) -> Tensor:
     """Unit vectors (A, 2) at uniform angles on half a turn."""
-    angle = math.pi / n_angles * torch.arange(n_angles, dtype=torch.float64)
+    angle = math.pi / n_angles * torch.arange(n_angles, dtype=torch.float64, device="cpu")
     return torch.stack([angle.cos(), angle.sin()], dim=-1)
 
 

@@ -88,7 +88,7 @@ def _sample(
     model, n_static = problem.model, problem.model.n_static
     precision = problem.scaled_data(state)[1]
     tangent = Linearization(model, state.image, state.z, problem.parallel)
-    z_prior = torch.as_tensor(problem.prior(state)).to(state.z)
+    z_prior = torch.zeros_like(state.z[0]) + problem.prior(state)
     curvature = model.curvature(state.image, state.z, precision, generator)[0] + z_prior
     least = _LEAST * float(curvature.max())
     curvature, hold = curvature.clamp(min=least), torch.where(z_prior > 0, z_prior, least)
