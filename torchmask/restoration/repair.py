@@ -21,7 +21,8 @@ _ROUNDS, _ITERATIONS = 3, 30  # of falling noise, without which most random star
 def repair(problem: JointProblem, state: State, excess: Tensor, first_excess: float, seed: int) -> tuple[State, int]:
     """Aberrations of outlying frames from the best of several random starts, and the evaluations that it took.
 
-    `excess` (T,) tells which frames fit badly. A frame keeps its aberrations unless others lower its cost.
+    `excess` (T,) tells which frames fit badly. A frame keeps its aberrations unless others lower its cost;
+    it is `state` itself that comes back if all do.
     """
     bad = (excess > _OUTLYING * excess.quantile(0.25)).nonzero().flatten()
     if not len(bad):
@@ -50,6 +51,9 @@ def repair(problem: JointProblem, state: State, excess: Tensor, first_excess: fl
         costs = part.frame_costs(trial)
         best = torch.where((costs < least)[:, None], trial.z, best)
         least = torch.minimum(costs, least)
+    spent = n_evaluations * len(bad) // len(state.z)
+    if torch.equal(best, now.z):
+        return state, spent
     z = state.z.clone()
     z[bad] = best
-    return replace(state, z=z), n_evaluations * len(bad) // len(state.z)
+    return replace(state, z=z), spent

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 SEGMENT = 100  # iterations between restarts of the descent
 _BLURRED = 300  # iterations after which the object is sharp enough to look for its place and for lost frames
-_RELOCATIONS = 3  # how often that is done
+_RELOCATIONS = 6  # how often that is done at most
 _CONTINUATION = 30.0  # the first noise variance: what the mean frame leaves unexplained over this
 _START = 0.7  # rms of the first whitened aberrations of a point-symmetric pupil, and of a second start
 _MISSED = 0.005  # of the change from frame to frame, left unexplained by the fit: the object is another one
@@ -62,7 +62,7 @@ class Restoration:
         self.prior: bool = self.estimated or method.aberration_prior
         self.unit: float = float(frames.mean())
         bluest = replace(method.grid, wavelength=self.model.shortest_wavelength)
-        self.variance: float = expected_variance(frames, bluest, method.aperture, method.readout_noise)
+        self.variance: float = expected_variance(frames, bluest, method.aperture, method.readout_noise, valid)
         if border_brightness(frames) > _BRIGHT_BORDER:
             warnings.warn("the frames are bright at the border: does the object reach beyond the field?", stacklevel=3)
         basis = self.model.basis
