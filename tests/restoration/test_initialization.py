@@ -46,6 +46,28 @@ def test_noise_variance_is_measured_beyond_the_cutoff(n_frames):
     assert float(ratios.std()) < 2.5 / math.sqrt(n_frames * 100)
 
 
+@pytest.mark.parametrize("holes", ["scattered", "a blob"])
+def test_noise_variance_is_that_of_the_valid_pixels(holes):
+    """What stands in dead and saturated pixels is no noise, and what is put there takes none away."""
+    generator = torch.Generator().manual_seed(4)
+    valid = torch.rand(GRID.shape, generator=generator) > 0.05
+    if holes == "a blob":
+        valid = torch.ones(GRID.shape, dtype=torch.bool)
+        valid[12:18, 14:20] = False
+    nu_y, nu_x = GRID.frequencies(torch.float64)
+    inside, ratios, naive = torch.hypot(nu_y, nu_x) < 0.45, [], []
+    for _ in range(40):
+        scene = torch.rand(GRID.shape, dtype=torch.float64, generator=generator)
+        scene = 1e3 * torch.fft.ifft2(torch.fft.fft2(scene) * inside).real
+        frames = scene + 3.0 * torch.randn(4, *GRID.shape, dtype=torch.float64, generator=generator)
+        filled, mask = check_frames(torch.where(valid, frames, math.inf), valid, GRID)
+        ratios.append(noise_variance(filled, GRID, PUPIL, mask) / 9)
+        naive.append(noise_variance(filled, GRID, PUPIL) / 9)
+    ratios = torch.tensor(ratios)
+    assert abs(float(ratios.mean()) - 1) < 4 * float(ratios.std()) / math.sqrt(40) + 0.05  # that of the white noise
+    assert min(naive) > 2
+
+
 def test_noise_variance_needs_frequencies_beyond_the_cutoff():
     coarse = Grid.nyquist(1.0, 550e-9, (4, 4))
     assert noise_variance(torch.rand(3, 4, 4), coarse, PUPIL) is None
@@ -89,6 +111,16 @@ def test_pixels_that_are_not_valid_may_hold_anything():
     assert torch.equal(filled[:, valid], frames[:, valid])
     around = (frames[:, 4:7, 5:8].sum((1, 2)) - frames[:, 5, 6]) / 8
     assert torch.allclose(filled[:, 5, 6], around)
+
+
+def test_a_dead_region_is_filled_from_its_rim():
+    frames, valid = torch.zeros(1, *GRID.shape, dtype=torch.float64), torch.ones(GRID.shape, dtype=torch.bool)
+    frames[:, 8:20, 8:20] = 5.0
+    valid[10:18, 10:18] = False  # saturated: wholly within the bright part
+    filled, _ = check_frames(torch.where(valid, frames, math.nan), valid, GRID)
+    torch.testing.assert_close(filled, frames, rtol=1e-12, atol=0)
+    with pytest.raises(ValueError, match="hold no light"):
+        check_frames(frames, ~torch.ones_like(valid), GRID)
 
 
 @pytest.mark.parametrize(

@@ -10,13 +10,13 @@ from torchmask.metrics import align, lowpass
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.detector import Detector
 from torchmask.optics.turbulence import TurbulencePhase
+from torchmask.restoration.conjugate import conjugate_gradients
 from torchmask.restoration.model import ExposureModel
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.posterior import (
     _filter,
     _prior_noise,
     _sample,
-    conjugate_gradients,
     smooth,
 )
 from torchmask.restoration.priors import divergence, gradient, whitening
@@ -69,7 +69,7 @@ def test_conjugate_gradients_solve():
     root = torch.randn(12, 12, dtype=torch.float64, generator=generator)
     matrix = root @ root.T + torch.eye(12, dtype=torch.float64)
     right = torch.randn(4, 12, dtype=torch.float64, generator=generator)
-    found = conjugate_gradients(lambda x: x @ matrix, right, lambda x: x / matrix.diagonal())
+    found = conjugate_gradients(lambda x: x @ matrix, right, lambda x: x / matrix.diagonal(), 50)
     torch.testing.assert_close(found, torch.linalg.solve(matrix, right.T).T, rtol=1e-9, atol=1e-9)
 
 

@@ -10,7 +10,9 @@ from torch import Tensor
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture
+from torchmask.restoration.conjugate import conjugate_gradients
 
+_ITERATIONS = 30  # of the search for what dead pixels would hold
 _STRENGTH_RANGE = (0.05, 20.0)  # of the turbulence against its first guess, in (1/r0)^(5/3)
 
 
@@ -49,41 +51,67 @@ def check_frames(frames: Tensor, valid: Tensor | None, grid: Grid) -> tuple[Tens
 
 
 def _fill(frames: Tensor, valid: Tensor) -> Tensor:
-    """Replace pixels that are not valid by the mean of their valid neighbours, or of the frame where there is none.
+    """Replace pixels that are not valid by the mean of their valid neighbours, from the rim of a dead region inwards.
 
-    They carry no weight in the restoration; this keeps them from spoiling the mean frame and the measured noise.
+    They carry no weight in the restoration; this keeps them from spoiling the mean frame. 0 in frames without any.
     """
-    known = torch.where(valid, frames, 0.0)
+    frames = torch.where(valid, frames, 0.0)
     kernel = torch.ones(1, 1, 3, 3, dtype=frames.dtype, device=frames.device)
-    around = torch.nn.functional.conv2d(known[:, None], kernel, padding=1)[:, 0]
-    count = torch.nn.functional.conv2d(valid[:, None].to(frames), kernel, padding=1)[:, 0]
-    overall = known.sum((1, 2), keepdim=True) / valid.sum((1, 2), keepdim=True).clamp(min=1)
-    return torch.where(valid, frames, torch.where(count > 0, around / count.clamp(min=1), overall))
+    for _ in range(max(frames.shape[1:])):
+        if bool(valid.all()):
+            break
+        around = torch.nn.functional.conv2d(frames[:, None], kernel, padding=1)[:, 0]
+        count = torch.nn.functional.conv2d(valid[:, None].to(frames), kernel, padding=1)[:, 0]
+        frames = torch.where(valid, frames, around / count.clamp(min=1))
+        valid = valid | (count > 0)
+    return frames
 
 
-def noise_variance(frames: Tensor, grid: Grid, aperture: Aperture) -> float | None:
+def noise_variance(frames: Tensor, grid: Grid, aperture: Aperture, valid: Tensor | None = None) -> float | None:
     """Mean noise variance of a pixel [electrons^2], from the frequencies that the aperture cannot transmit.
 
     White noise has the same power at all frequencies, and beyond the cut-off there is nothing else. The median over
     frequencies (of the power averaged over T frames, a gamma variable) leaves out the cross of a bright border.
     None if fewer than eight frequencies lie beyond the cut-off.
+
+    Pixels that are not `valid` (T, H, W) take the values that leave the least power there. That takes some of the
+    noise with it: as much as of white noise with the same holes.
     """
     nu_y, nu_x = grid.frequencies(frames.dtype, frames.device)
     beyond = torch.hypot(nu_y, nu_x) > grid.cutoff(aperture.extent)
     if int(beyond.sum()) < 8:
         return None
-    power = (torch.fft.fft2(frames, norm="ortho").abs() ** 2)[..., beyond].mean(0)
     n = len(frames)
     median_over_mean = math.log(2) if n == 1 else (1 - 1 / (9 * n)) ** 3  # Wilson & Hilferty 1931
-    return float(power.median()) / median_over_mean
+    if valid is not None and not bool(valid.all()):
+        generator = torch.Generator().manual_seed(0)
+        white = torch.randn(frames.shape, dtype=frames.dtype, device="cpu", generator=generator).to(frames.device)
+        frames = _least_power(frames, valid, beyond)
+        median_over_mean = _median_power(_least_power(white * valid, valid, beyond), beyond)
+    return _median_power(frames, beyond) / median_over_mean
 
 
-def expected_variance(frames: Tensor, grid: Grid, aperture: Aperture, readout_noise: float | None) -> float:
+def _median_power(frames: Tensor, beyond: Tensor) -> float:
+    return float((torch.fft.fft2(frames, norm="ortho").abs() ** 2)[..., beyond].mean(0).median())
+
+
+def _least_power(frames: Tensor, valid: Tensor, beyond: Tensor) -> Tensor:
+    """Frames whose pixels that are not valid make the power at the frequencies `beyond` (H, W) least."""
+
+    def gradient(x: Tensor) -> Tensor:
+        return torch.where(valid, 0.0, torch.fft.ifft2(torch.fft.fft2(x) * beyond).real)
+
+    return frames + conjugate_gradients(gradient, -gradient(frames), lambda x: x, _ITERATIONS)
+
+
+def expected_variance(
+    frames: Tensor, grid: Grid, aperture: Aperture, readout_noise: float | None, valid: Tensor | None = None
+) -> float:
     """Mean noise variance of a pixel [electrons^2]: photon and read-out noise, or what `noise_variance` measures.
 
     Raises ValueError if nothing tells the noise; warns if both ways are open and disagree by more than a factor of 2.
     """
-    measured = noise_variance(frames, grid, aperture)
+    measured = noise_variance(frames, grid, aperture, valid)
     if readout_noise is None:
         if measured is None or measured <= 0:
             raise ValueError("the noise cannot be measured beyond the cut-off frequency: give readout_noise")

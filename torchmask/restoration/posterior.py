@@ -13,12 +13,12 @@ Inf. Process. Syst. 23, 1858, 2010), by conjugate gradients.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from torchmask.metrics import lowpass
+from torchmask.restoration.conjugate import Operator, conjugate_gradients
 from torchmask.restoration.linearization import Linearization
 from torchmask.restoration.priors import divergence, gradient
 from torchmask.restoration.problem import JointProblem, State
@@ -27,8 +27,6 @@ _REACH = 1.0  # resolution elements (1 / cut-off) over which an object's gradien
 _ROUNDS, _FEW = 3, 6  # of expectation maximisation, and its samples, which the mean over the reach makes enough
 _LEAST = 1e-6  # of the largest: dark parts have a prior too, and aberrations without curvature a scale and a hold
 _ITERATIONS = 50  # of conjugate gradients: variances of what is below the cut-off are within 3 % of their limit then
-
-Operator = Callable[[Tensor], Tensor]
 
 
 def standard_deviations(
@@ -71,7 +69,7 @@ def _bias(image: Tensor, slope: Tensor, power: Tensor, prior: Tensor) -> Tensor:
 def _solve_for_object(power: Tensor, prior: Tensor, right: Tensor) -> Tensor:
     """Objects (S, H', W') at which data and prior pull with `right` (S, H', W'), for known PSFs."""
     return conjugate_gradients(
-        lambda x: _filter(x, power) + _curvature(x, prior), right, _object_preconditioner(power, prior)
+        lambda x: _filter(x, power) + _curvature(x, prior), right, _object_preconditioner(power, prior), _ITERATIONS
     )
 
 
@@ -118,7 +116,7 @@ def _sample(
     by_image, by_z = tangent.adjoint(noise)
     by_image = by_image + _prior_noise(prior, n_samples, generator)
     by_z = by_z + z_prior.sqrt() * _white(shape, state.z, generator)
-    return split(conjugate_gradients(hessian, join(by_image, by_z), precondition))
+    return split(conjugate_gradients(hessian, join(by_image, by_z), precondition, _ITERATIONS))
 
 
 def _object_preconditioner(power: Tensor, prior: Tensor) -> Operator:
@@ -160,26 +158,6 @@ def _curvature(x: Tensor, prior: Tensor) -> Tensor:
 
 def _filter(x: Tensor, response: Tensor) -> Tensor:
     return torch.fft.irfft2(torch.fft.rfft2(x) * response, s=x.shape[-2:])
-
-
-def conjugate_gradients(hessian: Operator, right: Tensor, precondition: Operator) -> Tensor:
-    """Solve hessian(x) = right for every entry of the first axis; what is zero in all of `right` stays so."""
-    axes, tiny = tuple(range(1, right.ndim)), torch.finfo(right.dtype).tiny
-
-    def inner(a: Tensor, b: Tensor) -> Tensor:
-        return (a * b).sum(axes, keepdim=True)
-
-    x, residual = torch.zeros_like(right), right
-    direction = scaled = precondition(residual)
-    size = inner(residual, scaled)
-    for _ in range(_ITERATIONS):
-        curved = hessian(direction)
-        step = size / inner(direction, curved).clamp(min=tiny)  # all may be zero, or solved already
-        x, residual = x + step * direction, residual - step * curved
-        scaled = precondition(residual)
-        size, before = inner(residual, scaled), size
-        direction = scaled + size / before.clamp(min=tiny) * direction
-    return x
 
 
 def _energy(image: Tensor) -> Tensor:

@@ -1,0 +1,34 @@
+"""Linear systems that are known by their action only."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+Operator = Callable[[Tensor], Tensor]
+
+
+def conjugate_gradients(hessian: Operator, right: Tensor, precondition: Operator, n_iterations: int) -> Tensor:
+    """Solve hessian(x) = right for every entry of the first axis; what is zero in all of `right` stays so.
+
+    Preconditioned conjugate gradients (Hestenes & Stiefel, J. Res. Natl. Bur. Stand. 49, 409, 1952), for positive
+    definite operators that act on entries independently.
+    """
+    axes, tiny = tuple(range(1, right.ndim)), torch.finfo(right.dtype).tiny
+
+    def inner(a: Tensor, b: Tensor) -> Tensor:
+        return (a * b).sum(axes, keepdim=True)
+
+    x, residual = torch.zeros_like(right), right
+    direction = scaled = precondition(residual)
+    size = inner(residual, scaled)
+    for _ in range(n_iterations):
+        curved = hessian(direction)
+        step = size / inner(direction, curved).clamp(min=tiny)  # all may be zero, or solved already
+        x, residual = x + step * direction, residual - step * curved
+        scaled = precondition(residual)
+        size, before = inner(residual, scaled), size
+        direction = scaled + size / before.clamp(min=tiny) * direction
+    return x
