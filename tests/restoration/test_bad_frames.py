@@ -1,0 +1,123 @@
+"""Frames as they should not be: each kind ends in an error that names it, in a warning, or in a good restoration.
+
+One frame, odd sizes and dead pixels in whole restorations stand in test_myopic.py.
+"""
+
+import math
+import warnings
+
+import pytest
+import torch
+
+from torchmask.grid import Grid
+from torchmask.metrics import score
+from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.detector import Detector
+from torchmask.optics.turbulence import TurbulencePhase
+from torchmask.restoration.myopic import MyopicDeconvolution
+from torchmask.simulation.observation import simulate_observation
+
+GRID = Grid.nyquist(1.0, 550e-9, 40)
+READOUT = 1.5
+ANGLES = torch.arange(5, dtype=torch.float64) * 2 * math.pi / 5
+MASK = SparseAperture(torch.stack([ANGLES.cos(), ANGLES.sin()], -1) * 0.38, 0.22, 1.0)
+
+
+def body(shape, panel):
+    """A bright square in front of a panel (rows, columns)."""
+    rows, columns = panel
+    image = torch.zeros(shape, dtype=torch.float64)
+    row, column = shape[0] // 2, shape[1] // 2
+    image[row - 4 : row + 4, column - 4 : column + 3] = 3
+    image[row - rows // 2 : row + rows // 2, column - columns // 2 : column + columns // 2] += 1
+    return image
+
+
+def observe(grid=GRID, panel=(4, 20), n_frames=4, photons=3e5):
+    scene = body(grid.shape, panel)
+    generator = torch.Generator().manual_seed(1)
+    turbulence = TurbulencePhase(0.25, 20.0)
+    return simulate_observation(
+        scene * (photons / scene.sum()), MASK, grid, turbulence, Detector(READOUT), n_frames, generator
+    )
+
+
+@pytest.fixture(scope="module")
+def seen():
+    return observe()
+
+
+def method(grid=GRID, **options):
+    return MyopicDeconvolution(MASK, grid, **({"n_modes": 6, "r0": 0.25, "max_iterations": 250} | options))
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_values_that_are_not_finite_are_named(seen, value):
+    spoilt = seen.frames.clone()
+    spoilt[2, 5, 6] = value
+    with pytest.raises(ValueError, match=r"frames \[2\] hold values that are not finite: mark those pixels in `valid`"):
+        method().restore(spoilt)
+
+
+def test_dead_pixels_change_neither_noise_nor_image(seen):
+    valid = torch.rand(seen.frames.shape, generator=torch.Generator().manual_seed(0)) > 0.05  # others in every frame
+    whole = method().restore(seen.frames)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        result = method().restore(torch.where(valid, seen.frames, math.nan), valid=valid, n_samples=2)
+    assert result.noise == pytest.approx(whole.noise, rel=0.08)  # of 1300 frequencies, and as many of white noise
+    assert score(result.object, seen.object, 0.5) < 1.3 * score(whole.object, seen.object, 0.5)
+    assert bool(torch.isfinite(result.object_std).all())
+
+
+def test_saturated_pixels_are_to_be_marked(seen):
+    full_well = float(torch.quantile(seen.frames.flatten(), 0.95))
+    clipped = seen.frames.clamp(max=full_well)
+    unmarked = method(max_iterations=300).restore(clipped)
+    marked = method(max_iterations=300).restore(clipped, valid=clipped < full_well)
+    assert bool(torch.isfinite(unmarked.object).all())
+    assert score(marked.object, seen.object, 0.5) < 0.75 * score(unmarked.object, seen.object, 0.5)
+    assert marked.noise < READOUT + float(seen.frames.mean()) ** 0.5  # what is clipped does not count as noise
+    assert float(unmarked.chi_square.mean()) > 2 * float(marked.chi_square.mean())  # which tells who forgets it
+
+
+def test_constant_frames_hold_no_noise():
+    flat = torch.full((3, *GRID.shape), 100.0)
+    with pytest.raises(ValueError, match=r"noise cannot be measured .*: give readout_noise"):
+        method().restore(flat)
+    with pytest.warns(UserWarning, match="noise is 0 electrons"), pytest.warns(UserWarning, match="beyond the field"):
+        result = method(readout_noise=READOUT, max_iterations=20).restore(flat, n_samples=2)
+    for image in (result.object, result.object_std, result.coefficients):
+        assert bool(torch.isfinite(image).all())
+
+
+def test_dark_frames_are_named(seen):
+    dark = torch.cat([seen.frames, 0 * seen.frames[:1]])
+    with pytest.raises(ValueError, match=r"frames \[4\] hold no light: leave them out"):
+        method().restore(dark)
+
+
+@pytest.mark.parametrize("shape", [(35, 41), (40, 51)])
+def test_one_frame_of_odd_sides(shape):
+    grid = Grid(shape, GRID.pixel_scale, GRID.wavelength)
+    single = observe(grid, n_frames=1)
+    result = method(grid, readout_noise=READOUT).restore(single.frames, n_samples=2)
+    assert result.object.shape == result.object_std.shape == shape
+    assert score(result.object, single.object, 0.5) < 0.75 * score(single.frames[0], single.object, 0.5)
+
+
+def test_an_object_wider_than_the_field_is_noticed(seen):
+    wide = observe(Grid.nyquist(1.0, 550e-9, 80), panel=(60, 60))
+    with pytest.warns(UserWarning, match="does the object reach beyond the field"):
+        result = method(max_iterations=5).restore(wide.frames[:, 20:60, 10:50])
+    assert bool(torch.isfinite(result.object).all())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        method(readout_noise=READOUT, max_iterations=5).restore(seen.frames)  # this one does not
+
+
+@pytest.mark.parametrize(("gain", "readout_noise"), [(1.0, 100.0), (5.0, READOUT), (0.01, READOUT)])
+def test_a_wrong_noise_level_is_noticed(seen, gain, readout_noise):
+    """Readout noise that is far off, or frames in other units than electrons."""
+    with pytest.warns(UserWarning, match="check the gain and readout_noise"):
+        method(readout_noise=readout_noise, max_iterations=5).restore(gain * seen.frames)
