@@ -26,6 +26,7 @@ from torchmask.restoration.problem import JointProblem, State
 _REACH = 1.0  # resolution elements (1 / cut-off) over which an object's gradients are alike
 _ROUNDS, _FEW = 3, 6  # of expectation maximisation, and its samples, which the mean over the reach makes enough
 _LEAST = 1e-6  # of the largest: dark parts have a prior too, and aberrations without curvature a scale and a hold
+_BATCH = 8  # samples at once, each of which takes the memory of several stacks
 _ITERATIONS = 50  # of conjugate gradients: variances of what is below the cut-off are within 3 % of their limit then
 
 
@@ -42,7 +43,9 @@ def standard_deviations(
     reach = _REACH / cutoff
     slope, power = problem.object_quadratic(state)
     prior = _gradient_prior(power, state.image, reach, generator)
-    objects, aberrations = _sample(problem, state, power, prior, photon_share, n_samples, generator)
+    sizes = [min(_BATCH, n_samples - start) for start in range(0, n_samples, _BATCH)]
+    drawn = [_sample(problem, state, power, prior, photon_share, size, generator) for size in sizes]
+    objects, aberrations = (torch.cat(part) for part in zip(*drawn, strict=True))
     off = lowpass(_bias(state.image, slope, power, prior), cutoff).square() if "object" in problem.free else 0.0
     variance = smooth(lowpass(objects, cutoff).square().mean(0) + off, reach)
     return variance.clamp(min=0).sqrt(), aberrations

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ class RestorationResult:
     residuals : (T, H, W) (frames - model) / noise, 0 where a pixel is not valid
     chi_square : (T,) mean square of the residuals
     tv_weight : mu, in units of frames of mean 1
-    r0 : Fried parameter of the prior on the aberrations [m], NaN without prior
+    r0 : Fried parameter of the prior on the aberrations [m], NaN without prior or where they are known
     noise : electrons rms per pixel, averaged over the stack
     cost : (iterations,) what was minimised, one start after the other
     converged, message : whether and why it stopped
@@ -90,6 +91,7 @@ class RestorationResult:
             f"{n_sub} x {n_modes} aberrations each",
             f"{self.message} after {len(self.cost)} iterations, {self.n_evaluations} evaluations, {self.seconds:.1f} s",
             f"chi-square per pixel {float(chi.mean()):.3f} (worst frame {int(chi.argmax())}: {float(chi.max()):.3f})",
-            f"noise {self.noise:.3g} electrons rms, TV weight {self.tv_weight:g}, r0 {self.r0:.3g} m",
+            f"noise {self.noise:.3g} electrons rms, TV weight {self.tv_weight:g}"
+            + ("" if math.isnan(self.r0) else f", r0 {self.r0:.3g} m"),
         ]
         return "\n".join(lines)

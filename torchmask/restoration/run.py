@@ -301,6 +301,7 @@ class Restoration:
         residuals = (self.frames - frames) * self.problem.precision.sqrt()
         n_valid = self.valid.sum((1, 2)).clamp(min=1)
         image = state.image * self.unit
+        of_turbulence = method.aberration_prior and not self.estimated and "aberrations" in self.problem.free
         return RestorationResult(
             object=image[:rows, :columns].clone(),
             extended_object=image,
@@ -310,7 +311,7 @@ class Restoration:
             residuals=residuals,
             chi_square=(residuals**2).sum((1, 2)) / n_valid,
             tv_weight=method.tv_weight,
-            r0=method.r0 * state.prior ** (3 / 5) if method.aberration_prior and not self.estimated else math.nan,
+            r0=method.r0 * state.prior ** (3 / 5) if of_turbulence else math.nan,
             noise=self.variance**0.5,
             cost=torch.tensor(progress.costs, dtype=torch.float64, device="cpu"),
             converged=progress.message.startswith("converged"),
