@@ -123,6 +123,16 @@ def test_a_dead_region_is_filled_from_its_rim():
         check_frames(frames, ~torch.ones_like(valid), GRID)
 
 
+def test_arrays_and_frames_with_a_gradient_are_frames_too():
+    frames = blurred(3, torch.Generator().manual_seed(1))
+    valid = frames > 0
+    expected = check_frames(frames, valid, GRID)
+    for given in ((frames.numpy(), valid.numpy()), (frames.clone().requires_grad_(), valid)):
+        for one, other in zip(expected, check_frames(*given, GRID), strict=True):
+            assert torch.equal(one, other)
+            assert not other.requires_grad
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,7 +17,7 @@ _ITERATIONS = 30  # of the search for what dead pixels would hold
 _STRENGTH_RANGE = (0.05, 20.0)  # of the turbulence against its first guess, in (1/r0)^(5/3)
 
 
-def check_frames(frames: Tensor, valid: Tensor | None, grid: Grid) -> tuple[Tensor, Tensor]:
+def check_frames(frames: Tensor | np.ndarray, valid: Tensor | np.ndarray | None, grid: Grid) -> tuple[Tensor, Tensor]:
     """Frames (T, H, W) in floating point with pixels that are not valid filled in, and `valid` as (T, H, W).
 
     Raises ValueError if a shape is wrong, a valid pixel is not finite, or a frame holds no light.
@@ -27,7 +28,7 @@ def check_frames(frames: Tensor, valid: Tensor | None, grid: Grid) -> tuple[Tens
             f"frames has shape {tuple(frames.shape)}: it must be (n_frames, {grid.shape[0]}, {grid.shape[1]}), with "
             "at least one frame, as the grid says"
         )
-    frames = frames.double()
+    frames = frames.detach().double()
     if valid is None:
         valid = torch.ones_like(frames, dtype=torch.bool)
     else:

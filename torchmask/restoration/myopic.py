@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -168,9 +169,9 @@ class MyopicDeconvolution(nn.Module):
 
     def restore(
         self,
-        frames: Tensor,
+        frames: Tensor | np.ndarray,
         *,
-        valid: Tensor | None = None,
+        valid: Tensor | np.ndarray | None = None,
         coefficients: Tensor | None = None,
         covariance: Tensor | None = None,
         known_object: Tensor | None = None,
@@ -183,9 +184,9 @@ class MyopicDeconvolution(nn.Module):
 
         Parameters
         ----------
-        frames : (T, H, W) tensor
+        frames : (T, H, W) tensor or array
             Single pixels may be negative (read-out noise).
-        valid : (H, W) or (T, H, W) boolean tensor, optional
+        valid : (H, W) or (T, H, W) boolean tensor or array, optional
             False where a pixel is dead or saturated; it is left out, whatever its value.
         coefficients : (T, N, J) tensor, optional
             Known aberrations [rad rms], which stay as they are: non-blind deconvolution.
@@ -200,7 +201,7 @@ class MyopicDeconvolution(nn.Module):
             new frames are then fitted to its object before everything is refined together.
         n_samples : int
             Drawn from the posterior for the standard deviations of object and coefficients, which cost about as much
-            as 60 iterations each; 8 are enough. 0: no standard deviations.
+            as 50 iterations each; 8 are enough. 0: no standard deviations.
         checkpoint : path, optional
             An .npz file, written every 100 iterations. If it exists, the restoration goes on from it, and ends in the
             same result as if it had never been interrupted.
@@ -210,9 +211,9 @@ class MyopicDeconvolution(nn.Module):
         Raises
         ------
         ValueError
-            If a shape is wrong, a valid pixel is not finite, a frame holds no light, both object and aberrations are
-            known, `covariance` is not one or stands without coefficients or beside static modes, or the checkpoint is
-            damaged or belongs to other frames or settings.
+            If a shape is wrong, a valid pixel or what is known is not finite, a frame or the known object holds no
+            light, both object and aberrations are known, `covariance` is not one or stands without coefficients or
+            beside static modes, or the checkpoint is damaged or belongs to other frames, settings or known values.
 
         Warns
         -----
