@@ -98,9 +98,10 @@ def _median_power(frames: Tensor, beyond: Tensor) -> float:
 
 def _least_power(frames: Tensor, valid: Tensor, beyond: Tensor) -> Tensor:
     """Frames whose pixels that are not valid make the power at the frequencies `beyond` (H, W) least."""
+    half = beyond[:, : beyond.shape[1] // 2 + 1]
 
     def gradient(x: Tensor) -> Tensor:
-        return torch.where(valid, 0.0, torch.fft.ifft2(torch.fft.fft2(x) * beyond).real)
+        return torch.where(valid, 0.0, torch.fft.irfft2(torch.fft.rfft2(x) * half, s=beyond.shape))
 
     return frames + conjugate_gradients(gradient, -gradient(frames), lambda x: x, _ITERATIONS)
 
