@@ -18,7 +18,7 @@ from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.simulation.observation import simulate_observation
 
 GRID = Grid.nyquist(1.0, 550e-9, 40)
-READOUT = 1.5
+R0, READOUT = 0.6, 1.5  # so weak that 300 iterations do
 ANGLES = torch.arange(5, dtype=torch.float64) * 2 * math.pi / 5
 MASK = SparseAperture(torch.stack([ANGLES.cos(), ANGLES.sin()], -1) * 0.38, 0.22, 1.0)
 
@@ -36,7 +36,7 @@ def body(shape, panel):
 def observe(grid=GRID, panel=(4, 20), n_frames=4, photons=3e5):
     scene = body(grid.shape, panel)
     generator = torch.Generator().manual_seed(1)
-    turbulence = TurbulencePhase(0.25, 20.0)
+    turbulence = TurbulencePhase(R0, 20.0)
     return simulate_observation(
         scene * (photons / scene.sum()), MASK, grid, turbulence, Detector(READOUT), n_frames, generator
     )
@@ -48,7 +48,7 @@ def seen():
 
 
 def method(grid=GRID, **options):
-    return MyopicDeconvolution(MASK, grid, **({"n_modes": 6, "r0": 0.25, "max_iterations": 250} | options))
+    return MyopicDeconvolution(MASK, grid, **({"n_modes": 6, "r0": R0, "max_iterations": 300} | options))
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
@@ -65,20 +65,20 @@ def test_dead_pixels_change_neither_noise_nor_image(seen):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         result = method().restore(torch.where(valid, seen.frames, math.nan), valid=valid, n_samples=2)
-    assert result.noise == pytest.approx(whole.noise, rel=0.08)  # of 1300 frequencies, and as many of white noise
-    assert score(result.object, seen.object, 0.5) < 1.3 * score(whole.object, seen.object, 0.5)
+    assert result.noise == pytest.approx(whole.noise, rel=0.12)  # 3 sigma of medians of 170 frequencies
+    assert score(result.object, seen.object, 0.5) < 1.2 * score(whole.object, seen.object, 0.5)
     assert bool(torch.isfinite(result.object_std).all())
 
 
 def test_saturated_pixels_are_to_be_marked(seen):
     full_well = float(torch.quantile(seen.frames.flatten(), 0.95))
     clipped = seen.frames.clamp(max=full_well)
-    unmarked = method(max_iterations=300).restore(clipped)
-    marked = method(max_iterations=300).restore(clipped, valid=clipped < full_well)
+    unmarked = method().restore(clipped)
+    marked = method().restore(clipped, valid=clipped < full_well)
     assert bool(torch.isfinite(unmarked.object).all())
-    assert score(marked.object, seen.object, 0.5) < 0.75 * score(unmarked.object, seen.object, 0.5)
+    assert score(marked.object, seen.object, 0.5) < 0.5 * score(unmarked.object, seen.object, 0.5)
     assert marked.noise < READOUT + float(seen.frames.mean()) ** 0.5  # what is clipped does not count as noise
-    assert float(unmarked.chi_square.mean()) > 2 * float(marked.chi_square.mean())  # which tells who forgets it
+    assert float(unmarked.chi_square.mean()) > 3 * float(marked.chi_square.mean())  # which tells who forgets it
 
 
 def test_constant_frames_hold_no_noise():
