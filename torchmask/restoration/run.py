@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 SEGMENT = 100  # iterations between restarts of the descent
 _BLURRED = 300  # iterations after which the object is sharp enough to look for its place and for lost frames
-_RELOCATIONS = 6  # how often that is done at most
+_RELOCATIONS = 3  # how often that is done at most
 _CONTINUATION = 30.0  # the first noise variance: what the mean frame leaves unexplained over this
 _START = 0.7  # rms of the first whitened aberrations of a point-symmetric pupil, and of a second start
 _MISSED = 0.005  # of the change from frame to frame, left unexplained by the fit: the object is another one
@@ -139,7 +139,7 @@ class Restoration:
         """At the end of a start: another one if this has missed the object, then the better of both."""
         excess = self.problem.calibrate(progress.state).excess.mean()
         if progress.rival is None:
-            if float(excess - 1) > _MISSED * self._change:
+            if len(self.frames) > 1 and float(excess - 1) > _MISSED * self._change:
                 progress.rival, progress.rival_message = progress.state, progress.message
                 progress.began, progress.relocations, progress.message = len(progress.costs), 0, ""
                 first = self._begin(None, None)
