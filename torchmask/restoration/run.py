@@ -96,7 +96,8 @@ class Restoration:
             progress = self._resume(checkpoint, self._fingerprint(given))
         else:
             progress = Progress(begin) if start is None else self._warm(begin, start)
-        may_restart = len(self.problem.free) == 2 and not self.estimated and start is None
+        blind = len(self.problem.free) == 2 and not self.estimated and start is None
+        may_restart = blind and self.method.aberration_prior  # without it, a poor fit is the method's own
         while not progress.message:
             self._advance(progress)
             if progress.message and may_restart and progress.iterations > _BLURRED:
