@@ -194,6 +194,7 @@ def test_interrupted_and_resumed_is_the_same(observation, tmp_path):
     assert torch.equal(spread.object_std, method.restore(observation.frames, checkpoint=path, n_samples=2).object_std)
 
 
+@pytest.mark.slow
 def test_a_missed_object_gets_a_second_start(observation, tmp_path, monkeypatch):
     """Here nothing is missed, so the threshold is lowered: the better of both is kept, resumed or not."""
     method = MyopicDeconvolution(mask(), GRID, N_MODES, r0=R0, readout_noise=READOUT, max_iterations=400)
@@ -259,6 +260,7 @@ def test_a_descent_at_rest_comes_to_an_end(observation):
     assert len(result.cost) < 2000
 
 
+@pytest.mark.slow
 def test_a_second_start_that_is_worse_changes_nothing(observation, monkeypatch):
     for name, value in {"_BLURRED": 50, "_RELOCATIONS": 0, "_MISSED": math.inf}.items():
         monkeypatch.setattr(f"torchmask.restoration.run.{name}", value)
@@ -363,7 +365,7 @@ def test_refuses_shapes_that_disagree(observation, known):
 
 @pytest.mark.slow
 @pytest.mark.skipif(not STACKS.is_dir(), reason="the reference stacks lie beside the checkout")
-@pytest.mark.parametrize(("name", "limit"), [("skylab_1e7_mask", 0.070), ("mgs_1e6_mask", 0.1425)])
+@pytest.mark.parametrize(("name", "limit"), [("skylab_1e7_mask", 0.065), ("mgs_1e6_mask", 0.1385)])
 def test_reference_stacks(name, limit):
     """One call, nothing known but the instrument; the limits are those measured plus 2 % for another platform."""
     stack = Observation.load(STACKS / f"{name}.npz")

@@ -14,7 +14,9 @@ from torchmask.restoration.conjugate import conjugate_gradients
 from torchmask.restoration.model import ExposureModel
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.posterior import (
+    _bias,
     _filter,
+    _gradient_prior,
     _prior_noise,
     _sample,
     smooth,
@@ -103,6 +105,7 @@ def test_the_object_alone_has_the_closed_form():
     assert relative < 0.03
 
 
+@pytest.mark.slow
 def test_aberrations_alone_have_the_inverse_of_their_hessian():
     """With a known object the frames are apart, and the Hessian is a small matrix."""
     stated, state = problem(free=("aberrations",), n_frames=1)
@@ -226,6 +229,34 @@ def test_deviations_are_kept_and_asked_for(tmp_path):
     for bad in (-1, 1):
         with pytest.raises(ValueError, match="at least 2"):
             method.restore(frames, n_samples=bad)
+
+
+@pytest.mark.parametrize("noisy", [False, True])
+def test_the_prior_has_the_variance_of_the_gradients(noisy):
+    """Seen perfectly: 1 / 18. Not seen at all: an object has half as many pixels as gradients, so 1 / prior is lost."""
+    generator = torch.Generator().manual_seed(0)
+    image = 3.0 * torch.randn(96, 96, dtype=torch.float64, generator=generator)  # gradients of variance 2 x 9
+    power = torch.full((96, 49), 1e-12 if noisy else 1e12, dtype=torch.float64)
+    prior = _gradient_prior(power, image, 8.0, generator)
+    # A Gaussian of 8 pixels averages over 4 pi 8^2 = 804 of them; neighbouring gradients are correlated by 1/2.
+    scatter = 2 / math.sqrt(804)
+    expected = 2 / 36
+    for _ in range(3 if noisy else 0):
+        expected = 2 / (36 + 1 / expected)
+    assert float(prior.mean()) == pytest.approx(expected, rel=scatter)
+    assert float(prior.std()) < scatter * expected
+
+
+def test_bias_leads_to_the_mean_of_the_posterior():
+    """For an even prior the mean is a filter: of data o + slope/power it is power / (power + prior |k|^2)."""
+    generator = torch.Generator().manual_seed(0)
+    image, slope = (torch.randn(32, 32, dtype=torch.float64, generator=generator) for _ in range(2))
+    power, prior = torch.full((32, 17), 2.0, dtype=torch.float64), torch.full((32, 32), 0.7, dtype=torch.float64)
+    nu = torch.fft.fftfreq(32, dtype=torch.float64)
+    smoothness = 4 * ((math.pi * nu[:, None]).sin() ** 2 + (math.pi * nu[None, :17]).sin() ** 2)
+    seen = image - slope / 2.0  # where the quadratic misfit has its least
+    mean = _filter(seen, 2.0 / (2.0 + 0.7 * smoothness))
+    torch.testing.assert_close(image + _bias(image, slope, power, prior), mean, rtol=0, atol=1e-9)
 
 
 def test_filter_is_periodic_convolution():
