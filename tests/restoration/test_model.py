@@ -84,7 +84,7 @@ def test_gradients_at_zero_aberrations_and_zero_object():
 def test_unwanted_gradients_are_not_computed_and_chunks_do_not_show(monkeypatch):
     model, image, z, frames, precision = setup(n_frames=5)
     whole = model.misfit(image, z, frames, precision)
-    monkeypatch.setattr("torchmask.restoration.model._CHUNK", 2 * math.prod(model.field.shape))
+    monkeypatch.setattr("torchmask.restoration.model._CHUNK", 2 * 16 * math.prod(model.field.shape))
     assert len(list(model.chunks(5))) == 3
     parts = model.misfit(image, z, frames, precision)
     for one, other in zip(whole, parts, strict=True):

@@ -21,7 +21,7 @@ from torchmask.optics.aperture import Aperture
 from torchmask.optics.zernike import zernike_basis
 from torchmask.restoration.parallel import Map
 
-_CHUNK = 2**16  # pixels of one complex work array: it stays in a core's cache
+_CHUNK = 2**20  # bytes of one complex work array: it stays in a core's cache
 
 
 class Misfit(NamedTuple):
@@ -156,7 +156,8 @@ class ExposureModel(nn.Module):
 
     def chunks(self, n_frames: int) -> Iterator[slice]:
         """Slices of the frames whose work arrays stay small."""
-        size = max(1, _CHUNK // (self.n_wavelengths * math.prod(self.field.shape)))
+        frame = 2 * self.basis.element_size() * self.n_wavelengths * math.prod(self.field.shape)
+        size = max(1, _CHUNK // frame)
         return (slice(start, min(start + size, n_frames)) for start in range(0, n_frames, size))
 
     def pupil_field(self, z: Tensor) -> Tensor:

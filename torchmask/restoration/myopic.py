@@ -31,11 +31,13 @@ class MyopicDeconvolution(nn.Module):
 
         1/2 sum_t || (g_t window(h_t(a_t) * o) - y_t) / sigma ||^2  +  mu TV(o)  +  1/2 ||z||^2
 
-    by bounded L-BFGS in variables scaled by the diagonal of the Hessian, from zero aberrations (random ones for a full
-    pupil) and the clipped mean frame. It restarts every 100 iterations: then the scales, the transmission g_t of each
-    frame and, if r0 is not given, the strength of the turbulence are brought up to date; sigma falls from what the
-    mean frame leaves unexplained to the noise or to what the model cannot explain, if that is more; frames that fit
-    badly start anew from random aberrations, and the object is moved between the pixels to where it fits best.
+    by bounded L-BFGS in variables scaled by the diagonal of the Hessian, from zero aberrations and the clipped mean
+    frame. It restarts every 100 iterations: then the scales, the transmission g_t of each frame and, if r0 is not
+    given, the strength of the turbulence are brought up to date; sigma falls from what the mean frame leaves
+    unexplained to the noise or to what the model cannot explain, if that is more; a mask's frames that fit badly start
+    anew from random aberrations, and the object is moved between the pixels to where it fits best. A full pupil has
+    many more minima: each of its frames begins with 16 random candidates, which share one object and of which the
+    worse half is dropped after 30, 100 and 200 iterations, and all but the best after 300.
 
     Parameters
     ----------

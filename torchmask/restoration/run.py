@@ -16,6 +16,7 @@ from torch import Tensor
 from torchmask.io import as_array
 from torchmask.record import Callback, Record
 from torchmask.restoration.checkpoint import Progress, load_checkpoint, save_checkpoint
+from torchmask.restoration.crowd import ITERATIONS, N_CANDIDATES, crowd, select
 from torchmask.restoration.initialization import (
     border_brightness,
     expected_variance,
@@ -35,9 +36,9 @@ if TYPE_CHECKING:
 
 SEGMENT = 100  # iterations between restarts of the descent
 _BLURRED = 300  # iterations after which the object is sharp enough to look for its place and for lost frames
-_RELOCATIONS = 3  # how often that is done at most
+_RELOCATIONS = 7  # how often that is done at most
 _CONTINUATION = 30.0  # the first noise variance: what the mean frame leaves unexplained over this
-_START = 0.7  # rms of the first whitened aberrations of a point-symmetric pupil, and of a second start
+_START = 0.7  # rms of the first whitened aberrations of a full pupil, and of a second start
 _MISSED = 0.005  # of the change from frame to frame, left unexplained by the fit: the object is another one
 _SEED = 0
 _BRIGHT_BORDER = 0.5  # of the mean pixel
@@ -77,7 +78,7 @@ class Restoration:
         change = self.frames - self.frames.mean((1, 2), keepdim=True) * self.frames.mean(0)
         self._change = float((change**2 * precision).mean())
         self._first_excess = max(1.0, self._change / _CONTINUATION)
-        self._symmetric = method.aperture.n_subapertures == 1  # under point reflection, and of many modes
+        self._full = method.aperture.n_subapertures == 1
 
     def __call__(
         self,
@@ -95,7 +96,7 @@ class Restoration:
         if checkpoint is not None and Path(checkpoint).exists():
             progress = self._resume(checkpoint, self._fingerprint(given))
         else:
-            progress = Progress(begin) if start is None else self._warm(begin, start)
+            progress = Progress(self._first(begin, _SEED)) if start is None else self._warm(begin, start)
         blind = len(self.problem.free) == 2 and not self.estimated and start is None
         may_restart = blind and self.method.aberration_prior  # without it, a poor fit is the method's own
         while not progress.message:
@@ -109,18 +110,39 @@ class Restoration:
             result = replace(result, **self._deviations(progress.state, n_samples))
         return replace(result, seconds=time.perf_counter() - started)
 
+    def _descend(self, progress: Progress, problem: JointProblem, n_iterations: int) -> State:
+        n_candidates = len(progress.state.z) // len(self.frames)
+
+        def step(cost: float, evaluations: int, variables: Any) -> None:
+            progress.costs.append(cost / n_candidates)
+            progress.n_evaluations += evaluations * n_candidates
+            self._record(progress, variables)
+
+        left = self.method.max_iterations - progress.iterations
+        return problem.descend(progress.state, min(n_iterations, left), step)
+
+    def _choose(self, progress: Progress, n_candidates: int) -> None:
+        """One stage of several candidates for each frame, of which half are left then, or one at the last."""
+        problem = crowd(self.problem, n_candidates)
+        state = self._update(self._descend(progress, problem, ITERATIONS[n_candidates]), problem)
+        ends = progress.iterations >= self.method.max_iterations
+        progress.state = select(problem, state, n_candidates, 1 if ends else n_candidates // 2)
+        if ends:
+            progress.message = self._exhausted()
+
+    def _exhausted(self) -> str:
+        return f"stopped at max_iterations = {self.method.max_iterations}"
+
     def _advance(self, progress: Progress) -> None:
         """One segment, then what is brought up to date between two."""
+        n_candidates = len(progress.state.z) // len(self.frames)
+        if n_candidates > 1:
+            self._choose(progress, n_candidates)
+            return
         method, problem = self.method, self.problem
         state, done = progress.state, progress.iterations
         before = float(problem.cost(state, state.image, state.z)[0])
-
-        def step(cost: float, evaluations: int, variables: Any) -> None:
-            progress.costs.append(cost)
-            progress.n_evaluations += evaluations
-            self._record(progress, variables)
-
-        progress.state = state = problem.descend(state, min(SEGMENT, method.max_iterations - done), step)
+        progress.state = state = self._descend(progress, problem, SEGMENT)
         after = float(problem.cost(state, state.image, state.z)[0])
         decrease = (before - after) / abs(after)
         goes_on = progress.iterations < method.max_iterations
@@ -132,9 +154,9 @@ class Restoration:
             progress.message = f"converged: the last {SEGMENT} iterations lowered the cost by a fraction {decrease:.1e}"
             return
         if not goes_on:
-            progress.message = f"stopped at max_iterations = {method.max_iterations}"
+            progress.message = self._exhausted()
             return
-        progress.state = self._update(progress.state)
+        progress.state = self._update(progress.state, problem)
 
     def _compare(self, progress: Progress) -> None:
         """At the end of a start: another one if this has missed the object, then the better of both."""
@@ -143,12 +165,22 @@ class Restoration:
             if len(self.frames) > 1 and float(excess - 1) > _MISSED * self._change:
                 progress.rival, progress.rival_message = progress.state, progress.message
                 progress.began, progress.relocations, progress.message = len(progress.costs), 0, ""
-                first = self._begin(None, None)
-                progress.state = replace(first, z=self._random(first.z, _SEED + 1))
+                progress.state = self._first(self._begin(None, None), _SEED + 1)
             return
         if float(self.problem.calibrate(progress.rival).excess.mean()) < float(excess):
             progress.state, progress.message = progress.rival, progress.rival_message
         progress.message += "; the better of two starts, of which one or both missed the object"
+
+    def _first(self, state: State, seed: int) -> State:
+        """The state with the aberrations to begin with: zero for masks at first, random ones from a full pupil.
+
+        Zero is a saddle point of a full pupil: the sign of the even modes of a point-symmetric pupil cannot be seen.
+        """
+        if "aberrations" not in self.problem.free or self.estimated or not (self._full or seed):
+            return state
+        n_candidates = N_CANDIDATES if self._full else 1
+        z = self._random(state.z.repeat(n_candidates, 1), seed)
+        return replace(state, z=z, gains=state.gains.repeat(n_candidates), excess=state.excess.repeat(n_candidates))
 
     def _random(self, z: Tensor, seed: int) -> Tensor:
         """First aberrations like z (T, K) that are not zero."""
@@ -159,26 +191,27 @@ class Restoration:
         return z
 
     def _relocate(self, progress: Progress) -> None:
-        """What no descent does: frames in a local minimum start anew, the object moves between the pixels."""
+        """What no descent does: frames in a local minimum start anew, the object moves between the pixels.
+
+        Those of a full pupil have had their starts.
+        """
         progress.relocations += 1
-        excess = self.problem.calibrate(progress.state).excess
-        state, evaluations = repair(self.problem, progress.state, excess, self._first_excess, seed=progress.relocations)
-        progress.n_evaluations += evaluations
+        state = progress.state
+        if not self._full:
+            excess = self.problem.calibrate(state).excess
+            state, evaluations = repair(self.problem, state, excess, self._first_excess, seed=progress.relocations)
+            progress.n_evaluations += evaluations
         if "object" in self.problem.free:
             state = centre_on_pixels(self.problem, state)
         if state is progress.state:  # all is where it belongs
             progress.relocations = _RELOCATIONS
         progress.state = state
 
-    def _update(self, state: State) -> State:
-        """Gains, excess noise and strength of the turbulence as the state itself tells them.
-
-        The excess is common to all frames: those that fit badly are what draws a wrong object to the right one.
-        """
-        state = self.problem.calibrate(state)
-        state = replace(state, excess=state.excess.mean().expand_as(state.excess).clone())
+    def _update(self, state: State, problem: JointProblem) -> State:
+        """Gains, excess noise and strength of the turbulence as the state itself tells them."""
+        state = _of_equal_excess(problem.calibrate(state))
         if state.prior and "aberrations" in self.problem.free:
-            state = replace(state, z=self.model.unwrapped(state.z, self.problem.centre))
+            state = replace(state, z=self.model.unwrapped(state.z, problem.centre))
         r0_is_open = self.method.aberration_prior and not self.method.known_r0 and not self.estimated
         if not r0_is_open or "aberrations" not in self.problem.free:
             return state
@@ -191,9 +224,6 @@ class Restoration:
         grid, shape = self.method.grid, (len(self.frames), self.model.n_parameters)
         image = mean_frame(self.frames, self.model.field).double()
         z = torch.zeros(shape, dtype=torch.float64, device=image.device)
-        if self._symmetric:
-            # Zero is a saddle point there: the sign of the even modes of a point-symmetric pupil cannot be seen.
-            z = self._random(z, _SEED)
         if coefficients is not None:
             expected = (len(z), self.method.aperture.n_subapertures, self.method.n_modes)
             if tuple(coefficients.shape) != expected:
@@ -241,6 +271,12 @@ class Restoration:
                 progress.n_evaluations += evaluations
 
             part = replace(progress.state, z=z[known:], gains=state.gains[known:], excess=state.excess[known:])
+            part = self._first(part, _SEED)
+            part.z[:, own:] = z[0, own:]
+            while (n_candidates := len(part.z) // (len(z) - known)) > 1:
+                several = crowd(fresh, n_candidates)
+                part = several.descend(part, ITERATIONS[n_candidates], count)
+                part = select(several, _of_equal_excess(several.calibrate(part)), n_candidates, n_candidates // 2)
             z[known:] = fresh.descend(part, SEGMENT, count).z
         return progress
 
@@ -251,7 +287,8 @@ class Restoration:
         if step == 1 or step % 10 == 0:
             image, z = variables()
             rows, columns = self.method.grid.shape
-            arrays = {"object": image[:rows, :columns] * self.unit, "coefficients": self._coefficients(z)}
+            coefficients = self._coefficients(z[: len(self.frames)])
+            arrays = {"object": image[:rows, :columns] * self.unit, "coefficients": coefficients}
         scalars = {"cost": progress.costs[-1]}
         self.callback(Record("restoration", step, progress.began + self.method.max_iterations, scalars, arrays))
 
@@ -320,3 +357,8 @@ class Restoration:
             n_evaluations=progress.n_evaluations,
             seconds=0.0,
         )
+
+
+def _of_equal_excess(state: State) -> State:
+    """Common to all frames: those that fit badly are what draws a wrong object to the right one."""
+    return replace(state, excess=state.excess.mean().expand_as(state.excess).clone())
