@@ -266,9 +266,11 @@ class Restoration:
         progress = Progress(replace(state, image=image, z=z), relocations=_RELOCATIONS)
         if known < len(z) and "aberrations" in self.problem.free:
             fresh = self.problem.of_frames(slice(known, None), free=("aberrations",), static=False)
+            n_frames = 0
 
             def count(cost: float, evaluations: int, variables: Any) -> None:
-                progress.n_evaluations += evaluations
+                nonlocal n_frames
+                n_frames += evaluations * len(part.z)
 
             part = replace(progress.state, z=z[known:], gains=state.gains[known:], excess=state.excess[known:])
             part = self._first(part, _SEED)
@@ -278,6 +280,7 @@ class Restoration:
                 part = several.descend(part, ITERATIONS[n_candidates], count)
                 part = select(several, _of_equal_excess(several.calibrate(part)), n_candidates, n_candidates // 2)
             z[known:] = fresh.descend(part, SEGMENT, count).z
+            progress.n_evaluations = n_frames // len(z)
         return progress
 
     def _record(self, progress: Progress, variables: Any) -> None:
