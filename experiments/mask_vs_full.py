@@ -7,9 +7,10 @@
 
 Both instruments look at the same scene through the same screens, and both are restored by the library's defaults with
 equal iterations. The full pupil reaches as far as the mask and receives photons in proportion to its area. Its many
-modes make many local minima, so it is restored from several starts, and the one that fits its frames best is kept; the
-mask starts from zero aberrations, once. The floor of each instrument is the same restoration with the true aberrations
-given. What is found follows from the numbers, by the paired ratio of scores over scenes and seeds.
+modes make many local minima, so each of its frames begins with 16 candidates, and of --restarts restorations the one
+that fits its frames best is kept; the mask starts from zero aberrations, once. The floor of each instrument is the same
+restoration with the true aberrations given. What is found follows from the numbers, by the paired ratio of scores over
+scenes and seeds.
 
 The figure, the table and the numbers go to a new folder, runs/<name>/; every restoration is kept in --sweep, so that a
 run that was stopped, or a wider grid, goes on from there.
@@ -83,8 +84,8 @@ class Config:
     """Of the image, per side."""
     iterations: int = 600
     """At most, of every restoration."""
-    restarts: int = 2
-    """Starts of the full pupil."""
+    restarts: int = 1
+    """Restorations of the full pupil."""
     mask: Path | None = None
     """A mask to use (.json, .dxf or .fits); None: the best that a search finds."""
     n_subapertures: int = 11
@@ -119,7 +120,7 @@ def with_presets(config: Config) -> Config:
         raise ValueError("full and smoke are both given: choose one")
     if config.full:
         whole = {"photons": (1e4, 1e5, 1e6, 1e7, 1e8), "d_over_r0": (3.0, 5.0, 7.0, 10.0, 15.0)}
-        whole |= {"seeds": (0, 1, 2, 3, 4), "n_frames": 20, "n_pixels": 128, "iterations": 1000, "restarts": 4}
+        whole |= {"seeds": (0, 1, 2, 3, 4), "n_frames": 20, "n_pixels": 128, "iterations": 1000, "restarts": 2}
         config = dataclasses.replace(config, **whole)
     if config.smoke:
         tiny: dict[str, Any] = {"photons": (1e5, 1e6), "d_over_r0": (3.0,), "seeds": (0, 1), "views": 1, "n_frames": 2}
@@ -342,15 +343,15 @@ def findings(cells: Sequence[Mapping[str, Any]]) -> list[str]:
 def markdown(config: Config, mask: SparseAperture, cells: Sequence[Mapping[str, Any]]) -> str:
     """The numbers, for readers."""
     n_scenes, light = len(scenes(config)), FullAperture(mask.extent).area / mask.area
-    starts = f"{config.restarts} start{'s' if config.restarts > 1 else ''}"
+    kept = f"Of {config.restarts} restorations of the full pupil the lowest chi-square is kept. "
     lines = [
         "# Mask against full pupil",
         "",
         f"{mask.n_subapertures} holes, fill factor {mask.fill_factor:.3g}; the full pupil reaches as far and gets "
         f"{light:.2f} times the photons. {config.n_frames} frames of {config.n_pixels} x {config.n_pixels} pixels, "
         f"{config.readout_noise:g} electrons of read-out noise, outer scale {config.outer_scale:g} D, {n_scenes} "
-        f"scenes, {len(config.seeds)} seeds. At most {config.iterations} iterations; the full pupil from {starts}: "
-        "the lowest chi-square is kept. Scores are relative errors up to the diffraction limit, geometric "
+        f"scenes, {len(config.seeds)} seeds. At most {config.iterations} iterations. "
+        f"{kept if config.restarts > 1 else ''}Scores are relative errors up to the diffraction limit, geometric "
         "means over draws; the floor knows the true aberrations; the ratio is paired, with its interval at "
         f"{100 * CONFIDENCE:g} %.",
         "",

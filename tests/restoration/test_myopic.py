@@ -365,9 +365,17 @@ def test_refuses_shapes_that_disagree(observation, known):
 
 @pytest.mark.slow
 @pytest.mark.skipif(not STACKS.is_dir(), reason="the reference stacks lie beside the checkout")
-@pytest.mark.parametrize(("name", "limit"), [("skylab_1e7_mask", 0.065), ("mgs_1e6_mask", 0.1385)])
+@pytest.mark.parametrize(
+    ("name", "limit"),
+    [("skylab_1e7_mask", 0.065), ("mgs_1e6_mask", 0.1385), ("skylab_1e7_full", 0.0737), ("mgs_1e6_full", 0.087)],
+)
 def test_reference_stacks(name, limit):
-    """One call, nothing known but the instrument; the limits are those measured plus 2 % for another platform."""
+    """One call, nothing known but the instrument.
+
+    The limits of the masks are those measured plus 2 % for another platform. A full pupil ends in another minimum
+    after another rounding: the limits are a lead of 1.5 over the best peer on Skylab, and what a single start reached
+    on Mars Global Surveyor, where candidates have 0.076 with a standard deviation of 0.006 over seeds.
+    """
     stack = Observation.load(STACKS / f"{name}.npz")
     started = time.process_time()
     result = MyopicDeconvolution(stack.aperture, stack.grid).restore(stack.frames)
