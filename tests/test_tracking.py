@@ -180,9 +180,10 @@ def test_an_interrupted_run_is_readable_with_what_was_reached(tmp_path, error, s
 
 
 LOG_FOR_EVER = """
-import itertools, sys, torch
+import itertools, signal, sys, torch
 from torchmask import tracking
 from torchmask.record import Record
+signal.signal(signal.SIGINT, signal.default_int_handler)  # tests that run in the background inherit a deaf ear to it
 tracking._CHECKPOINT_INTERVAL = 0.05
 with tracking.RunLogger(sys.argv[1]) as log:
     for step in itertools.count(1):
@@ -198,7 +199,10 @@ def test_a_stopped_process_leaves_a_readable_folder(tmp_path, stop):
             assert process.poll() is None, process.stderr.read().decode()
             time.sleep(0.02)
         os.kill(process.pid, stop)
-        _, printed = process.communicate(timeout=60)
+        try:
+            _, printed = process.communicate(timeout=60)
+        finally:
+            process.kill()  # what goes on for ever would keep the test waiting
     rows = read_metrics(folder)
     assert [row["step"] for row in rows] == list(range(1, len(rows) + 1))
     state = load_npz(folder / "checkpoints" / "fit.npz", ["x", "step"])

@@ -20,7 +20,7 @@ ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "2", "RAY_AUTH_MODE": "disabled"
 
 # Tasks leave a mark when they start and when they end, so that what was computed can be counted from outside.
 SWEEP = """
-import os, sys, time
+import os, signal, sys, time
 from pathlib import Path
 import torch
 from torchmask.design.sweep import run_tasks
@@ -35,6 +35,7 @@ def slow(task):
     return {"square": task["x"] ** 2, "threads": torch.get_num_threads(), "pid": os.getpid()}
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background inherit a deaf ear to it
     tasks = [{"x": float(x)} for x in range(10)]
     result = run_tasks(slow, tasks, sys.argv[1], stage="square", backend=sys.argv[3], n_workers=2)
     assert [r["square"] for r in result] == [t["x"] ** 2 for t in tasks]
