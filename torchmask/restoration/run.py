@@ -193,11 +193,11 @@ class Restoration:
     def _relocate(self, progress: Progress) -> None:
         """What no descent does: frames in a local minimum start anew, the object moves between the pixels.
 
-        Those of a full pupil have had their starts.
+        Those of a full pupil have had their starts, unless they began where a sensor saw them.
         """
         progress.relocations += 1
         state = progress.state
-        if not self._full:
+        if self.estimated or not self._full:
             excess = self.problem.calibrate(state).excess
             state, evaluations = repair(self.problem, state, excess, self._first_excess, seed=progress.relocations)
             progress.n_evaluations += evaluations
