@@ -6,6 +6,7 @@ import hashlib
 import math
 import time
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -124,7 +125,7 @@ class Restoration:
     def _choose(self, progress: Progress, n_candidates: int) -> None:
         """One stage of several candidates for each frame, of which half are left then, or one at the last."""
         problem = crowd(self.problem, n_candidates)
-        state = self._update(self._descend(progress, problem, ITERATIONS[n_candidates]), problem)
+        state = self._update(self._descend(progress, problem, ITERATIONS[n_candidates]), problem, _of_equal_excess)
         ends = progress.iterations >= self.method.max_iterations
         progress.state = select(problem, state, n_candidates, 1 if ends else n_candidates // 2)
         if ends:
@@ -156,7 +157,8 @@ class Restoration:
         if not goes_on:
             progress.message = self._exhausted()
             return
-        progress.state = self._update(progress.state, problem)
+        weighed = _of_own_excess if progress.relocations == _RELOCATIONS else _of_equal_excess
+        progress.state = self._update(progress.state, problem, weighed)
 
     def _compare(self, progress: Progress) -> None:
         """At the end of a start: another one if this has missed the object, then the better of both."""
@@ -207,9 +209,9 @@ class Restoration:
             progress.relocations = _RELOCATIONS
         progress.state = state
 
-    def _update(self, state: State, problem: JointProblem) -> State:
+    def _update(self, state: State, problem: JointProblem, weighed: Callable[[State], State]) -> State:
         """Gains, excess noise and strength of the turbulence as the state itself tells them."""
-        state = _of_equal_excess(problem.calibrate(state))
+        state = weighed(problem.calibrate(state))
         if state.prior and "aberrations" in self.problem.free:
             state = replace(state, z=self.model.unwrapped(state.z, problem.centre))
         r0_is_open = self.method.aberration_prior and not self.method.known_r0 and not self.estimated
@@ -365,3 +367,8 @@ class Restoration:
 def _of_equal_excess(state: State) -> State:
     """Common to all frames: those that fit badly are what draws a wrong object to the right one."""
     return replace(state, excess=state.excess.mean().expand_as(state.excess).clone())
+
+
+def _of_own_excess(state: State) -> State:
+    """Squared: what the model cannot explain in a frame harms the object more than white noise of that power would."""
+    return replace(state, excess=state.excess**2)
