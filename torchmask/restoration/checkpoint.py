@@ -17,7 +17,8 @@ from torchmask.restoration.problem import State
 class Progress:
     """Everything a later segment of a restoration depends on.
 
-    began : iterations before the present start; rival : where an earlier start ended, and rival_message why
+    starts : how many there were, with the present one; began : iterations before it
+    rival : where the best of the earlier ones ended, and rival_message why
     relocations : how often lost frames and the object's place have been looked for
     message : why it stopped, empty until then
     """
@@ -26,6 +27,7 @@ class Progress:
     costs: list[float] = field(default_factory=list)
     n_evaluations: int = 0
     relocations: int = 0
+    starts: int = 1
     began: int = 0
     rival: State | None = None
     rival_message: str = ""
@@ -37,7 +39,7 @@ class Progress:
         return len(self.costs) - self.began
 
 
-_NUMBERS = ("n_evaluations", "relocations", "began")
+_NUMBERS = ("n_evaluations", "relocations", "starts", "began")
 _TEXTS = ("rival_message", "message")
 
 

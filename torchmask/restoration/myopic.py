@@ -35,7 +35,9 @@ class MyopicDeconvolution(nn.Module):
     frame. It restarts every 100 iterations: then the scales, the transmission g_t of each frame and, if r0 is not
     given, the strength of the turbulence are brought up to date; sigma falls from what the mean frame leaves
     unexplained to the noise or to what the model cannot explain, if that is more; a mask's frames that fit badly start
-    anew from random aberrations, and the object is moved between the pixels to where it fits best. A full pupil has
+    anew from random aberrations, and the object is moved between the pixels to where it fits best. When nothing moves
+    any more, each frame has its own sigma: a frame that fits n times worse than the best then counts n^2 times less,
+    so that one which no aberrations explain (smeared, or in a local minimum) does little harm. A full pupil has
     many more minima: each of its frames begins with 16 random candidates, which share one object and of which the
     worse half is dropped after 30, 100 and 200 iterations, and all but the best after 300.
 
@@ -62,8 +64,9 @@ class MyopicDeconvolution(nn.Module):
     aberration_prior : bool
         False leaves out 1/2 ||z||^2; z are the Zernike coefficients then.
     max_iterations : int
-        Of a start. A restoration that leaves 0.5 % of the change from frame to frame unexplained has missed the object:
-        it starts once more, from random aberrations, and the better of both is kept.
+        Of a start. A restoration that leaves 0.2 % of the change from frame to frame unexplained, and more than the
+        noise can leave, may have missed the object: it starts again from random aberrations, up to three times as long
+        as that is so and no two end alike, and the best is kept.
     tolerance : float
         Converged when 100 iterations lower the cost by less than this fraction.
     dtype : torch.dtype

@@ -40,7 +40,10 @@ _BLURRED = 300  # iterations after which the object is sharp enough to look for 
 _RELOCATIONS = 7  # how often that is done at most
 _CONTINUATION = 30.0  # the first noise variance: what the mean frame leaves unexplained over this
 _START = 0.7  # rms of the first whitened aberrations of a full pupil, and of a second start
-_MISSED = 0.005  # of the change from frame to frame, left unexplained by the fit: the object is another one
+_MISSED = 0.002  # of the change from frame to frame, left unexplained by the fit: the object is another one
+_CHANCE = 2.0  # standard deviations of a frame's chi-square, left to noise
+_STARTS = 4  # at most, for objects that were missed
+_ALIKE = 0.03  # relative difference of what two starts leave unexplained
 _SEED = 0
 _BRIGHT_BORDER = 0.5  # of the mean pixel
 
@@ -79,6 +82,8 @@ class Restoration:
         change = self.frames - self.frames.mean((1, 2), keepdim=True) * self.frames.mean(0)
         self._change = float((change**2 * precision).mean())
         self._first_excess = max(1.0, self._change / _CONTINUATION)
+        noise = math.sqrt(2 / math.prod(frames.shape[1:]))  # of the chi-square per pixel of one frame
+        self._tolerable = max(_MISSED * self._change, _CHANCE * noise)
         self._full = method.aperture.n_subapertures == 1
 
     def __call__(
@@ -99,7 +104,8 @@ class Restoration:
         else:
             progress = Progress(self._first(begin, _SEED)) if start is None else self._warm(begin, start)
         blind = len(self.problem.free) == 2 and not self.estimated and start is None
-        may_restart = blind and self.method.aberration_prior  # without it, a poor fit is the method's own
+        # Without a prior a poor fit is the method's own.
+        may_restart = blind and self.method.aberration_prior and len(self.frames) > 1
         while not progress.message:
             self._advance(progress)
             if progress.message and may_restart and progress.iterations > _BLURRED:
@@ -161,17 +167,28 @@ class Restoration:
         progress.state = self._update(progress.state, problem, weighed)
 
     def _compare(self, progress: Progress) -> None:
-        """At the end of a start: another one if this has missed the object, then the better of both."""
-        excess = self.problem.calibrate(progress.state).excess.mean()
-        if progress.rival is None:
-            if len(self.frames) > 1 and float(excess - 1) > _MISSED * self._change:
-                progress.rival, progress.rival_message = progress.state, progress.message
-                progress.began, progress.relocations, progress.message = len(progress.costs), 0, ""
-                progress.state = self._first(self._begin(None, None), _SEED + 1)
-            return
-        if float(self.problem.calibrate(progress.rival).excess.mean()) < float(excess):
-            progress.state, progress.message = progress.rival, progress.rival_message
-        progress.message += "; the better of two starts, of which one or both missed the object"
+        """At the end of a start: the best so far, and another one if that has missed the object.
+
+        Two that end alike have found what there is to be found.
+        """
+        excess = self._unexplained(progress.state)
+        best, alike = excess, False
+        if progress.rival is not None:
+            before = self._unexplained(progress.rival)
+            best, alike = min(before, excess), abs(before - excess) < _ALIKE * min(before, excess)
+            if before < excess:
+                progress.state, progress.message = progress.rival, progress.rival_message
+        if best > self._tolerable and not alike and progress.starts < _STARTS:
+            progress.rival, progress.rival_message = progress.state, progress.message
+            progress.began, progress.relocations, progress.message = len(progress.costs), 0, ""
+            progress.state = self._first(self._begin(None, None), _SEED + progress.starts)
+            progress.starts += 1
+        elif progress.starts > 1:
+            progress.message += f"; the best of {progress.starts} starts, of which some missed the object"
+
+    def _unexplained(self, state: State) -> float:
+        """Variance of the residuals above that of the noise, over the latter."""
+        return float(self.problem.calibrate(state).excess.mean()) - 1
 
     def _first(self, state: State, seed: int) -> State:
         """The state with the aberrations to begin with: zero for masks at first, random ones from a full pupil.
@@ -370,5 +387,5 @@ def _of_equal_excess(state: State) -> State:
 
 
 def _of_own_excess(state: State) -> State:
-    """Squared: what the model cannot explain in a frame harms the object more than white noise of that power would."""
-    return replace(state, excess=state.excess**2)
+    """Relative to the best frame squared: what the model cannot explain harms more than white noise of that power."""
+    return replace(state, excess=state.excess**2 / state.excess.min())
