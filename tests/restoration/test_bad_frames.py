@@ -131,4 +131,4 @@ def test_frames_that_no_aberration_explains_do_little_harm():
     patient = method(max_iterations=600)
     alone = score(patient.restore(short).object, seen.object, 0.5)
     together = score(patient.restore(torch.cat([short, smeared])).object, seen.object, 0.5)
-    assert together < 1.2 * alone
+    assert together < 1.4 * alone

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -16,6 +17,7 @@ from torchmask.restoration.crowd import ITERATIONS, N_CANDIDATES, crowd, select
 from torchmask.restoration.model import ExposureModel
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.problem import JointProblem, State
+from torchmask.restoration.run import Restoration
 from torchmask.simulation.observation import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
 
@@ -58,6 +60,14 @@ def test_a_crowd_costs_as_much_as_its_members_one_by_one():
     assert float((by_aberrations - expected).norm() / expected.norm()) < rounding
     assert alone.model.basis.dtype == torch.float64  # the crowd's single precision is its own
     assert by_aberrations.dtype == torch.float64
+
+
+@pytest.mark.parametrize(("full", "expected"), [(True, [2.0, 8.0, 18.0]), (False, [2.0, 4.0, 6.0])])
+def test_frames_are_weighed_by_how_well_they_fit(full, expected):
+    """Against the best frame, by the square through a full pupil."""
+    _, state = problem()
+    few = dataclasses.replace(one_of(state, 0), excess=torch.tensor([2.0, 4.0, 6.0], dtype=torch.float64))
+    assert Restoration._of_own_excess(SimpleNamespace(_full=full), few).excess.tolist() == expected
 
 
 @pytest.mark.parametrize("n_kept", [1, 2])

@@ -36,8 +36,8 @@ class MyopicDeconvolution(nn.Module):
     given, the strength of the turbulence are brought up to date; sigma falls from what the mean frame leaves
     unexplained to the noise or to what the model cannot explain, if that is more; a mask's frames that fit badly start
     anew from random aberrations, and the object is moved between the pixels to where it fits best. When nothing moves
-    any more, each frame has its own sigma: a frame that fits n times worse than the best then counts n^2 times less,
-    so that one which no aberrations explain (smeared, or in a local minimum) does little harm. A full pupil has
+    any more, each frame has its own sigma, so that one which no aberrations explain does little harm: a frame whose
+    chi-square is n times that of the best counts n times less, or n^2 times through a full pupil. A full pupil has
     many more minima: each of its frames begins with 16 random candidates, which share one object and of which the
     worse half is dropped after 30, 100 and 200 iterations, and all but the best after 300.
 

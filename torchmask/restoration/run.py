@@ -163,8 +163,8 @@ class Restoration:
         if not goes_on:
             progress.message = self._exhausted()
             return
-        weighed = _of_own_excess if progress.relocations == _RELOCATIONS else _of_equal_excess
-        progress.state = self._update(progress.state, problem, weighed)
+        at_last = progress.relocations == _RELOCATIONS
+        progress.state = self._update(progress.state, problem, self._of_own_excess if at_last else _of_equal_excess)
 
     def _compare(self, progress: Progress) -> None:
         """At the end of a start: the best so far, and another one if that has missed the object.
@@ -238,6 +238,14 @@ class Restoration:
         mixing = self.model.mixing[:, :own]
         strength = turbulence_strength(self._coefficients(state.z[:, :own], mixing), mixing)
         return state if strength is None else replace(state, prior=1 / strength)
+
+    def _of_own_excess(self, state: State) -> State:
+        """Each frame weighed by how well it fits.
+
+        That of a full pupil by the square: what is left there comes from another minimum and harms more than white
+        noise of that power, whereas that of a mask comes from the modes left out.
+        """
+        return replace(state, excess=state.excess**2 / state.excess.min()) if self._full else state
 
     def _begin(self, coefficients: Tensor | None, known_object: Tensor | None) -> State:
         grid, shape = self.method.grid, (len(self.frames), self.model.n_parameters)
@@ -384,8 +392,3 @@ class Restoration:
 def _of_equal_excess(state: State) -> State:
     """Common to all frames: those that fit badly are what draws a wrong object to the right one."""
     return replace(state, excess=state.excess.mean().expand_as(state.excess).clone())
-
-
-def _of_own_excess(state: State) -> State:
-    """Relative to the best frame squared: what the model cannot explain harms more than white noise of that power."""
-    return replace(state, excess=state.excess**2 / state.excess.min())
