@@ -1,6 +1,6 @@
 """Where a mask gives the better image, and where the full pupil does, over flux and turbulence.
 
-    python experiments/mask_vs_full.py                             # a reduced grid: 20 to 30 minutes on two cores
+    python experiments/mask_vs_full.py                             # a reduced grid: half an hour on two cores
     python experiments/mask_vs_full.py --full                      # photons 1e4 to 1e8, D/r0 3 to 15, five seeds
     python experiments/mask_vs_full.py --scenes model.obj          # further scenes: meshes or images
     python experiments/mask_vs_full.py --smoke                     # everything, tiny, in seconds
@@ -390,6 +390,9 @@ def figure(cells: Sequence[Mapping[str, Any]]) -> Figure:
         ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
         ax.yaxis.set_major_formatter("{x:g}")
         ax.yaxis.set_minor_locator(NullLocator())
+    # The row shares one axis, which must hold the bars of all its panels.
+    seen = [cell[key] for cell in cells for key in ("ratio", "ratio_low", "ratio_high") if 0 < cell[key] < math.inf]
+    axes[1, 0].set_ylim(0.8 * min([*seen, 1.0]), 1.25 * max([*seen, 1.0]))
     axes[0, 0].set_ylabel("score (0 is perfect)")
     axes[1, 0].set_ylabel("score, mask / full pupil")
     handles, labels = axes[0, 0].get_legend_handles_labels()
@@ -412,8 +415,6 @@ def panel(top: Axes, bottom: Axes, cells: Sequence[Mapping[str, Any]]) -> None:
     bottom.axhspan(1e-9, 1, color=COLORS[0], alpha=0.07, linewidth=0)
     bottom.axhline(1, color=FAINT, linewidth=0.8)
     bottom.errorbar(photons, ratio, bars, color="#222222", marker="o", **style)
-    seen = [value for cell in cells for value in (cell["ratio_low"], cell["ratio_high"]) if 0 < value < math.inf]
-    bottom.set_ylim(0.8 * min([*ratio, *seen, 1.0]), 1.25 * max([*ratio, *seen, 1.0]))
     bottom.text(0.03, 0.04, "the mask wins", color=COLORS[0], fontsize=7, transform=bottom.transAxes)
 
 
