@@ -272,6 +272,18 @@ def test_starts_that_end_alike_are_the_last(observation, monkeypatch):
 
 
 @pytest.mark.slow
+def test_noise_alone_is_no_reason_for_another_start(monkeypatch):
+    """In faint frames it is more than the share of the change from frame to frame that a good fit may leave."""
+    faint = observe(n_frames=4, n_photons=2e4)
+    for name, value in {"_BLURRED": 50, "_RELOCATIONS": 0}.items():
+        monkeypatch.setattr(f"torchmask.restoration.run.{name}", value)
+    method = MyopicDeconvolution(mask(), GRID, 3, r0=R0, readout_noise=READOUT, tolerance=0.01)
+    assert "starts" not in method.restore(faint.frames).message
+    monkeypatch.setattr("torchmask.restoration.run._CHANCE", 0.0)
+    assert "starts" in method.restore(faint.frames).message
+
+
+@pytest.mark.slow
 def test_further_starts_that_are_worse_change_nothing(observation, monkeypatch):
     for name, value in {"_BLURRED": 50, "_RELOCATIONS": 0, "_MISSED": math.inf}.items():
         monkeypatch.setattr(f"torchmask.restoration.run.{name}", value)

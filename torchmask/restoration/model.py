@@ -162,7 +162,12 @@ class ExposureModel(nn.Module):
 
     def pupil_field(self, z: Tensor) -> Tensor:
         """Complex field (T, P) on the open samples of the pupil."""
-        phase = z.to(self.basis.dtype) @ self.basis.T
+        return self._field(self._phase(z))
+
+    def _phase(self, z: Tensor) -> Tensor:
+        return z.to(self.basis.dtype) @ self.basis.T
+
+    def _field(self, phase: Tensor) -> Tensor:
         return torch.complex(self.weights * phase.cos(), self.weights * phase.sin())  # faster than torch.polar
 
     def amplitude(self, field: Tensor) -> Tensor:
@@ -210,11 +215,12 @@ class ExposureModel(nn.Module):
         shape = self.field.shape
         spectrum = torch.fft.rfft2(image.to(self.basis.dtype))
         conjugate = spectrum.conj().resolve_conj()
-        pupil = self.pupil_field(z)
+        phase = self._phase(z)  # of all frames at once: one large matrix product is faster than many small ones
 
         @torch.no_grad()  # which holds for one thread only
         def compare(part: slice) -> tuple[Tensor, Tensor | None, Tensor | None]:
-            amplitude = self.amplitude(pupil[part])
+            pupil = self._field(phase[part])
+            amplitude = self.amplitude(pupil)
             transfer = torch.fft.rfft2(_intensity(amplitude))
             model = torch.fft.irfft2(transfer * spectrum, s=shape)
             error = model[:, : self.grid.shape[0], : self.grid.shape[1]] - frames[part]
@@ -227,7 +233,7 @@ class ExposureModel(nn.Module):
             if not want_aberrations:
                 return value, by_object, None
             psf_gradient = torch.fft.irfft2(back * conjugate, s=shape)
-            return value, by_object, self.pull_back(pupil[part], amplitude, psf_gradient)
+            return value, by_object, self.pull_back(pupil, amplitude, psf_gradient)
 
         values, by_object, slopes = zip(*parallel(compare, self.chunks(len(z))), strict=True)
         return Misfit(

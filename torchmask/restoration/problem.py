@@ -29,7 +29,8 @@ class State:
     z : (T, K) aberrations, the last `model.n_static` of them the same in every frame
     gains : (T,) transmission of the frames, 1 on average
     prior : weight of ||z||^2 / 2, which follows the strength of the turbulence
-    excess : (T,) variance of a frame's residuals over that of its noise, at least 1
+    excess : (T,) divides a frame's precision: variance of its residuals over that of its noise, at least 1, or what is
+        made of it
     """
 
     image: Tensor
@@ -93,7 +94,12 @@ class JointProblem:
 
     def cost(self, state: State, image: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The cost with the gains and prior of `state`, and its gradients in image and z (zero where not free)."""
-        frames, precision = self.scaled_data(state)
+        return self._cost(self.scaled_data(state), state, image, z)
+
+    def _cost(
+        self, data: tuple[Tensor, Tensor], state: State, image: Tensor, z: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        frames, precision = data
         by_object, by_aberrations = ("object" in self.free), ("aberrations" in self.free)
         misfit = self.model.misfit(
             image,
@@ -144,13 +150,14 @@ class JointProblem:
     def descend(self, state: State, n_iterations: int, progress: Callable[[float, int, Any], None]) -> State:
         """L-BFGS from `state`; `progress(cost, evaluations, function giving (image, z))` after every iteration."""
         image_scale, z_scale = self.scales(state)
+        data = self.scaled_data(state)
         n, seen = state.image.numel(), 0
 
         def split(x: Tensor) -> tuple[Tensor, Tensor]:
             return x[:n].view_as(state.image) * image_scale, x[n:].view_as(state.z) * z_scale
 
         def cost(x: Tensor) -> tuple[float, Tensor]:
-            value, image_gradient, z_gradient = self.cost(state, *split(x))
+            value, image_gradient, z_gradient = self._cost(data, state, *split(x))
             return float(value), torch.cat([(image_gradient * image_scale).flatten(), (z_gradient * z_scale).flatten()])
 
         def after(x: Tensor, value: float, evaluations: int) -> None:

@@ -39,7 +39,7 @@ SEGMENT = 100  # iterations between restarts of the descent
 _BLURRED = 300  # iterations after which the object is sharp enough to look for its place and for lost frames
 _RELOCATIONS = 7  # how often that is done at most
 _CONTINUATION = 30.0  # the first noise variance: what the mean frame leaves unexplained over this
-_START = 0.7  # rms of the first whitened aberrations of a full pupil, and of a second start
+_START = 0.7  # rms of the first whitened aberrations of a full pupil, and of further starts
 _MISSED = 0.002  # of the change from frame to frame, left unexplained by the fit: the object is another one
 _CHANCE = 2.0  # standard deviations of a frame's chi-square, left to noise
 _STARTS = 4  # at most, for objects that were missed
@@ -195,7 +195,7 @@ class Restoration:
 
         Zero is a saddle point of a full pupil: the sign of the even modes of a point-symmetric pupil cannot be seen.
         """
-        if "aberrations" not in self.problem.free or self.estimated or not (self._full or seed):
+        if "aberrations" not in self.problem.free or self.estimated or not (self._full or seed != _SEED):
             return state
         n_candidates = N_CANDIDATES if self._full else 1
         z = self._random(state.z.repeat(n_candidates, 1), seed)
