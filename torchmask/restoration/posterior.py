@@ -23,7 +23,7 @@ from torchmask.restoration.linearization import Linearization
 from torchmask.restoration.priors import divergence, gradient
 from torchmask.restoration.problem import JointProblem, State
 
-_REACH = 1.0  # resolution elements (1 / cut-off) over which an object's gradients are alike
+_REACH = 0.7  # resolution elements (1 / cut-off) over which gradients are alike: 0.5 to 1.4 tried, docs/restoration.md
 _ROUNDS, _FEW = 3, 6  # of expectation maximisation, and its samples, which the mean over the reach makes enough
 _LEAST = 1e-6  # of the largest: dark parts have a prior too, and aberrations without curvature a scale and a hold
 _BATCH = 8  # samples at once, each of which takes the memory of several stacks
