@@ -176,6 +176,11 @@ class JointProblem:
 
     def calibrate(self, state: State) -> State:
         """The state with the gains that fit best, 1 on average, and the excess that is left then."""
+        gains, chi_square = self.fit_of_frames(state)
+        return replace(state, gains=gains / gains.mean(), excess=chi_square.clamp(min=1))
+
+    def fit_of_frames(self, state: State) -> tuple[Tensor, Tensor]:
+        """The gain (T,) at which each frame fits best, and what its residuals are then: chi-square per pixel (T,)."""
         gains, squares = [], []
         for part in self.model.chunks(len(state.z)):
             frames, model = self.frames[part], self.model(state.image, state.z[part])
@@ -184,5 +189,4 @@ class JointProblem:
             gains.append(gain)
             error = (precision * (frames - gain[:, None, None] * model) ** 2).sum((1, 2))
             squares.append(error / (precision > 0).sum((1, 2)).clamp(min=1))
-        gain = torch.cat(gains).to(state.z).clamp(min=_LEAST_GAIN)
-        return replace(state, gains=gain / gain.mean(), excess=torch.cat(squares).to(state.z).clamp(min=1))
+        return torch.cat(gains).to(state.z).clamp(min=_LEAST_GAIN), torch.cat(squares).to(state.z)

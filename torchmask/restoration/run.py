@@ -40,8 +40,8 @@ _BLURRED = 300  # iterations after which the object is sharp enough to look for 
 _RELOCATIONS = 7  # how often that is done at most
 _CONTINUATION = 30.0  # the first noise variance: what the mean frame leaves unexplained over this
 _START = 0.7  # rms of the first whitened aberrations of a full pupil, and of further starts
-_MISSED = 0.002  # of the change from frame to frame, left unexplained by the fit: the object is another one
-_CHANCE = 2.0  # standard deviations of a frame's chi-square, left to noise
+_MISSED = 0.0013  # of the change from frame to frame, left unexplained by the fit: the object is another one
+_CHANCE = 2.0  # standard deviations of the stack's chi-square, left to noise
 _STARTS = 4  # at most, for objects that were missed
 _ALIKE = 0.03  # relative difference of what two starts leave unexplained
 _SEED = 0
@@ -82,7 +82,7 @@ class Restoration:
         change = self.frames - self.frames.mean((1, 2), keepdim=True) * self.frames.mean(0)
         self._change = float((change**2 * precision).mean())
         self._first_excess = max(1.0, self._change / _CONTINUATION)
-        noise = math.sqrt(2 / math.prod(frames.shape[1:]))  # of the chi-square per pixel of one frame
+        noise = math.sqrt(2 / frames.numel())  # of the chi-square per pixel
         self._tolerable = max(_MISSED * self._change, _CHANCE * noise)
         self._full = method.aperture.n_subapertures == 1
 
@@ -175,7 +175,7 @@ class Restoration:
         best, alike = excess, False
         if progress.rival is not None:
             before = self._unexplained(progress.rival)
-            best, alike = min(before, excess), abs(before - excess) < _ALIKE * min(before, excess)
+            best, alike = min(before, excess), abs(before - excess) < _ALIKE * max(min(before, excess), self._tolerable)
             if before < excess:
                 progress.state, progress.message = progress.rival, progress.rival_message
         if best > self._tolerable and not alike and progress.starts < _STARTS:
@@ -188,7 +188,7 @@ class Restoration:
 
     def _unexplained(self, state: State) -> float:
         """Variance of the residuals above that of the noise, over the latter."""
-        return float(self.problem.calibrate(state).excess.mean()) - 1
+        return float(self.problem.fit_of_frames(state)[1].mean()) - 1
 
     def _first(self, state: State, seed: int) -> State:
         """The state with the aberrations to begin with: zero for masks at first, random ones from a full pupil.
