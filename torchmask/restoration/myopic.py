@@ -64,7 +64,7 @@ class MyopicDeconvolution(nn.Module):
     aberration_prior : bool
         False leaves out 1/2 ||z||^2; z are the Zernike coefficients then.
     max_iterations : int
-        Of a start. A restoration that leaves 0.2 % of the change from frame to frame unexplained, and more than the
+        Of a start. A restoration that leaves 0.13 % of the change from frame to frame unexplained, and more than the
         noise can leave, may have missed the object: it starts again from random aberrations, up to three times as long
         as that is so and no two end alike, and the best is kept.
     tolerance : float
