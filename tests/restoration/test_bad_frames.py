@@ -131,4 +131,5 @@ def test_frames_that_no_aberration_explains_do_little_harm():
     patient = method(max_iterations=600)
     alone = score(patient.restore(short).object, seen.object, 0.5)
     together = score(patient.restore(torch.cat([short, smeared])).object, seen.object, 0.5)
-    assert together < 1.4 * alone
+    # Measured 1.225. Squared weights, which cost a tenth at 1e8 photons, kept it below 1.2.
+    assert together < 1.25 * alone

@@ -174,5 +174,5 @@ def test_a_new_frame_has_candidates_too(stack):
     assert float(result.chi_square[-1]) < 1.2
     assert score(result.object, stack.object, 0.5) < score(first.object, stack.object, 0.5)
     # The new frame's candidates, as shares of an evaluation of 4 frames, and then 500 iterations of all.
-    # Line searches make it a little more: one iteration in eight or ten takes a second evaluation.
-    assert result.n_evaluations < 1.15 * (sum(n * ITERATIONS[n] for n in ITERATIONS) / 4 + 500)
+    # Line searches make it 1.103 to 1.109 times as many.
+    assert result.n_evaluations < 1.11 * (sum(n * ITERATIONS[n] for n in ITERATIONS) / 4 + 500)

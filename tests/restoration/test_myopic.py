@@ -88,8 +88,8 @@ def test_beats_the_mean_frame_and_explains_the_data(observation, known):
 
 def test_nothing_but_the_frames_is_needed(observation, known):
     result = MyopicDeconvolution(mask(), GRID).restore(observation.frames)
-    # Over eight seeds the ratio is 1.23 with a standard deviation of 0.07.
-    assert errors(observation, result.object)[0] < 1.37 * errors(observation, known.object)[0]
+    # Over eight seeds the ratio is 1.23 with a standard deviation of 0.07; here it is 1.17.
+    assert errors(observation, result.object)[0] < 1.23 * errors(observation, known.object)[0]
     assert 0.6 * R0 < result.r0 < 1.7 * R0
     expected = math.sqrt(float(observation.frames.mean()) + READOUT**2)
     assert result.noise == pytest.approx(expected, rel=0.05)
