@@ -28,10 +28,10 @@ import tyro
 from torch import Tensor
 
 from torchmask.design.criterion import AsymptoticMSE, wiener_mse
-from torchmask.design.psd import NoisePSD, PowerLawPSD
 from torchmask.grid import Grid
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.otf import OTF
+from torchmask.spectra import NoisePSD, PowerLawPSD
 
 N_FRAMES, FILL_FACTOR = 20, 0.15
 

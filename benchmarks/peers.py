@@ -34,18 +34,19 @@ import torch
 import tyro
 from torch import Tensor
 
-from torchmask.design.psd import NoisePSD, PowerLawPSD
+from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.grid import Grid
 from torchmask.io import atomic_write, write_json
-from torchmask.metrics import score, ssim
+from torchmask.metrics import relative_error, ssim
+from torchmask.observation import Observation
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.detector import Detector
-from torchmask.optics.turbulence import TurbulencePhase
 from torchmask.restoration.baselines import average_psf, shift_and_add
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.wiener import multiframe_wiener
-from torchmask.simulation.observation import Observation, simulate_observation
+from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
+from torchmask.spectra import NoisePSD, PowerLawPSD
 
 OURS, LIMIT = "torchmask", "multi-frame Wiener, true PSFs"
 WANTED_LEAD = 1.5  # over the best peer that does not know the PSFs
@@ -266,7 +267,7 @@ def best(name: str, candidates: Iterator[Candidate], truth: Tensor | None, cutof
     row: dict[str, Any] | None = None
     for candidate in candidates:
         for image in (candidate.image, candidate.image.clamp(min=0)):
-            value = score(image, truth, cutoff)
+            value = relative_error(image, truth, cutoff)
             if row is None or value < row["score"]:
                 row = {"method": name, "score": value, "ssim": ssim(image, truth, cutoff)}
                 row |= {"seconds": candidate.seconds, "settings": candidate.settings}

@@ -15,12 +15,12 @@ from collections.abc import Callable
 import torch
 
 from torchmask.grid import Grid
-from torchmask.metrics import score
+from torchmask.metrics import relative_error
+from torchmask.observation import Observation
 from torchmask.optics.aperture import Aperture, FullAperture, SparseAperture
 from torchmask.restoration.model import ExposureModel
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.priors import total_variation
-from torchmask.simulation.observation import Observation
 
 
 def seconds(function: Callable[[], object], device: str, repeats: int) -> float:
@@ -98,7 +98,7 @@ def main() -> None:
         for dtype in (torch.float64, torch.float32):
             method = MyopicDeconvolution(stack.aperture, stack.grid, dtype=dtype, device=args.device)
             result = method.restore(stack.frames)
-            truth = "" if stack.object is None else f", score {score(result.object, stack.object, 0.5):.4f}"
+            truth = "" if stack.object is None else f", score {relative_error(result.object, stack.object, 0.5):.4f}"
             print(f"{args.stack} {str(dtype)[6:]}{truth}\n{result.summary()}")
 
 

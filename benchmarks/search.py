@@ -21,11 +21,11 @@ from typing import Any, Literal
 import torch
 import tyro
 
-from torchmask.design.constraints import check
+from torchmask.design.constraints import check_mask
 from torchmask.design.criterion import AsymptoticMSE
-from torchmask.design.psd import NoisePSD, PowerLawPSD
 from torchmask.design.search import search_mask
 from torchmask.grid import Grid
+from torchmask.spectra import NoisePSD, PowerLawPSD
 
 METHODS: dict[str, dict[str, Any]] = {
     "cma": {"method": "cma", "refine": False},
@@ -69,7 +69,7 @@ def main(config: Config) -> None:
                 start = clock()
                 found = search_mask(criterion, n, 1.0, config.fill_factor, seed=seed, budget=budget, **options)
                 seconds.append(clock() - start)
-                check(found.aperture, 1e-9)
+                check_mask(found.aperture, 1e-9)
                 errors.append(found.relative_mse)
             median = statistics.median(errors)
             print(

@@ -26,9 +26,8 @@ import scipy.sparse
 import torch
 import tyro
 
-from torchmask._drawing import COLORS, FAINT, new_figure, styled
+from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.design.criterion import AsymptoticMSE, wiener_mse
-from torchmask.design.psd import NoisePSD, PowerLawPSD
 from torchmask.design.space import DesignSpace
 from torchmask.design.sweep import run_tasks
 from torchmask.design.table import design_table
@@ -36,8 +35,9 @@ from torchmask.grid import Grid
 from torchmask.io import atomic_write, write_json
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.otf import OTF, subaperture_otf
-from torchmask.optics.turbulence import TurbulencePhase
 from torchmask.progress import Progress
+from torchmask.spectra import NoisePSD, PowerLawPSD
+from torchmask.viz.style import COLORS, FAINT, new_figure, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

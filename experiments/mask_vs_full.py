@@ -36,22 +36,23 @@ import tyro
 from scipy.stats import t as student
 from torch import Tensor
 
-from torchmask._drawing import COLORS, FAINT, new_figure, styled
+from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.design.manufacture import load_mask
 from torchmask.design.space import DesignSpace
 from torchmask.design.sweep import run_tasks
 from torchmask.design.table import design_table
 from torchmask.grid import Grid
 from torchmask.io import atomic_write, write_json
-from torchmask.metrics import score
+from torchmask.metrics import relative_error
+from torchmask.observation import Observation
 from torchmask.optics.aperture import Aperture, FullAperture, PupilSamples, SparseAperture
 from torchmask.optics.detector import Detector
-from torchmask.optics.turbulence import TurbulencePhase
 from torchmask.optics.zernike import zernike_basis
 from torchmask.progress import Progress
 from torchmask.restoration.myopic import MyopicDeconvolution
-from torchmask.simulation.observation import Observation, simulate_observation
+from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
+from torchmask.viz.style import COLORS, FAINT, new_figure, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -209,8 +210,8 @@ def measure(task: dict[str, Any]) -> dict[str, Any]:
     assert observation.object is not None
     cutoff = grid.cutoff(DIAMETER)
     return {
-        "score": score(result.object, observation.object, cutoff),
-        "mean_frame": score(frames.mean(0), observation.object, cutoff),
+        "score": relative_error(result.object, observation.object, cutoff),
+        "mean_frame": relative_error(frames.mean(0), observation.object, cutoff),
         "chi_square": float(result.chi_square.mean()),
         "iterations": len(result.cost),
         "converged": result.converged,

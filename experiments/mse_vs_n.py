@@ -23,11 +23,11 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from torchmask._drawing import COLORS, FAINT, INK, PALE, new_figure, styled
 from torchmask.design.space import Design, DesignSpace
 from torchmask.design.table import DesignTable, design_table
 from torchmask.io import atomic_write, write_json
 from torchmask.progress import Progress
+from torchmask.viz.style import COLORS, FAINT, INK, PALE, new_figure, styled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

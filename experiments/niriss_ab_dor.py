@@ -44,6 +44,7 @@ from rich.console import Console
 from torch import Tensor
 
 from torchmask.data.keywords import ARCSEC, FILTERS, pixel_matrix
+from torchmask.data.observe import read_observation
 from torchmask.grid import Grid
 from torchmask.io import save_npz, write_json
 from torchmask.optics.aperture import SparseAperture
@@ -51,7 +52,6 @@ from torchmask.progress import Progress
 from torchmask.record import Callback, Record
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.result import RestorationResult
-from torchmask.simulation.observation import Observation
 from torchmask.tracking import RunLogger, fan_out
 
 MASK, FILTER = "jwst_niriss_ami_7", FILTERS[("NIRISS", "F480M")]  # (wavelength, width) [m], its source beside it
@@ -108,7 +108,7 @@ def read(folder: Path, star: str, crop: int) -> tuple[Exposures, Grid]:
     if not paths:
         raise ValueError(f"{folder} has no {star}_*.fits: give the folder of the exposures with --data")
     aperture = SparseAperture.from_catalog(MASK)
-    parts = [Observation.from_fits([path], aperture, gain=GAIN, crop=crop) for path in paths]
+    parts = [read_observation([path], aperture, gain=GAIN, crop=crop) for path in paths]
     matrices = [pixel_matrix(part.header) for part in parts]  # (x, y) to (east, north) [deg]
     if any(matrix is None for matrix in matrices):
         raise ValueError(f"{folder}: the headers of {star}_*.fits have no CD matrix, which tells where north is")

@@ -13,8 +13,8 @@ from companion_fit import Exposures, Fit
 from rich.table import Table
 from torch import Tensor
 
-from torchmask._drawing import COLORS, FAINT, new_figure, styled
 from torchmask.data.keywords import ARCSEC
+from torchmask.viz.style import COLORS, FAINT, new_figure, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

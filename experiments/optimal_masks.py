@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from torchmask._drawing import COLORS, FAINT, INK, PALE, hole, new_figure, styled
 from torchmask.design.manufacture import save_json
 from torchmask.design.redundancy import analyse_redundancy
 from torchmask.design.space import Design, DesignSpace
@@ -30,6 +29,7 @@ from torchmask.design.table import DesignTable, design_table
 from torchmask.io import atomic_write, write_json
 from torchmask.optics.aperture import SparseAperture
 from torchmask.progress import Progress
+from torchmask.viz.style import COLORS, FAINT, INK, PALE, hole, new_figure, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

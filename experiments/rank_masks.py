@@ -29,16 +29,16 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from torchmask._drawing import COLORS, FAINT, new_figure, styled
 from torchmask.design.criterion import AsymptoticMSE
 from torchmask.design.manufacture import save_json
-from torchmask.design.psd import NoisePSD, PowerLawPSD
 from torchmask.design.redundancy import analyse_redundancy
 from torchmask.design.search import search_mask
 from torchmask.grid import Grid
 from torchmask.io import atomic_write, write_json
 from torchmask.optics import catalog
 from torchmask.optics.aperture import SparseAperture
+from torchmask.spectra import NoisePSD, PowerLawPSD
+from torchmask.viz.style import COLORS, FAINT, new_figure, styled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

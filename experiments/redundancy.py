@@ -27,13 +27,13 @@ import torch
 import tyro
 from torch import Tensor
 
-from torchmask._drawing import COLORS, FAINT, INK, new_figure, styled
+from torchmask.atmosphere.phase import TurbulencePhase
+from torchmask.atmosphere.von_karman import von_karman_structure_function
 from torchmask.grid import Grid
 from torchmask.io import atomic_write, write_json
 from torchmask.optics.aperture import Aperture, FullAperture, SparseAperture
 from torchmask.optics.otf import OTF
-from torchmask.optics.turbulence import TurbulencePhase
-from torchmask.optics.von_karman import von_karman_structure_function
+from torchmask.viz.style import COLORS, FAINT, INK, new_figure, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -24,16 +24,16 @@ import tyro
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
-from torchmask import viz
 from torchmask.grid import Grid
 from torchmask.io import atomic_write, write_json
-from torchmask.metrics import lowpass, score
+from torchmask.metrics import lowpass, relative_error
 from torchmask.optics.aperture import SparseAperture
 from torchmask.progress import Progress
 from torchmask.record import Callback, Record
 from torchmask.restoration.wiener import multiframe_wiener
 from torchmask.simulation.dataset import StackDataset, StackRanges
 from torchmask.tracking import RunLogger, fan_out
+from torchmask.viz import figures as viz
 
 DIAMETER = 1.0  # of the mask [m]
 WAVELENGTH = 550e-9
@@ -132,7 +132,7 @@ def turned(images: Tensor, targets: Tensor, generator: torch.Generator) -> tuple
     return both[:, :-1], both[:, -1:]
 
 
-def relative_error(estimate: Tensor, target: Tensor) -> Tensor:
+def power_error(estimate: Tensor, target: Tensor) -> Tensor:
     """Mean over the batch of the squared error, as a share of the target's power."""
     return (((estimate - target) ** 2).sum((1, 2, 3)) / (target**2).sum((1, 2, 3))).mean()
 
@@ -155,7 +155,7 @@ def train(
             order = torch.randperm(len(training[0]), generator=generator).split(config.batch_size)
         chosen = order[(step - 1) % per_epoch]
         images, targets = turned(training[0][chosen], training[1][chosen], generator)
-        loss = relative_error(network(images), targets)
+        loss = power_error(network(images), targets)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -164,14 +164,14 @@ def train(
         if step % per_epoch == 0:
             with torch.no_grad():
                 restored = network(held_out[0])
-            scalars["held_out_loss"] = relative_error(restored, held_out[1]).item()
+            scalars["held_out_loss"] = power_error(restored, held_out[1]).item()
             arrays = {"linear": held_out[0][0, 0], "restored": restored[0, 0], "truth": held_out[1][0, 0]}
         callback(Record("training", step, n_steps, scalars, arrays))
 
 
 def scores(images: Tensor, targets: Tensor, cutoff: float) -> list[float]:
     """The library's score of each image (B, H, W)."""
-    return [score(image, target[0], cutoff) for image, target in zip(images, targets, strict=True)]
+    return [relative_error(image, target[0], cutoff) for image, target in zip(images, targets, strict=True)]
 
 
 def compare(

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from skimage.metrics import structural_similarity
 
-from torchmask.metrics import align, lowpass, score, ssim
+from torchmask.metrics import align, lowpass, relative_error, ssim
 
 STACKS = Path(__file__).parents[2] / "shared" / "stacks"
 
@@ -50,7 +50,7 @@ def test_position_and_brightness_do_not_count(rows, columns, dy, dx, gain, cutof
     estimate = gain * moved(truth, dy, dx)
     # The correlation is stationary at its top, so a gradient of 1e-9 (the registration's tolerance) leaves the
     # shift wrong by far less than 1e-6 pixel, and the score by that times the gradient of a band-limited image.
-    assert score(estimate, truth, cutoff) < 1e-6
+    assert relative_error(estimate, truth, cutoff) < 1e-6
     torch.testing.assert_close(align(estimate, truth, cutoff), lowpass(truth, cutoff), rtol=0, atol=1e-5)
 
 
@@ -64,9 +64,9 @@ def test_known_error():
         # ||truth||^2 = n^2 (1 + 1/2) and ||ripple||^2 = n^2 / 2. The best gain g leaves the sine of the angle between
         # truth and estimate, a / sqrt(3 + a^2); moving along x does not help, for the truth is constant there.
         expected = amplitude / math.sqrt(3 + amplitude**2)
-        assert score(7 * (truth + amplitude * ripple), truth, cutoff) == pytest.approx(expected, rel=1e-9)
+        assert relative_error(7 * (truth + amplitude * ripple), truth, cutoff) == pytest.approx(expected, rel=1e-9)
     hidden = torch.cos(2 * math.pi * 14 * x / n)[None, :].expand(n, n)  # 14 / 32 > 0.4: beyond the cut-off
-    assert score(truth + hidden, truth, cutoff) < 1e-9
+    assert relative_error(truth + hidden, truth, cutoff) < 1e-9
 
 
 def test_lowpass_keeps_the_rim_and_nothing_beyond():
@@ -90,17 +90,19 @@ def test_align_in_the_units_of_the_truth():
     residual = aligned - lowpass(truth, 0.3)
     assert abs(float((residual * aligned).sum())) < 1e-9 * float((aligned**2).sum())  # the gain is the best one
     torch.testing.assert_close(align(estimate, 1e4 * truth, 0.3), 1e4 * aligned)
-    assert score(estimate, truth, 0.3) == pytest.approx(float(residual.norm() / lowpass(truth, 0.3).norm()), rel=1e-12)
+    assert relative_error(estimate, truth, 0.3) == pytest.approx(
+        float(residual.norm() / lowpass(truth, 0.3).norm()), rel=1e-12
+    )
 
 
 def test_tensors_arrays_and_dtypes_agree():
     truth = smooth_scene(20, 20, 0.4).float()
     estimate = truth.roll((3, 1), (0, 1)) + 0.1 * smooth_scene(20, 20, 0.4, seed=2).float()
-    expected = score(estimate, truth, 0.4)
+    expected = relative_error(estimate, truth, 0.4)
     assert isinstance(expected, float)
-    assert score(estimate.requires_grad_(), truth.double(), 0.4) == expected
-    assert score(estimate.detach().numpy(), truth.numpy().astype(np.float64), 0.4) == expected
-    assert score((estimate * 1000).round().long(), truth, 0.4) == pytest.approx(expected, abs=2e-3)
+    assert relative_error(estimate.requires_grad_(), truth.double(), 0.4) == expected
+    assert relative_error(estimate.detach().numpy(), truth.numpy().astype(np.float64), 0.4) == expected
+    assert relative_error((estimate * 1000).round().long(), truth, 0.4) == pytest.approx(expected, abs=2e-3)
 
 
 def test_shared_definition():
@@ -118,12 +120,12 @@ def test_shared_definition():
             truth, frames = stack["object"], stack["frames"]
         for estimate in (frames[0], frames.mean(0), truth + truth.max() * rng.random(truth.shape)):
             for cutoff in (0.5, 0.2):
-                assert score(estimate, truth, cutoff) == pytest.approx(
+                assert relative_error(estimate, truth, cutoff) == pytest.approx(
                     definition.score(estimate, truth, cutoff), abs=1e-6
                 )
     for shape in ((16, 16), (17, 24)):  # without structure: the hardest to register
         truth, estimate = rng.random(shape), rng.random(shape)
-        assert score(estimate, truth, 0.5) == pytest.approx(definition.score(estimate, truth, 0.5), abs=1e-5)
+        assert relative_error(estimate, truth, 0.5) == pytest.approx(definition.score(estimate, truth, 0.5), abs=1e-5)
 
 
 def test_ssim():
@@ -152,7 +154,7 @@ def test_ssim():
         (torch.ones(4, 4), torch.ones(4, 4), math.nan, "cutoff is nan"),
     ],
 )
-@pytest.mark.parametrize("function", [score, align, ssim])
+@pytest.mark.parametrize("function", [relative_error, align, ssim])
 def test_bad_input(function, estimate, truth, cutoff, message):
     with pytest.raises(ValueError, match=message):
         function(estimate, truth, cutoff)
@@ -162,4 +164,4 @@ def test_a_flat_estimate_has_a_score():
     truth = smooth_scene(16, 16, 0.4)
     mean = float(truth.mean())
     expected = float((truth - mean).norm() / truth.norm())  # the best constant is the mean
-    assert score(torch.ones(16, 16), truth, 0.4) == pytest.approx(expected, rel=1e-9)
+    assert relative_error(torch.ones(16, 16), truth, 0.4) == pytest.approx(expected, rel=1e-9)

@@ -14,16 +14,17 @@ import torch
 from torch import Tensor, nn
 
 import torchmask
+from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.design.criterion import AsymptoticMSE
-from torchmask.design.psd import NoisePSD, PowerLawPSD
 from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture, FullAperture, SparseAperture
 from torchmask.optics.detector import Detector
-from torchmask.optics.otf import OTF, PSF
-from torchmask.optics.turbulence import TurbulencePhase
+from torchmask.optics.otf import OTF
+from torchmask.optics.psf import PSF
 from torchmask.optics.zernike import ZernikePhase
 from torchmask.restoration.model import ExposureModel
 from torchmask.restoration.myopic import MyopicDeconvolution
+from torchmask.spectra import NoisePSD, PowerLawPSD
 
 GRID = Grid.nyquist(1.0, 550e-9, 32)
 CENTERS = torch.tensor([[0.02, 0.31], [0.3, -0.21], [-0.29, -0.18]], dtype=torch.float64)

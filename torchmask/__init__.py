@@ -3,30 +3,33 @@
 mask -> pupil field -> PSF / OTF -> short exposures -> restored object
 """
 
-from torchmask.data.fringes import frame_observables
+from torchmask.atmosphere.phase import TurbulencePhase
+from torchmask.data.observe import read_observation
 from torchmask.data.restored import save_restored
-from torchmask.data.visibilities import Observables, restored_observables
-from torchmask.design.constraints import check
+from torchmask.design.constraints import check_mask
 from torchmask.design.criterion import AsymptoticMSE, wiener_mse
 from torchmask.design.manufacture import load_mask
-from torchmask.design.psd import NoisePSD, PowerLawPSD
 from torchmask.design.refine import refine_mask
 from torchmask.design.search import SearchResult, search_mask
 from torchmask.design.table import design_table
 from torchmask.grid import Grid
-from torchmask.oifits import save_oifits
+from torchmask.interferometry.fringes import frame_observables
+from torchmask.interferometry.oifits import save_oifits
+from torchmask.interferometry.visibilities import Observables, restored_observables
+from torchmask.observation import Observation
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.detector import Detector
-from torchmask.optics.otf import OTF, PSF
-from torchmask.optics.turbulence import TurbulencePhase
+from torchmask.optics.otf import OTF
+from torchmask.optics.psf import PSF
 from torchmask.optics.zernike import ZernikePhase
 from torchmask.restoration.baselines import average_psf, shift_and_add
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.result import RestorationResult
 from torchmask.restoration.wiener import multiframe_wiener
 from torchmask.simulation.dataset import StackDataset, StackRanges
-from torchmask.simulation.observation import Observation, simulate_observation
+from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
+from torchmask.spectra import NoisePSD, PowerLawPSD
 from torchmask.tracking import RunLogger
 
 __version__ = "0.1.0"
@@ -53,12 +56,13 @@ __all__ = [
     "TurbulencePhase",
     "ZernikePhase",
     "average_psf",
-    "check",
+    "check_mask",
     "design_table",
     "frame_observables",
     "load_mask",
     "make_scene",
     "multiframe_wiener",
+    "read_observation",
     "refine_mask",
     "restored_observables",
     "save_oifits",

@@ -71,7 +71,7 @@ def align(estimate: Any, truth: Any, cutoff: float) -> Tensor:
     return image * ((image * reference).sum() / (image * image).sum())
 
 
-def score(estimate: Any, truth: Any, cutoff: float) -> float:
+def relative_error(estimate: Any, truth: Any, cutoff: float) -> float:
     """Relative error of a restoration up to the diffraction limit: 0 is perfect, below 1 is better than nothing.
 
     ||align(estimate) - lowpass(truth)|| / ||lowpass(truth)||: both low-passed at `cutoff`, registered (far

@@ -31,7 +31,7 @@ import numpy as np
 
 from torchmask.io import as_array, atomic_write, save_npz, to_json, write_json
 from torchmask.record import Callback, Record
-from torchmask.viz import stretch
+from torchmask.viz.figures import stretch
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

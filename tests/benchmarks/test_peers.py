@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.grid import Grid
-from torchmask.metrics import score
+from torchmask.metrics import relative_error
 from torchmask.optics.aperture import FullAperture
 from torchmask.optics.detector import Detector
-from torchmask.optics.turbulence import TurbulencePhase
-from torchmask.simulation.observation import simulate_observation
+from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
 
 PATH = Path(__file__).parents[2] / "benchmarks" / "peers.py"
@@ -45,7 +45,7 @@ def observation():
 
 
 def best_score(candidates, observation):
-    return min(score(candidate.image, observation.object, 0.5) for candidate in candidates)
+    return min(relative_error(candidate.image, observation.object, 0.5) for candidate in candidates)
 
 
 @pytest.mark.parametrize("method", ["richardson_lucy", "unsupervised_wiener", "known_psfs"])
@@ -109,7 +109,11 @@ def test_a_peer_gets_the_best_of_its_candidates_and_of_clipping(script):
     candidates = [script.Candidate(name, image, 1.0) for name, image in images.items()]
     row = script.best("peer", iter(candidates), truth, 0.5)
     assert row["settings"] == "better"
-    assert row["score"] == score(images["better"].clamp(min=0), truth, 0.5) < score(images["better"], truth, 0.5)
+    assert (
+        row["score"]
+        == relative_error(images["better"].clamp(min=0), truth, 0.5)
+        < relative_error(images["better"], truth, 0.5)
+    )
     assert script.best("peer", iter([]), truth, 0.5) is None
 
 

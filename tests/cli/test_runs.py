@@ -11,18 +11,18 @@ from astropy.io import fits
 
 from torchmask.cli.main import main
 from torchmask.cli.report import draw_zones
-from torchmask.design.constraints import KeepOutDisc, KeepOutSegment, MinimumGap, check
+from torchmask.design.constraints import KeepOutDisc, KeepOutSegment, MinimumGap, check_mask
 from torchmask.design.criterion import AsymptoticMSE
 from torchmask.design.manufacture import load_mask
-from torchmask.design.psd import NoisePSD, PowerLawPSD
 from torchmask.grid import Grid
 from torchmask.io import load_npz
+from torchmask.observation import Observation
 from torchmask.optics.aperture import FullAperture
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.result import RestorationResult
-from torchmask.simulation.observation import Observation
+from torchmask.spectra import NoisePSD, PowerLawPSD
 from torchmask.tracking import RunLogger, read_metrics
-from torchmask.viz import mask_figure
+from torchmask.viz.figures import mask_figure
 
 DESIGN = ["design", "--n-subapertures", "4", "--fill-factor", "0.1", "--budget", "60", "--n-frequencies", "32"]
 RULES = ["--min-gap", "0.05", "--central-obstruction", "0.3", "--spiders", "0", "0", "0", "0.5", "0.02"]
@@ -63,7 +63,7 @@ def cube(runs):
 def test_design_writes_a_mask_that_obeys_and_its_error(runs):
     folder = runs / "design"
     mask = load_mask(folder / "mask.json")
-    check(mask, 1e-9, [MinimumGap(0.05), KeepOutDisc(0.3), KeepOutSegment((0, 0), (0, 0.5), 0.02)])
+    check_mask(mask, 1e-9, [MinimumGap(0.05), KeepOutDisc(0.3), KeepOutSegment((0, 0), (0, 0.5), 0.02)])
     assert (mask.n_subapertures, mask.mask_diameter, mask.fill_factor) == (4, 1.0, pytest.approx(0.1, rel=1e-12))
     criterion = AsymptoticMSE(Grid.nyquist(1.0, 1e-6, 32), PowerLawPSD(1.5, 1e7), NoisePSD(1e7), 20)
     metrics = json.loads((folder / "metrics.json").read_text())
@@ -291,7 +291,7 @@ def test_an_interrupted_search_leaves_its_best_mask(tmp_path, monkeypatch, capsy
     interrupt_at(monkeypatch, "design/hybrid", 30)
     assert main([*DESIGN, *RULES, "--out", str(tmp_path / "run")]) == 130
     assert f"what was reached is in {tmp_path / 'run'}" in capsys.readouterr().err
-    check(load_mask(tmp_path / "run/mask.json"), 1e-9, [MinimumGap(0.05), KeepOutDisc(0.3)])
+    check_mask(load_mask(tmp_path / "run/mask.json"), 1e-9, [MinimumGap(0.05), KeepOutDisc(0.3)])
     assert json.loads((tmp_path / "run/status.json").read_text())["status"] == "interrupted"
 
 

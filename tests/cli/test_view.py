@@ -15,11 +15,11 @@ from torchmask.design.manufacture import load_mask, save_dxf, save_fits, save_js
 from torchmask.design.redundancy import analyse_redundancy
 from torchmask.grid import Grid
 from torchmask.io import save_npz
+from torchmask.observation import Observation
 from torchmask.optics import catalog
 from torchmask.optics.aperture import SparseAperture
 from torchmask.record import Record
 from torchmask.restoration.result import RestorationResult
-from torchmask.simulation.observation import Observation
 from torchmask.tracking import RunLogger
 
 GOLAY6 = SparseAperture.from_catalog("golay6", 2.0, 0.2)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import torchmask as tm
-from torchmask.optics.otf import psf_from_samples
+from torchmask.optics.psf import psf_from_samples
 
 GRID = tm.Grid.nyquist(diameter=1.0, wavelength=550e-9, n_pixels=64)
 

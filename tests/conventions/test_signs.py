@@ -7,7 +7,7 @@ import torch
 
 import torchmask as tm
 from torchmask.optics.otf import analytic_otf
-from torchmask.simulation.observation import simulate_observation
+from torchmask.simulation.exposures import simulate_observation
 
 GRID = tm.Grid.nyquist(diameter=1.0, wavelength=550e-9, n_pixels=64)
 

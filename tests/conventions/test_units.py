@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import torchmask as tm
-from torchmask.optics.von_karman import von_karman_structure_function
+from torchmask.atmosphere.von_karman import von_karman_structure_function
 
 GRID = tm.Grid.nyquist(diameter=2.0, wavelength=1e-6, n_pixels=64)
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import torchmask as tm
-from torchmask.optics.von_karman import modal_covariance
+from torchmask.atmosphere.von_karman import modal_covariance
 from torchmask.optics.zernike import noll, zernike
 
 GRID = tm.Grid.nyquist(diameter=1.2, wavelength=550e-9, n_pixels=256)

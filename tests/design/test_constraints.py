@@ -8,6 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from torchmask.design.constraint_base import Infeasible, Subspace, project
 from torchmask.design.constraints import (
     FixedHoles,
     InsideDisc,
@@ -17,9 +18,8 @@ from torchmask.design.constraints import (
     NFoldSymmetry,
     NonRedundancy,
     NoOverlap,
-    check,
+    check_mask,
 )
-from torchmask.design.feasibility import Infeasible, Subspace, project
 from torchmask.optics.aperture import SparseAperture
 
 INEQUALITIES = [
@@ -190,7 +190,7 @@ def test_descent_leaves_where_no_direction_is_better(constraint, centers, shorte
 def test_symmetric_mask_leaves_the_center():
     rules = [InsideDisc(), NoOverlap(), KeepOutDisc(0.3), NFoldSymmetry(4)]
     found = project(mask([[0.0, 0.0]] * 4), rules)
-    check(found, 1e-11, rules)
+    check_mask(found, 1e-11, rules)
     assert torch.linalg.vector_norm(found.centers, dim=-1).tolist() == pytest.approx([0.2] * 4, rel=1e-6)
 
 
@@ -200,7 +200,7 @@ def test_any_mask_finds_its_way_into_the_disc(seed, fill, n):
     diameter = math.sqrt(fill / n)
     aperture = thrown(n, seed, diameter, spread=0.8)
     try:
-        check(project(aperture, [InsideDisc(), NoOverlap()]), 1e-11)
+        check_mask(project(aperture, [InsideDisc(), NoOverlap()]), 1e-11)
     except Infeasible:
         # only crowded starts may get stuck between others
         assert fill > 0.25
@@ -209,7 +209,7 @@ def test_any_mask_finds_its_way_into_the_disc(seed, fill, n):
 def test_several_rules_at_once():
     rules = [InsideDisc(), NoOverlap(), KeepOutDisc(0.2), NFoldSymmetry(3), FixedHoles([(0.3, 0.1)], indices=[3])]
     found = project(thrown(9, 1), rules)
-    check(found, 1e-11, rules)
+    check_mask(found, 1e-11, rules)
     assert found.centers[3].tolist() == pytest.approx([0.3, 0.1], abs=1e-12)
     turned = found.centers @ torch.tensor([[-0.5, math.sqrt(3) / 2], [-math.sqrt(3) / 2, -0.5]], dtype=torch.float64)
     distance = torch.cdist(turned, found.centers).min(-1).values
@@ -220,15 +220,15 @@ def test_float32_masks_still_hold_after_rounding():
     aperture = SparseAperture(thrown(9, 2).centers.float(), 0.1, 1.0)
     projected = project(aperture, [InsideDisc(), NoOverlap()])
     assert projected.centers.dtype == torch.float32
-    check(projected, 0.0)
+    check_mask(projected, 0.0)
 
 
 def test_check_names_the_rule_and_the_shortfall():
     with pytest.raises(ValueError, match=r"NoOverlap.*0\.04 m"):
-        check(mask([[0.0, 0.0], [0.06, 0.0]]))
+        check_mask(mask([[0.0, 0.0], [0.06, 0.0]]))
     with pytest.raises(ValueError, match="KeepOutDisc"):
-        check(mask([[0.0, 0.0], [0.3, 0.0]]), constraints=[KeepOutDisc(0.1)])
-    check(mask([[0.0, 0.0], [0.0999, 0.0]]), tolerance=1e-3)
+        check_mask(mask([[0.0, 0.0], [0.3, 0.0]]), constraints=[KeepOutDisc(0.1)])
+    check_mask(mask([[0.0, 0.0], [0.0999, 0.0]]), tolerance=1e-3)
 
 
 def test_subspace_moves_a_hole_and_all_that_is_tied_to_it():

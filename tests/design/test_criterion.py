@@ -18,10 +18,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchmask.design import overlap
 from torchmask.design.criterion import AsymptoticMSE, wiener_mse
-from torchmask.design.psd import NoisePSD, PowerLawPSD
 from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.otf import analytic_otf, hexagon_otf
+from torchmask.spectra import NoisePSD, PowerLawPSD
 
 WAVELENGTH = 550e-9
 DIAMETER = 0.14  # of a sub-aperture; the masks here have 1 m

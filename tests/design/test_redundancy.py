@@ -17,7 +17,8 @@ from torchmask.design.redundancy import analyse_redundancy
 from torchmask.grid import Grid
 from torchmask.optics import catalog
 from torchmask.optics.aperture import FullAperture, SparseAperture
-from torchmask.optics.otf import hexagon_otf, psf_from_samples
+from torchmask.optics.otf import hexagon_otf
+from torchmask.optics.psf import psf_from_samples
 
 SHARED = Path(__file__).parents[3] / "shared" / "masks.json"
 

@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from torchmask.design.constraints import FixedHoles, KeepOutDisc, MinimumGap, NFoldSymmetry, check
-from torchmask.design.feasibility import project
+from torchmask.design.constraint_base import project
+from torchmask.design.constraints import FixedHoles, KeepOutDisc, MinimumGap, NFoldSymmetry, check_mask
 from torchmask.design.refine import refine_mask
 from torchmask.design.room import require_room
 from torchmask.optics.aperture import SparseAperture
@@ -33,7 +33,7 @@ def test_the_largest_value_that_fits_is_stated(rule, stated, largest):
     assert 0.99 * largest < value <= largest
     if "fill factor" in stated:
         found = require_room(3, 1.0, value, [rule])[1]
-        check(found, 1e-9, [rule])
+        check_mask(found, 1e-9, [rule])
 
 
 def test_where_no_size_helps_the_rules_are_named():
@@ -50,7 +50,7 @@ def test_where_no_size_helps_the_rules_are_named():
 def test_what_is_no_list_of_rules_is_refused(constraints):
     for call in (
         lambda: require_room(6, 1.0, 0.15, constraints),
-        lambda: check(MASK, constraints=constraints),
+        lambda: check_mask(MASK, constraints=constraints),
         lambda: project(MASK, constraints),
         lambda: refine_mask(lambda mask: mask.centers.sum(), MASK, constraints=constraints),
     ):

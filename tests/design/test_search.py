@@ -7,13 +7,13 @@ import pytest
 import torch
 from scipy.optimize import linear_sum_assignment
 
-from torchmask.design.constraints import KeepOutDisc, MinimumGap, NFoldSymmetry, check
+from torchmask.design.constraints import KeepOutDisc, MinimumGap, NFoldSymmetry, check_mask
 from torchmask.design.criterion import AsymptoticMSE
-from torchmask.design.psd import NoisePSD, PowerLawPSD
 from torchmask.design.refine import refine_mask
 from torchmask.design.search import search_mask
 from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture, SparseAperture
+from torchmask.spectra import NoisePSD, PowerLawPSD
 
 
 def reference(n_pixels):
@@ -28,7 +28,7 @@ COARSE = reference(96)
 @pytest.mark.parametrize(("method", "budget"), [("cma", 640), ("hybrid", 1500)])
 def test_result_is_feasible_and_measured_where_it_stands(method, budget):
     found = search_mask(COARSE, 7, 1.0, 0.15, method=method, budget=budget, seed=3)
-    check(found.aperture, tolerance=1e-9)
+    check_mask(found.aperture, tolerance=1e-9)
     assert found.aperture.fill_factor == pytest.approx(0.15, rel=1e-12)
     assert found.mse == float(COARSE(found.aperture))
     assert found.relative_mse == float(COARSE.relative(found.aperture))
@@ -60,14 +60,14 @@ def test_search_leaves_the_process_and_the_folder_alone(tmp_path, monkeypatch):
 def test_gradient_stage_improves_on_cma_alone():
     plain = search_mask(COARSE, 9, 1.0, 0.15, method="cma", refine=False, budget=640, seed=0)
     refined = search_mask(COARSE, 9, 1.0, 0.15, method="cma", refine=True, budget=640, seed=0)
-    check(plain.aperture)
+    check_mask(plain.aperture)
     assert refined.mse < plain.mse
 
 
 def test_refinement_goes_downhill_and_stays_feasible():
     start = SparseAperture.random(8, 1.0, 0.15, torch.Generator().manual_seed(0))
     found = refine_mask(COARSE, start, budget=60)
-    check(found.aperture)
+    check_mask(found.aperture)
     assert found.mse < float(COARSE(start))
 
 
@@ -83,7 +83,7 @@ def test_records_lead_to_the_result():
 def test_extra_rules_are_obeyed_exactly():
     rules = [KeepOutDisc(0.2), MinimumGap(0.02), NFoldSymmetry(3)]
     found = search_mask(COARSE, 6, 1.0, 0.1, budget=1500, constraints=rules, seed=0)
-    check(found.aperture, 1e-9, rules)
+    check_mask(found.aperture, 1e-9, rules)
 
 
 @pytest.mark.parametrize(

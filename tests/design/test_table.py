@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 import torch
 
+from torchmask.design.constraint_base import Infeasible
 from torchmask.design.criterion import AsymptoticMSE, wiener_mse
-from torchmask.design.feasibility import Infeasible
-from torchmask.design.psd import NoisePSD, PowerLawPSD
 from torchmask.design.space import DesignSpace
 from torchmask.design.table import design_table, measure
 from torchmask.grid import Grid
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.otf import analytic_otf
+from torchmask.spectra import NoisePSD, PowerLawPSD
 
 SMALL = DesignSpace(n_subapertures=(3, 5), n_pixels=32, n_frames=(2,), n_draws=2, diameter_over_r0=(3.0,), budget=64)
 

@@ -7,10 +7,10 @@ from scipy.stats import chi2, norm
 from torch import nn
 
 from torchmask.design.criterion import AsymptoticMSE
-from torchmask.design.psd import NoisePSD, PowerLawPSD
 from torchmask.design.tolerance import machining_errors, machining_tolerance
 from torchmask.grid import Grid
 from torchmask.optics.aperture import SparseAperture
+from torchmask.spectra import NoisePSD, PowerLawPSD
 
 HOLE = 0.1
 

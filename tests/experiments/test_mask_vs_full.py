@@ -12,9 +12,9 @@ import pytest
 import torch
 from scipy import stats
 
+from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.io import save_npz
-from torchmask.optics.otf import psf_from_samples
-from torchmask.optics.turbulence import TurbulencePhase
+from torchmask.optics.psf import psf_from_samples
 from torchmask.optics.zernike import zernike_basis
 
 PATH = Path(__file__).parents[2] / "experiments" / "mask_vs_full.py"

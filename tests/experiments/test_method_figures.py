@@ -16,10 +16,10 @@ import torch
 
 from torchmask.design.criterion import AsymptoticMSE
 from torchmask.design.manufacture import load_mask
-from torchmask.design.psd import NoisePSD, PowerLawPSD
 from torchmask.grid import Grid
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.otf import analytic_otf
+from torchmask.spectra import NoisePSD, PowerLawPSD
 
 SCRIPTS = {"asymptotic_limit": asymptotic_limit, "optimal_masks": optimal_masks, "mse_vs_n": mse_vs_n}
 

@@ -15,7 +15,7 @@ from companion_fit import CompanionModel, Exposures
 from torchmask.data.keywords import ARCSEC, FILTERS
 from torchmask.grid import Grid
 from torchmask.optics.aperture import SparseAperture
-from torchmask.optics.otf import psf_from_samples
+from torchmask.optics.psf import psf_from_samples
 from torchmask.optics.zernike import ZernikePhase
 
 # torch.func itself still scripts some derivatives.

@@ -8,9 +8,9 @@ import pytest
 import redundancy
 import torch
 
+from torchmask.atmosphere.von_karman import von_karman_structure_function
 from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture, SparseAperture
-from torchmask.optics.von_karman import von_karman_structure_function
 
 GRID = Grid.nyquist(1.0, 550e-9, 128)
 STEP = GRID.period / 128

@@ -5,12 +5,13 @@ import importlib.util
 import pytest
 import torch
 
+from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.grid import Grid
-from torchmask.metrics import score
+from torchmask.metrics import relative_error
+from torchmask.observation import Observation
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.detector import Detector, image_formation
-from torchmask.optics.turbulence import TurbulencePhase
-from torchmask.simulation.observation import Observation, simulate_observation
+from torchmask.simulation.exposures import simulate_observation
 
 if importlib.util.find_spec("deepinv") is None:
     pytest.skip("needs the extra deepinv", allow_module_level=True)
@@ -119,7 +120,9 @@ def test_total_variation_restores_the_object(observation, solver):
     with torch.no_grad():
         restored = getattr(deepinv.optim, solver)(deepinv.optim.L2(), prior, lambda_reg=3e-4, **settings)(y, physics)
     assert restored.dtype == torch.float64
-    before, after = (score(image, observation.object, 0.5) for image in (observation.frames.mean(0), restored[0, 0]))
+    before, after = (
+        relative_error(image, observation.object, 0.5) for image in (observation.frames.mean(0), restored[0, 0])
+    )
     assert after < 0.6 * before
 
 

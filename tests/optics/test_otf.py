@@ -7,16 +7,8 @@ from torch import nn
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture, SparseAperture
-from torchmask.optics.otf import (
-    OTF,
-    PSF,
-    analytic_otf,
-    disc_otf,
-    fold,
-    hexagon_otf,
-    psf_from_samples,
-    subaperture_otf,
-)
+from torchmask.optics.otf import OTF, analytic_otf, disc_otf, hexagon_otf, subaperture_otf
+from torchmask.optics.psf import PSF, fold, psf_from_samples
 
 WAVELENGTH = 550e-9
 

@@ -9,7 +9,7 @@ from torch import nn
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture, SparseAperture
-from torchmask.optics.otf import PSF, psf_from_samples
+from torchmask.optics.psf import PSF, psf_from_samples
 from torchmask.optics.zernike import ZernikePhase, aperture_modes, noll, quadrature, zernike, zernike_basis
 
 WAVELENGTH = 550e-9

@@ -9,13 +9,13 @@ import warnings
 import pytest
 import torch
 
+from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.grid import Grid
-from torchmask.metrics import score
+from torchmask.metrics import relative_error
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.detector import Detector
-from torchmask.optics.turbulence import TurbulencePhase
 from torchmask.restoration.myopic import MyopicDeconvolution
-from torchmask.simulation.observation import simulate_observation
+from torchmask.simulation.exposures import simulate_observation
 
 GRID = Grid.nyquist(1.0, 550e-9, 40)
 R0, READOUT = 0.6, 1.5  # so weak that 300 iterations do
@@ -66,7 +66,7 @@ def test_dead_pixels_change_neither_noise_nor_image(seen):
         warnings.simplefilter("error")
         result = method().restore(torch.where(valid, seen.frames, math.nan), valid=valid, n_samples=2)
     assert result.noise == pytest.approx(whole.noise, rel=0.12)  # 3 sigma of medians of 170 frequencies
-    assert score(result.object, seen.object, 0.5) < 1.2 * score(whole.object, seen.object, 0.5)
+    assert relative_error(result.object, seen.object, 0.5) < 1.2 * relative_error(whole.object, seen.object, 0.5)
     assert bool(torch.isfinite(result.object_std).all())
 
 
@@ -76,7 +76,7 @@ def test_saturated_pixels_are_to_be_marked(seen):
     unmarked = method().restore(clipped)
     marked = method().restore(clipped, valid=clipped < full_well)
     assert bool(torch.isfinite(unmarked.object).all())
-    assert score(marked.object, seen.object, 0.5) < 0.5 * score(unmarked.object, seen.object, 0.5)
+    assert relative_error(marked.object, seen.object, 0.5) < 0.5 * relative_error(unmarked.object, seen.object, 0.5)
     assert marked.noise < READOUT + float(seen.frames.mean()) ** 0.5  # what is clipped does not count as noise
     assert float(unmarked.chi_square.mean()) > 3 * float(marked.chi_square.mean())  # which tells who forgets it
 
@@ -103,7 +103,9 @@ def test_one_frame_of_odd_sides(shape):
     single = observe(grid, n_frames=1)
     result = method(grid, readout_noise=READOUT).restore(single.frames, n_samples=2)
     assert result.object.shape == result.object_std.shape == shape
-    assert score(result.object, single.object, 0.5) < 0.75 * score(single.frames[0], single.object, 0.5)
+    assert relative_error(result.object, single.object, 0.5) < 0.75 * relative_error(
+        single.frames[0], single.object, 0.5
+    )
 
 
 def test_an_object_wider_than_the_field_is_noticed(seen):
@@ -129,7 +131,7 @@ def test_frames_that_no_aberration_explains_do_little_harm():
     short = seen.frames[:4]
     smeared = torch.stack([seen.frames[4:7].mean(0), seen.frames[7:].mean(0)])
     patient = method(max_iterations=600)
-    alone = score(patient.restore(short).object, seen.object, 0.5)
-    together = score(patient.restore(torch.cat([short, smeared])).object, seen.object, 0.5)
+    alone = relative_error(patient.restore(short).object, seen.object, 0.5)
+    together = relative_error(patient.restore(torch.cat([short, smeared])).object, seen.object, 0.5)
     # Measured 1.225. Squared weights, which cost a tenth at 1e8 photons, kept it below 1.2.
     assert together < 1.25 * alone

@@ -5,10 +5,10 @@ import math
 import pytest
 import torch
 
+from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture, SparseAperture
-from torchmask.optics.otf import PSF
-from torchmask.optics.turbulence import TurbulencePhase
+from torchmask.optics.psf import PSF
 from torchmask.restoration.baselines import average_psf, shift_and_add
 
 GRID = Grid.nyquist(1.0, 550e-9, 48)

@@ -7,7 +7,7 @@ import torch
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture, SparseAperture
-from torchmask.optics.otf import psf_from_samples
+from torchmask.optics.psf import psf_from_samples
 from torchmask.optics.zernike import ZernikePhase
 from torchmask.restoration.model import ExposureModel, fast_size, weighted_misfit
 

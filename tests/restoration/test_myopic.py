@@ -9,15 +9,16 @@ import numpy as np
 import pytest
 import torch
 
+from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.grid import Grid
-from torchmask.metrics import score
+from torchmask.metrics import relative_error
+from torchmask.observation import Observation
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.detector import Detector
-from torchmask.optics.turbulence import TurbulencePhase
 from torchmask.record import Record
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.result import RestorationResult
-from torchmask.simulation.observation import Observation, simulate_observation
+from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
 
 GRID = Grid.nyquist(1.0, 550e-9, 48)
@@ -68,7 +69,9 @@ def known(observation):
 
 def errors(observation, image):
     """Scores of a restoration and of the mean frame."""
-    return score(image, observation.object, 0.5), score(observation.frames.mean(0), observation.object, 0.5)
+    return relative_error(image, observation.object, 0.5), relative_error(
+        observation.frames.mean(0), observation.object, 0.5
+    )
 
 
 def test_beats_the_mean_frame_and_explains_the_data(observation, known):
@@ -402,5 +405,5 @@ def test_reference_stacks(name, limit):
     stack = Observation.load(STACKS / f"{name}.npz")
     started = time.process_time()
     result = MyopicDeconvolution(stack.aperture, stack.grid).restore(stack.frames)
-    assert score(result.object, stack.object, 0.5) < limit
+    assert relative_error(result.object, stack.object, 0.5) < limit
     assert time.process_time() - started < 120

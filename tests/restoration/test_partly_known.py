@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchmask.grid import Grid
-from torchmask.metrics import score
+from torchmask.metrics import relative_error
 from torchmask.optics.aperture import SparseAperture
 from torchmask.restoration.model import ExposureModel
 from torchmask.restoration.myopic import MyopicDeconvolution
@@ -53,7 +53,7 @@ def test_refines_what_was_measured(exposures):
     fits = refined.chi_square < 1.3  # one frame may stay in a local minimum, which it shows
     assert int(fits.sum()) >= 7
     assert error(refined.coefficients[fits], true[fits]) < 0.2 * ERROR
-    assert score(refined.object, scene, 0.5) < 0.5 * score(fixed.object, scene, 0.5)
+    assert relative_error(refined.object, scene, 0.5) < 0.5 * relative_error(fixed.object, scene, 0.5)
     assert float(fixed.chi_square.min()) > 1.3
     assert math.isnan(refined.r0)
 

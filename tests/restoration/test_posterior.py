@@ -5,11 +5,11 @@ import math
 import pytest
 import torch
 
+from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.grid import Grid
 from torchmask.metrics import align, lowpass
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.detector import Detector
-from torchmask.optics.turbulence import TurbulencePhase
 from torchmask.restoration.conjugate import conjugate_gradients
 from torchmask.restoration.model import ExposureModel
 from torchmask.restoration.myopic import MyopicDeconvolution
@@ -23,7 +23,7 @@ from torchmask.restoration.posterior import (
 )
 from torchmask.restoration.priors import divergence, gradient, whitening
 from torchmask.restoration.problem import JointProblem, State
-from torchmask.simulation.observation import simulate_observation
+from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
 
 GRID = Grid.nyquist(1.0, 550e-9, 48)

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
+from torchmask.atmosphere.von_karman import modal_covariance
 from torchmask.optics.aperture import FullAperture, SparseAperture
-from torchmask.optics.von_karman import modal_covariance
 from torchmask.restoration.priors import total_variation, total_variation_curvature, whitening
 
 

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from torchmask.design.criterion import wiener_mse
-from torchmask.design.psd import NoisePSD, PowerLawPSD
 from torchmask.grid import Grid
 from torchmask.restoration.wiener import multiframe_wiener
+from torchmask.spectra import NoisePSD, PowerLawPSD
 
 SHAPE = (12, 10)
 

@@ -16,25 +16,26 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from torchmask import viz
+from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.cli.design import make_criterion, search
 from torchmask.cli.options import ConfigOptions, SearchOptions
 from torchmask.cli.report import log_design, log_observation
 from torchmask.cli.run import Run, new_run
-from torchmask.design.psd import NoisePSD
 from torchmask.design.search import SearchResult
 from torchmask.grid import Grid
 from torchmask.io import save_npz
-from torchmask.metrics import score, ssim
+from torchmask.metrics import relative_error, ssim
+from torchmask.observation import Observation
 from torchmask.optics.aperture import Aperture, FullAperture, SparseAperture
 from torchmask.optics.detector import Detector
 from torchmask.optics.packing import hole_diameter
-from torchmask.optics.turbulence import TurbulencePhase
 from torchmask.record import Callback
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.result import RestorationResult
-from torchmask.simulation.observation import Observation, simulate_observation
+from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
+from torchmask.spectra import NoisePSD
+from torchmask.viz import figures as viz
 
 
 @dataclass(frozen=True)
@@ -189,9 +190,9 @@ def metrics(observation: Observation, result: RestorationResult, cutoff: float) 
     truth = observation.object
     assert truth is not None
     return {
-        "score": score(result.object, truth, cutoff),
+        "score": relative_error(result.object, truth, cutoff),
         "ssim": ssim(result.object, truth, cutoff),
-        "mean_frame_score": score(observation.frames.mean(0), truth, cutoff),
+        "mean_frame_score": relative_error(observation.frames.mean(0), truth, cutoff),
         "photons_per_frame": float(truth.sum()),
         "chi_square": float(result.chi_square.mean()),
         "iterations": len(result.cost),

@@ -12,11 +12,10 @@ from typing import Literal
 from torchmask.cli.options import RunOptions, SearchOptions
 from torchmask.cli.report import log_design
 from torchmask.cli.run import new_run
+from torchmask.design.constraint_base import Constraint, project
 from torchmask.design.constraints import InsideDisc, KeepOutDisc, KeepOutSegment, MinimumGap, NoOverlap
 from torchmask.design.criterion import AsymptoticMSE
-from torchmask.design.feasibility import Constraint, project
 from torchmask.design.manufacture import save_json, save_svg
-from torchmask.design.psd import NoisePSD, PowerLawPSD
 from torchmask.design.redundancy import analyse_redundancy
 from torchmask.design.search import SearchResult, search_mask
 from torchmask.grid import Grid
@@ -24,6 +23,7 @@ from torchmask.io import write_json
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.packing import hole_diameter
 from torchmask.record import Callback, Record
+from torchmask.spectra import NoisePSD, PowerLawPSD
 from torchmask.tracking import fan_out
 
 

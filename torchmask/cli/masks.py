@@ -9,13 +9,13 @@ from pathlib import Path
 
 import tyro
 
-from torchmask import viz
 from torchmask.cli.options import DebugOptions
 from torchmask.design.manufacture import save_dxf, save_fits, save_json, save_svg
 from torchmask.design.redundancy import analyse_redundancy
 from torchmask.io import atomic_write
 from torchmask.optics import catalog
 from torchmask.optics.aperture import SparseAperture
+from torchmask.viz import figures as viz
 
 _ANY_SIZE = (1.0, 0.1)  # mask diameter [m] and fill factor at which a mask without a size of its own is shown
 

@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from torchmask import _drawing as drawing
-from torchmask import viz
+from torchmask.design.constraint_base import Constraint
 from torchmask.design.constraints import KeepOutDisc, KeepOutSegment
-from torchmask.design.feasibility import Constraint
 from torchmask.design.search import SearchResult
 from torchmask.grid import Grid
 from torchmask.io import as_array
-from torchmask.optics.otf import PSF
-from torchmask.simulation.observation import Observation
+from torchmask.observation import Observation
+from torchmask.optics.psf import PSF
 from torchmask.tracking import RunLogger
+from torchmask.viz import figures as viz
+from torchmask.viz import style as drawing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -11,18 +11,19 @@ from typing import Any, Literal
 
 import tyro
 
-from torchmask import viz
 from torchmask.cli.config import stored
 from torchmask.cli.options import ARCSEC, MaskOptions, RunOptions, load_aperture
 from torchmask.cli.report import restored_figure
 from torchmask.cli.run import Run, new_run
+from torchmask.data.observe import read_observation
 from torchmask.data.restored import save_restored
 from torchmask.grid import Grid
 from torchmask.io import write_json
-from torchmask.metrics import score, ssim
+from torchmask.metrics import relative_error, ssim
+from torchmask.observation import Observation
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.result import RestorationResult
-from torchmask.simulation.observation import Observation
+from torchmask.viz import figures as viz
 
 CHECKPOINT = "resume.npz"  # of a run: from here it can go on
 
@@ -169,7 +170,7 @@ def _from_fits(stack: list[Path], options: Options) -> Observation:
     given = {item.name: getattr(options, item.name) for item in dataclasses.fields(FITSOptions)}
     given |= {"wavelength": options.wavelength, "readout_noise": options.readout_noise}
     try:
-        return Observation.from_fits(stack, aperture, pixel_scale=None if scale is None else scale * ARCSEC, **given)
+        return read_observation(stack, aperture, pixel_scale=None if scale is None else scale * ARCSEC, **given)
     except ValueError as error:
         message = str(error).replace("give pixel_scale [rad]", "give --pixel-scale-arcsec [arcsec]")
         for name in given:
@@ -193,9 +194,9 @@ def metrics(observation: Observation, result: RestorationResult) -> dict[str, An
     }
     if observation.object is not None:
         cutoff = observation.grid.cutoff(observation.aperture.mask_diameter)
-        table["score"] = score(result.object, observation.object, cutoff)
+        table["score"] = relative_error(result.object, observation.object, cutoff)
         table["ssim"] = ssim(result.object, observation.object, cutoff)
-        table["mean_frame_score"] = score(observation.frames.mean(0), observation.object, cutoff)
+        table["mean_frame_score"] = relative_error(observation.frames.mean(0), observation.object, cutoff)
     return table
 
 

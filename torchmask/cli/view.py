@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import tyro
 
-from torchmask import viz
 from torchmask.cli.masks import describe
 from torchmask.cli.options import ARCSEC, DebugOptions
 from torchmask.cli.report import restored_figure
 from torchmask.data.fits import read_fits
 from torchmask.design.manufacture import load_mask
 from torchmask.io import atomic_write, load_npz, read_json
+from torchmask.observation import Observation
 from torchmask.optics.aperture import SparseAperture
 from torchmask.restoration.result import RestorationResult
-from torchmask.simulation.observation import Observation
 from torchmask.tracking import read_metrics
+from torchmask.viz import figures as viz
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -14,12 +14,13 @@ from torchmask.data import keywords
 from torchmask.data.calibration import SELECTIONS, best_frames, calibrate, crop_corner, find_target
 from torchmask.data.fits import FITSImages, read_fits
 from torchmask.grid import Grid
+from torchmask.observation import Observation
 from torchmask.optics.aperture import Aperture
 
 PathLike = str | Path
 
 
-def observation_fields(
+def read_observation(
     paths: PathLike | Sequence[PathLike],
     aperture: Aperture,
     *,
@@ -36,8 +37,59 @@ def observation_fields(
     target: tuple[int, int] | None = None,
     keep: float | None = None,
     keep_by: str = "sharpness",
-) -> dict[str, Any]:
-    """The fields of the Observation that `Observation.from_fits` documents."""
+) -> Observation:
+    """Read a telescope's exposures: a cube (T, H, W), an image, or a list of such files, in that order.
+
+    An option left at None is taken from the header; what is given wins over it. Needs astropy (extra `data`).
+
+    Parameters
+    ----------
+    paths : path or sequence of paths
+        FITS files of one filter, pixel scale and orientation. The SCI extension is read, or else the first image;
+        ERR becomes `errors`, DQ marks pixels that are not valid.
+    aperture : Aperture
+        That they were taken through, in metres on the pupil, x and y along the image's columns and rows.
+    wavelength : float, optional
+        [m]. Header: WAVELEN, or the FILTER of a known instrument.
+    pixel_scale : float, optional
+        [rad]. Header: PIXELSCL [arcsec], or CD, PC or CDELT.
+    unit : str, optional
+        Unit of the pixels, such as "adu", "electron / s" or "250 electron". Header: BUNIT; without it the pixels
+        are in adu where a gain is known, and in electrons (with a warning) where none is.
+    gain : float, optional
+        Electrons per adu (DN, count). Header: EGAIN, GAIN.
+    exposure_time : float, optional
+        Of one frame [s], for units per second. Header: XPOSURE, EXPTIME; EFFINTTM for cubes of JWST.
+    readout_noise : float, optional
+        [electrons rms]. Header: RDNOISE, READNOIS. It may remain unknown.
+    dark, flat, bad_pixels : path or (H, W) array, optional
+        In the units of the file; of any scale; not 0 where bad. Of a cube the median is used.
+    crop : int, optional
+        Side of the field that is cut out around the target, which comes to pixel [crop // 2, crop // 2]: the same
+        in all frames of a file, found afresh in every file. The sky coordinates move with it.
+    target : (row, column), optional
+        Pixel of the target in every file, counted from 0. None: where the mean frame is brightest.
+    keep : float, optional
+        Fraction of the frames to keep: those of highest `keep_by`, "sharpness" or "flux".
+
+    Raises
+    ------
+    ValueError
+        If a file is missing or damaged, a keyword that is needed is missing (the message names it and the option
+        that stands for it), the files mix filters, pixel scales, shapes or orientations, or an option is wrong.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from astropy.io import fits
+    >>> from torchmask.optics.aperture import SparseAperture
+    >>> path = tempfile.mkdtemp() + "/cube.fits"
+    >>> header = fits.Header({"BUNIT": "electron", "PIXELSCL": 0.05, "WAVELEN": 550e-9, "RDNOISE": 1.5})
+    >>> fits.writeto(path, np.ones((5, 32, 32), dtype="float32"), header)
+    >>> observation = read_observation(path, SparseAperture([[0.0, 0.3], [0.3, -0.2], [-0.3, -0.2]], 0.2, 1.0))
+    >>> observation.frames.shape, observation.readout_noise
+    (torch.Size([5, 32, 32]), 1.5)
+    """
     _check_options(wavelength, pixel_scale, gain, exposure_time, readout_noise, crop, keep, keep_by)
     if target is not None and crop is None:
         raise ValueError(f"target is {target}, the middle of the field to cut out: give crop [pixels] too")
@@ -73,15 +125,15 @@ def observation_fields(
     if readout_noise is None and len(known) == len(files):
         readout_noise = math.sqrt(sum(noise**2 for noise in known) / len(known))
     side = frames.shape[-1] if frames.shape[-1] == frames.shape[-2] else frames.shape[-2:]
-    return {
-        "frames": torch.from_numpy(frames),
-        "aperture": aperture,
-        "grid": Grid(side, scales[0], lengths[0]),
-        "readout_noise": readout_noise,
-        "valid": torch.from_numpy(valid),
-        "errors": None if errors is None else torch.from_numpy(errors),
-        "header": headers[0] | _mean_exposure(files, times),
-    }
+    return Observation(
+        frames=torch.from_numpy(frames),
+        aperture=aperture,
+        grid=Grid(side, scales[0], lengths[0]),
+        readout_noise=readout_noise,
+        valid=torch.from_numpy(valid),
+        errors=None if errors is None else torch.from_numpy(errors),
+        header=headers[0] | _mean_exposure(files, times),
+    )
 
 
 def _mean_exposure(files: Sequence[FITSImages], times: Sequence[float | None]) -> dict[str, float]:

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from torchmask.data.keywords import ARCSEC
 from torchmask.io import as_array, atomic_write
+from torchmask.observation import Observation
 from torchmask.restoration.result import RestorationResult
-from torchmask.simulation.observation import Observation
 
 
 def save_restored(

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchmask.design.feasibility import Constraint, Inequality, LinearEquality, require_constraints
+from torchmask.design.constraint_base import Constraint, Inequality, LinearEquality, require_constraints
 from torchmask.optics.aperture import SparseAperture
 
 
@@ -251,7 +251,7 @@ class NFoldSymmetry(LinearEquality):
         return matrix, np.zeros(2 * n_subapertures)
 
 
-def check(aperture: SparseAperture, tolerance: float = 1e-9, constraints: Sequence[Constraint] = ()) -> None:
+def check_mask(aperture: SparseAperture, tolerance: float = 1e-9, constraints: Sequence[Constraint] = ()) -> None:
     """Raise ValueError unless the holes lie in the mask disc, do not overlap and obey `constraints`.
 
     Parameters
@@ -263,7 +263,7 @@ def check(aperture: SparseAperture, tolerance: float = 1e-9, constraints: Sequen
 
     Examples
     --------
-    >>> check(SparseAperture([[-0.4, 0.0], [0.4, 0.0]], subaperture_diameter=0.2, mask_diameter=1.0))
+    >>> check_mask(SparseAperture([[-0.4, 0.0], [0.4, 0.0]], subaperture_diameter=0.2, mask_diameter=1.0))
     """
     require_constraints(constraints)
     for constraint in (InsideDisc(), NoOverlap(), *constraints):

@@ -15,9 +15,9 @@ import torch
 from torch import Tensor, nn
 
 from torchmask.design.overlap import BaselineMSE, Geometry
-from torchmask.design.psd import PSD, evaluate_psd, resample_psd
 from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture, FullAperture
+from torchmask.spectra import PSD, evaluate_psd, resample_psd
 
 
 class AsymptoticMSE(nn.Module):
@@ -52,7 +52,7 @@ class AsymptoticMSE(nn.Module):
 
     Examples
     --------
-    >>> from torchmask.design.psd import NoisePSD, PowerLawPSD
+    >>> from torchmask.spectra import NoisePSD, PowerLawPSD
     >>> from torchmask.optics.aperture import SparseAperture
     >>> grid = Grid.nyquist(diameter=1.0, wavelength=550e-9, n_pixels=64)
     >>> criterion = AsymptoticMSE(grid, PowerLawPSD(1.5, 1e7), NoisePSD(1e7), n_frames=20)

@@ -42,7 +42,7 @@ class Pool:
         self.entries = sorted([*self.entries, (value, x, shape)], key=lambda entry: entry[0])[: self.size]
 
 
-def hop(
+def basin_hopping(
     criterion: Criterion, holes: Holes, budget: int, rng: np.random.Generator, monitor: Monitor
 ) -> tuple[Tensor, int]:
     """The best few local optima (n, F) found within `budget` evaluations of `criterion`, best first, and their cost."""

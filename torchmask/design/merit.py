@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from torchmask.design.feasibility import Constraint, Subspace, all_margins, project, with_centers
+from torchmask.design.constraint_base import Constraint, Subspace, all_margins, project, with_centers
 from torchmask.optics.aperture import SparseAperture
 
 

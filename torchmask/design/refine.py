@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from torchmask.design.constraints import InsideDisc, NoOverlap, check
+from torchmask.design.constraint_base import Constraint, Infeasible, require_constraints
+from torchmask.design.constraints import InsideDisc, NoOverlap, check_mask
 from torchmask.design.descent import BatchedBFGS
-from torchmask.design.feasibility import Constraint, Infeasible, require_constraints
 from torchmask.design.merit import Criterion, Holes, Merit
 from torchmask.optics.aperture import SparseAperture
 from torchmask.record import Callback, Record
@@ -123,7 +123,7 @@ def refine_mask(
     Examples
     --------
     >>> from torchmask.design.criterion import AsymptoticMSE
-    >>> from torchmask.design.psd import NoisePSD, PowerLawPSD
+    >>> from torchmask.spectra import NoisePSD, PowerLawPSD
     >>> from torchmask.grid import Grid
     >>> grid = Grid.nyquist(diameter=1.0, wavelength=550e-9, n_pixels=64)
     >>> criterion = AsymptoticMSE(grid, PowerLawPSD(1.5, 1e7), NoisePSD(1e7), n_frames=20)
@@ -218,7 +218,7 @@ def conclude(
 ) -> SearchResult:
     """Check the mask and measure it."""
     tolerance = TOLERANCE if aperture.centers.dtype == torch.float64 else 1e-6
-    check(aperture, tolerance, constraints)
+    check_mask(aperture, tolerance, constraints)
     with torch.no_grad():
         mse, relative = float(criterion(aperture)), float(criterion.relative(aperture))
     return SearchResult(aperture, mse, relative, evaluations, history)

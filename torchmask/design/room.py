@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from torchmask.design.constraint_base import Constraint, Inequality, Infeasible, require_constraints
 from torchmask.design.constraints import InsideDisc, NoOverlap
 from torchmask.design.descent import BatchedBFGS
-from torchmask.design.feasibility import Constraint, Inequality, Infeasible, require_constraints
 from torchmask.design.merit import Holes
 from torchmask.design.starts import random_mask
 from torchmask.optics.aperture import SparseAperture

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from torchmask.design.cma import evolve
-from torchmask.design.feasibility import Constraint
-from torchmask.design.hybrid import coarse_criterion, hop
+from torchmask.design.constraint_base import Constraint
+from torchmask.design.hybrid import basin_hopping, coarse_criterion
 from torchmask.design.merit import Criterion
 from torchmask.design.refine import Monitor, SearchResult, conclude, polish
 from torchmask.design.room import require_room
@@ -73,7 +73,7 @@ def search_mask(
     A small search on a coarse grid; leave `budget` out for a result to quote.
 
     >>> from torchmask.design.criterion import AsymptoticMSE
-    >>> from torchmask.design.psd import NoisePSD, PowerLawPSD
+    >>> from torchmask.spectra import NoisePSD, PowerLawPSD
     >>> from torchmask.grid import Grid
     >>> grid = Grid.nyquist(diameter=1.0, wavelength=550e-9, n_pixels=64)
     >>> criterion = AsymptoticMSE(grid, PowerLawPSD(1.5, 1e7), NoisePSD(1e7), n_frames=20)
@@ -93,7 +93,7 @@ def search_mask(
     holes, fallback = require_room(n_subapertures, mask_diameter, fill_factor, constraints)
     rng = np.random.default_rng(seed)
     monitor = Monitor(f"design/{method}", budget, holes, callback)
-    explore = evolve if method == "cma" else hop
+    explore = evolve if method == "cma" else basin_hopping
     working = criterion if method == "cma" else coarse_criterion(criterion)
     starts, used = explore(working, holes, budget, rng, monitor)
     history = monitor.history

@@ -16,9 +16,9 @@ from typing import Any
 
 import torch
 
+from torchmask.atmosphere.phase import TurbulencePhase
+from torchmask.design.constraint_base import Infeasible
 from torchmask.design.criterion import AsymptoticMSE, wiener_mse
-from torchmask.design.feasibility import Infeasible
-from torchmask.design.psd import NoisePSD, PowerLawPSD
 from torchmask.design.search import search_mask
 from torchmask.design.space import AXES, Design, DesignSpace
 from torchmask.design.sweep import require_backend, run_tasks
@@ -26,8 +26,8 @@ from torchmask.grid import Grid
 from torchmask.io import atomic_write, write_json
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.otf import OTF
-from torchmask.optics.turbulence import TurbulencePhase
 from torchmask.record import Callback
+from torchmask.spectra import NoisePSD, PowerLawPSD
 
 _FRAMES_AT_ONCE = 20  # OTFs held in memory
 _HEADINGS = {

@@ -162,7 +162,7 @@ def machining_tolerance(
     Examples
     --------
     >>> from torchmask.design.criterion import AsymptoticMSE
-    >>> from torchmask.design.psd import NoisePSD, PowerLawPSD
+    >>> from torchmask.spectra import NoisePSD, PowerLawPSD
     >>> from torchmask.grid import Grid
     >>> criterion = AsymptoticMSE(Grid.nyquist(1.0, 550e-9, 128), PowerLawPSD(1.5, 1e7), NoisePSD(1e7), n_frames=20)
     >>> mask = SparseAperture.from_catalog("golay6", 1.0, 0.15)

@@ -11,8 +11,8 @@ import torch
 from deepinv.physics import LinearPhysics, PoissonGaussianNoise  # pyright: ignore[reportMissingImports] -- an extra
 from torch import Tensor
 
+from torchmask.observation import Observation
 from torchmask.optics.detector import image_formation, image_formation_adjoint
-from torchmask.simulation.observation import Observation
 
 
 class StackPhysics(LinearPhysics):

@@ -177,7 +177,7 @@ class SparseAperture(Aperture):
     Notes
     -----
     Feasibility (holes inside the disc, no overlap) is not demanded here, because real masks may break it
-    slightly: see `torchmask.design.constraints.check`.
+    slightly: see `torchmask.design.constraints.check_mask`.
 
     Examples
     --------

@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture
-from torchmask.optics.otf import PSF
-from torchmask.optics.turbulence import TurbulencePhase
+from torchmask.optics.psf import PSF
 from torchmask.restoration.initialization import check_frames
 
 _OVERSAMPLING = 4  # of the pupil: phases change within the cells of the Nyquist raster

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchmask.atmosphere.von_karman import modal_covariance
 from torchmask.optics.aperture import Aperture
-from torchmask.optics.von_karman import modal_covariance
 
 _LEAST_ERROR = 1e-3  # rad
 _ROUNDING = 1e-6  # of a covariance that may come from float32

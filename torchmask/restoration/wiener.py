@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchmask.design.psd import PSD, evaluate_psd
 from torchmask.grid import Grid
+from torchmask.spectra import PSD, evaluate_psd
 
 
 def multiframe_wiener(frames: Tensor, otfs: Tensor, object_psd: PSD, noise_psd: PSD) -> Tensor:

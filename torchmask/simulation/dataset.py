@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.detector import Detector
-from torchmask.optics.turbulence import TurbulencePhase
-from torchmask.simulation.observation import simulate_observation
+from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.render import load_mesh, render_mesh
 from torchmask.simulation.satellite import satellite_mesh
 

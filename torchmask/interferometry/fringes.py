@@ -7,12 +7,18 @@ import math
 import torch
 from torch import Tensor
 
-from torchmask.data.visibilities import Observables, fringe_waves, pairs_and_triangles, sky_stations, triangle_sides
 from torchmask.grid import Grid
+from torchmask.interferometry.visibilities import (
+    Observables,
+    fringe_waves,
+    pairs_and_triangles,
+    sky_stations,
+    triangle_sides,
+)
+from torchmask.observation import Observation
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.otf import subaperture_otf
 from torchmask.restoration.initialization import check_frames
-from torchmask.simulation.observation import Observation
 
 _FIELD = 4  # the envelope of the fringes is computed on a field this many times as wide, against its wrap-around
 _WORST_CONDITION = 1e6  # of the normal equations of the fringes
@@ -56,12 +62,12 @@ def frame_observables(observation: Observation) -> Observables:
     >>> from torchmask.grid import Grid
     >>> from torchmask.optics.aperture import SparseAperture
     >>> from torchmask.optics.detector import Detector
-    >>> from torchmask.simulation.observation import simulate_observation
+    >>> from torchmask.simulation.exposures import simulate_observation
     >>> star = torch.zeros(64, 64, dtype=torch.float64); star[32, 32] = 1e7  # electrons per frame
     >>> mask = SparseAperture([[0.0, 0.4], [-0.35, -0.2], [0.35, -0.25]], 0.15, 1.0)
     >>> seen = simulate_observation(star, mask, Grid.nyquist(1.0, 550e-9, 64), None, Detector(), n_frames=4)
     >>> observables = frame_observables(seen)
-    >>> bool((observables.squared > 0.97).all()), bool((observables.closure_phases.abs() < 0.01).all())
+    >>> bool((observables.vis2 > 0.97).all()), bool((observables.closure_phases.abs() < 0.01).all())
     (True, True)
     """
     aperture, grid = observation.aperture, observation.grid
@@ -81,7 +87,7 @@ def frame_observables(observation: Observation) -> Observables:
     values, noise = fringes * n, noise * n**2
     visibilities, visibility_errors = _ratio(values, light, noise / 2)
     power = (values.abs() ** 2 - noise).clamp(min=0)
-    squared, squared_errors = _ratio(
+    vis2, vis2_errors = _ratio(
         values.abs() ** 2 - noise, light**2, 4 * power**2 * _variance(logarithms.real, covariance) + noise**2
     )
     first, second, third = triangle_sides(pairs, triangles)
@@ -99,8 +105,8 @@ def frame_observables(observation: Observation) -> Observables:
         sky_stations(observation),
         visibilities,
         visibility_errors,
-        squared,
-        squared_errors,
+        vis2,
+        vis2_errors,
         triple.angle(),
         sideways / amplitudes,
         amplitudes,

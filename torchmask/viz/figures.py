@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from torchmask import _drawing as drawing
 from torchmask.grid import Grid
 from torchmask.io import as_array
-from torchmask.metrics import align, lowpass, score
+from torchmask.metrics import align, lowpass, relative_error
 from torchmask.optics.aperture import Aperture
+from torchmask.viz import style as drawing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -246,7 +246,7 @@ def comparison_figure(
     -----
     All images share one grey scale, that of the diffraction-limited truth up to its 99.5th percentile, with a square
     root to show faint parts. Restorations are registered and scaled as for their score (`torchmask.metrics.align`);
-    frames are as they came, with the flux of the truth. Errors as in `torchmask.metrics.score`.
+    frames are as they came, with the flux of the truth. Errors as in `torchmask.metrics.relative_error`.
     """
     images = _comparison_images(truth, drawing.not_empty(results), cutoff)
     n = len(results)
@@ -275,11 +275,11 @@ def _comparison_images(
     for k, (name, (frame, restored)) in enumerate(results.items()):
         raw = as_array(frame).astype(float)
         images[f"frame {k}"] = (
-            f"{name}\none exposure, score {score(raw, reference, cutoff):.3f}",
+            f"{name}\none exposure, score {relative_error(raw, reference, cutoff):.3f}",
             raw * (reference.sum() / raw.sum()),
         )
         images[f"restored {k}"] = (
-            f"{name}\nrestored, score {score(restored, reference, cutoff):.3f}",
+            f"{name}\nrestored, score {relative_error(restored, reference, cutoff):.3f}",
             align(restored, reference, cutoff).numpy(),
         )
     return images

@@ -11,22 +11,25 @@ import torch
 from scipy.integrate import quad
 from scipy.special import j0
 
-from torchmask.data.fringes import frame_observables
-from torchmask.data.visibilities import Observables, restored_observables, sky_stations
+from torchmask.atmosphere.phase import TurbulencePhase
+from torchmask.data.observe import read_observation
 from torchmask.grid import Grid
-from torchmask.oifits import save_oifits
+from torchmask.interferometry.fringes import frame_observables
+from torchmask.interferometry.oifits import save_oifits
+from torchmask.interferometry.visibilities import Observables, restored_observables, sky_stations
+from torchmask.observation import Observation
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.detector import Detector
-from torchmask.optics.otf import disc_otf, psf_from_samples
-from torchmask.optics.turbulence import TurbulencePhase
+from torchmask.optics.otf import disc_otf
+from torchmask.optics.psf import psf_from_samples
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.result import RestorationResult
-from torchmask.simulation.observation import Observation, simulate_observation
+from torchmask.simulation.exposures import simulate_observation
 
 reader = pytest.importorskip("oifits")
 fits = pytest.importorskip("astropy.io.fits")
 
-REAL = Path(__file__).parents[2] / "shared" / "real" / "niriss"
+REAL = Path(__file__).parents[3] / "shared" / "real" / "niriss"
 CENTERS = [[0.0, 0.42], [0.38, -0.2], [-0.4, -0.15], [0.1, -0.05]]
 WAVELENGTH = 550e-9
 
@@ -122,7 +125,7 @@ def test_a_point_source_has_full_visibility_and_no_closure_phase_whatever_the_pi
     observation = Observation(expose(mask, grid, n_frames=3, oversampling=oversampling), mask, grid, 0.0)
     observables = frame_observables(observation)
     step = grid.period / (oversampling * grid.shape[0]) / mask.subaperture_diameter
-    assert float((observables.squared - 1).abs().max()) < step**2
+    assert float((observables.vis2 - 1).abs().max()) < step**2
     assert float(observables.closure_phases.abs().max()) < step**2
     assert float((observables.triple_amplitudes - 1).abs().max()) < 1.5 * step**2
     assert step < 0.3
@@ -154,7 +157,7 @@ def test_a_binary_has_its_known_visibilities_and_closure_phases(diameter):
     # Star and companion are dimmed, one or the other, by no more than the companion off centre.
     lost = contrast * dimming(math.hypot(x, y), grid.cutoff(diameter))
     step = (grid.period / (8 * 64) / diameter) ** 2
-    assert np.abs(observables.squared.numpy() - np.abs(expected) ** 2).max() < 2 * lost + step
+    assert np.abs(observables.vis2.numpy() - np.abs(expected) ** 2).max() < 2 * lost + step
     phases = wrapped(observables.closure_phases.numpy() - closures(expected, 4))
     assert np.abs(phases).max() < (3 * lost + step) / np.abs(expected).min()
     assert lost < 0.02 * (diameter / 0.12) ** 2 + 1e-3
@@ -216,7 +219,7 @@ def test_a_restored_object_has_exactly_the_visibilities_of_its_pixels(mask, grid
     observables = restored_observables(result_of(scene, mask), observation)
     expected = binary(observables.baselines, -7 * grid.pixel_scale, 5 * grid.pixel_scale, 0.2)
     np.testing.assert_allclose(observables.visibilities, expected, atol=1e-12)
-    np.testing.assert_allclose(observables.squared, np.abs(expected) ** 2, atol=1e-12)
+    np.testing.assert_allclose(observables.vis2, np.abs(expected) ** 2, atol=1e-12)
     phases = observables.closure_phases.numpy() - closures(expected, 4)
     np.testing.assert_allclose(wrapped(phases), 0, atol=1e-12)
 
@@ -227,7 +230,7 @@ def test_dead_pixels_do_no_harm(mask, grid):
     valid[24, 25] = valid[20, 21] = valid[:, 30] = False
     spoilt = torch.where(valid, frames, 1e7)
     observables = frame_observables(Observation(spoilt, mask, grid, 0.0, valid=valid))
-    assert float((observables.squared - 1).abs().max()) < 1e-2
+    assert float((observables.vis2 - 1).abs().max()) < 1e-2
     assert float(observables.closure_phases.abs().max()) < 1e-3
 
 
@@ -248,7 +251,7 @@ def test_errors_are_the_scatter_of_the_measurements():
         independent = 3 * len(found)
         slack = 5 * math.sqrt(2 / independent)
         phases = torch.stack([(o.closure_phases / o.closure_errors) ** 2 for o in found]).mean()
-        squares = torch.stack([((o.squared - 1) / o.squared_errors) ** 2 for o in found]).mean()
+        squares = torch.stack([((o.vis2 - 1) / o.vis2_errors) ** 2 for o in found]).mean()
         assert low - slack < phases < 1 + slack
         assert low - slack < squares < 1 + slack
         assert slack < 0.6
@@ -261,10 +264,10 @@ def test_squared_visibilities_of_faint_frames_are_free_of_noise_bias():
     noise = torch.Generator().manual_seed(6)
     noisy = torch.poisson(clean, noise) + 1.0 * torch.randn(clean.shape, generator=noise, dtype=torch.float64)
     freed = frame_observables(Observation(noisy, mask, grid, 1.0))
-    assert float(((freed.squared - 1) / freed.squared_errors).abs().max()) < 4
+    assert float(((freed.vis2 - 1) / freed.vis2_errors).abs().max()) < 4
     noiseless = torch.full_like(noisy, 1e-3)
     biased = frame_observables(Observation(noisy, mask, grid, 0.0, errors=noiseless))
-    assert float(((biased.squared - 1) / freed.squared_errors).mean()) > 4
+    assert float(((biased.vis2 - 1) / freed.vis2_errors).mean()) > 4
 
 
 def test_errors_of_a_restored_object_are_those_of_frames_with_its_noise():
@@ -278,7 +281,7 @@ def test_errors_of_a_restored_object_are_those_of_frames_with_its_noise():
     scene[48, 48] = 1e5
     restored = restored_observables(result_of(scene, mask, n_frames=2, noise=3.0), observation)
     # a hole, sampled 8 times, and its patch of 40 frequencies are known to some percent
-    for name in ("visibility_errors", "squared_errors", "closure_errors", "triple_errors"):
+    for name in ("visibility_errors", "vis2_errors", "closure_errors", "triple_errors"):
         torch.testing.assert_close(getattr(restored, name), getattr(direct, name), rtol=0.08, atol=0)
     louder = restored_observables(result_of(scene, mask, n_frames=2, noise=6.0), observation)
     torch.testing.assert_close(louder.closure_errors, 2 * restored.closure_errors)
@@ -359,7 +362,7 @@ def test_unknown_things_are_said_to_be_unknown(tmp_path, mask, grid):
 def test_what_is_not_finite_is_flagged(tmp_path, mask, grid):
     observation = Observation(expose(mask, grid), mask, grid, 0.0)
     whole = frame_observables(observation)
-    broken = Observables(**{**vars(whole), "squared_errors": torch.tensor([math.nan, 1, 1, 1, 1, 1])})
+    broken = Observables(**{**vars(whole), "vis2_errors": torch.tensor([math.nan, 1, 1, 1, 1, 1])})
     save_oifits(tmp_path / "a.fits", broken, observation, bandwidth=1e-8)
     flags = fits.getdata(tmp_path / "a.fits", "OI_VIS2")["FLAG"]
     assert flags.ravel().tolist() == [True] + 5 * [False]
@@ -369,7 +372,7 @@ def test_two_holes_have_a_baseline_and_no_triangle(tmp_path, grid):
     mask = SparseAperture(CENTERS[:2], 0.1, 1.0)
     observation = Observation(expose(mask, grid), mask, grid, 0.0)
     observables = frame_observables(observation)
-    assert observables.squared.shape == (1,)
+    assert observables.vis2.shape == (1,)
     assert observables.closure_phases.shape == (0,)
     save_oifits(tmp_path / "a.fits", observables, observation, bandwidth=1e-8)
     with fits.open(tmp_path / "a.fits") as hdus:
@@ -414,7 +417,7 @@ def test_closure_phases_of_ab_dor_show_its_companion():
     # README of the observations: about 0.3 arcsec away, several magnitudes fainter; the calibrator shows none.
     mask = SparseAperture.from_catalog("jwst_niriss_ami_7")
     star, calibrator = (
-        frame_observables(Observation.from_fits(sorted(REAL.glob(name)), mask, gain=1.62, crop=48))
+        frame_observables(read_observation(sorted(REAL.glob(name)), mask, gain=1.62, crop=48))
         for name in ("ab-dor*.fits", "hd-37093*.fits")
     )
     assert float(star.closure_phases.rad2deg().abs().max()) > 2

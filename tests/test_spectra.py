@@ -7,8 +7,8 @@ import math
 import pytest
 import torch
 
-from torchmask.design.psd import NoisePSD, PowerLawPSD, evaluate_psd, resample_psd
 from torchmask.grid import Grid
+from torchmask.spectra import NoisePSD, PowerLawPSD, evaluate_psd, resample_psd
 
 
 def grid(n_pixels: int | tuple[int, int] = 64) -> Grid:

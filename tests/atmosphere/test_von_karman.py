@@ -9,14 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import integrate, special
 
-from torchmask.optics import von_karman
-from torchmask.optics.aperture import FullAperture, SparseAperture
-from torchmask.optics.von_karman import (
+from torchmask.atmosphere import von_karman
+from torchmask.atmosphere.von_karman import (
     modal_covariance,
     von_karman_covariance,
     von_karman_psd,
     von_karman_structure_function,
 )
+from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.zernike import aperture_modes, noll, quadrature
 
 # Variance [rad^2] of the modes over a pupil with (D/r0)^(5/3) = 1, by D/L0: all modes, piston, each tilt, each mode of

@@ -12,17 +12,18 @@ from hypothesis import strategies as st
 
 from torchmask.data.calibration import calibrate, crop_corner, find_target, frame_drift, frame_sharpness
 from torchmask.data.keywords import ARCSEC, pixel_matrix, shift_cards
+from torchmask.data.observe import read_observation
 from torchmask.data.restored import save_restored
 from torchmask.grid import Grid
+from torchmask.observation import Observation
 from torchmask.optics.aperture import SparseAperture
-from torchmask.optics.otf import PSF
+from torchmask.optics.psf import PSF
 from torchmask.restoration.result import RestorationResult
-from torchmask.simulation.observation import Observation
 
 fits = pytest.importorskip("astropy.io.fits")
 wcs = pytest.importorskip("astropy.wcs")
 
-REAL = Path(__file__).parents[2] / "shared" / "real" / "niriss"
+REAL = Path(__file__).parents[3] / "shared" / "real" / "niriss"
 SCALE = 0.02  # arcsec
 HEADER = {"PIXELSCL": SCALE, "WAVELEN": 550e-9, "BUNIT": "electron", "RDNOISE": 3.0}
 SKY = {
@@ -94,7 +95,7 @@ def result_for(observation):
 
 
 def test_a_cube_arrives_as_it_is(tmp_path, mask, cube):
-    observation = Observation.from_fits(write(tmp_path / "a.fits", cube), mask)
+    observation = read_observation(write(tmp_path / "a.fits", cube), mask)
     assert torch.equal(observation.frames, torch.from_numpy(cube).double())
     assert observation.grid == Grid((16, 20), SCALE * ARCSEC, 550e-9)
     assert observation.readout_noise == 3.0
@@ -107,7 +108,7 @@ def test_a_cube_arrives_as_it_is(tmp_path, mask, cube):
 def test_options_stand_for_missing_cards_and_win_over_present_ones(tmp_path, mask, cube):
     options = {"wavelength": 2e-6, "pixel_scale": 1e-7, "readout_noise": 0.5, "gain": 2.0, "unit": "adu"}
     for name, header in (("bare.fits", {}), ("full.fits", HEADER | {"GAIN": 7.0})):
-        observation = Observation.from_fits(write(tmp_path / name, cube, header), mask, **options)
+        observation = read_observation(write(tmp_path / name, cube, header), mask, **options)
         assert observation.grid == Grid((16, 20), 1e-7, 2e-6)
         assert observation.readout_noise == 0.5
         assert torch.equal(observation.frames, 2 * torch.from_numpy(cube).double())
@@ -125,7 +126,7 @@ def test_options_stand_for_missing_cards_and_win_over_present_ones(tmp_path, mas
 )
 def test_every_way_to_state_the_pixel_scale(tmp_path, mask, cube, cards):
     header = {name: value for name, value in HEADER.items() if name != "PIXELSCL"} | cards
-    observation = Observation.from_fits(write(tmp_path / "a.fits", cube, header), mask)
+    observation = read_observation(write(tmp_path / "a.fits", cube, header), mask)
     assert observation.grid.pixel_scale == pytest.approx(SCALE * math.pi / 180 / 3600, rel=1e-12)
 
 
@@ -135,14 +136,14 @@ def test_every_way_to_state_the_pixel_scale(tmp_path, mask, cube, cards):
 def test_a_scale_that_is_no_angle_is_no_pixel_scale(tmp_path, mask, cube, cards):
     header = {name: value for name, value in HEADER.items() if name != "PIXELSCL"} | cards
     with pytest.raises(ValueError, match=r"a\.fits has no PIXELSCL, CDELT or CD matrix.*give pixel_scale \[rad\]"):
-        Observation.from_fits(write(tmp_path / "a.fits", cube, header), mask)
+        read_observation(write(tmp_path / "a.fits", cube, header), mask)
 
 
 def test_the_filter_tells_the_wavelength(tmp_path, mask, cube):
     header = HEADER | {"WAVELEN": None, "INSTRUME": "NIRISS", "FILTER": "F380M"}
-    assert Observation.from_fits(write(tmp_path / "a.fits", cube, header), mask).grid.wavelength == 3.828e-6
+    assert read_observation(write(tmp_path / "a.fits", cube, header), mask).grid.wavelength == 3.828e-6
     with pytest.raises(ValueError, match=r"no WAVELEN.*give wavelength \[m\] \(FILTER is 'V'.*NIRISS F480M"):
-        Observation.from_fits(write(tmp_path / "b.fits", cube, header | {"FILTER": "V"}), mask)
+        read_observation(write(tmp_path / "b.fits", cube, header | {"FILTER": "V"}), mask)
 
 
 @pytest.mark.parametrize(
@@ -169,16 +170,16 @@ def test_the_filter_tells_the_wavelength(tmp_path, mask, cube):
 def test_units_become_electrons(tmp_path, mask, cube, unit, factor):
     # GAIN 1.6 electrons per adu, 10 s, 0.25 MJy/sr per DN/s
     path = write(tmp_path / "a.fits", cube, BUNIT=unit, GAIN=1.6, XPOSURE=10.0, PHOTMJSR=0.25)
-    frames = Observation.from_fits(path, mask).frames
+    frames = read_observation(path, mask).frames
     torch.testing.assert_close(frames, factor * torch.from_numpy(cube).double(), rtol=1e-12, atol=0)
 
 
 def test_pixels_without_a_unit_are_taken_for_electrons_and_it_is_said(tmp_path, mask, cube):
     path = write(tmp_path / "a.fits", cube, BUNIT=None)
     with pytest.warns(UserWarning, match="no BUNIT and no GAIN in the header: pixels are taken for electrons"):
-        frames = Observation.from_fits(path, mask).frames
+        frames = read_observation(path, mask).frames
     np.testing.assert_array_equal(frames.numpy(), cube)
-    assert torch.equal(Observation.from_fits(path, mask, unit="electron").frames, frames)
+    assert torch.equal(read_observation(path, mask, unit="electron").frames, frames)
 
 
 @pytest.mark.parametrize(
@@ -197,15 +198,15 @@ def test_pixels_without_a_unit_are_taken_for_electrons_and_it_is_said(tmp_path, 
 )
 def test_cards_that_are_missing_or_wrong_are_named(tmp_path, mask, cube, cards, message):
     with pytest.raises(ValueError, match=message) as caught:
-        Observation.from_fits(write(tmp_path / "a.fits", cube, HEADER | cards), mask)
+        read_observation(write(tmp_path / "a.fits", cube, HEADER | cards), mask)
     assert "a.fits" in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 def test_the_time_of_one_integration_counts_for_a_cube_of_jwst(tmp_path, mask, cube):
     cards = {"BUNIT": "electron/s", "XPOSURE": 30.0, "EFFINTTM": 10.0}
-    one = Observation.from_fits(write(tmp_path / "a.fits", cube[0], HEADER | cards), mask).frames
-    three = Observation.from_fits(write(tmp_path / "b.fits", cube, HEADER | cards), mask).frames
+    one = read_observation(write(tmp_path / "a.fits", cube[0], HEADER | cards), mask).frames
+    three = read_observation(write(tmp_path / "b.fits", cube, HEADER | cards), mask).frames
     torch.testing.assert_close(one[0], 3 * three[0])
 
 
@@ -225,7 +226,7 @@ def test_dq_err_and_nan_mark_pixels(tmp_path, mask, cube):
         path = write(
             tmp_path / f"{telescope}.fits", cube, None, extensions, "SCI", TELESCOP=telescope, BUNIT="adu", GAIN=2.0
         )
-        observation = Observation.from_fits(path, mask)
+        observation = read_observation(path, mask)
         expected[:, 4, 5] = lowest_bit_only
         assert np.array_equal(observation.valid, expected)
         assert torch.isfinite(observation.frames).all()
@@ -246,7 +247,7 @@ def test_calibration_undoes_dark_and_flat(tmp_path, mask):
     raw[:, 3, 4] = 1e9
     # flats are known but for their scale
     write(tmp_path / "flat.fits", 37 * flat, {})
-    observation = Observation.from_fits(
+    observation = read_observation(
         write(tmp_path / "a.fits", raw), mask, dark=dark, flat=tmp_path / "flat.fits", bad_pixels=torch.from_numpy(bad)
     )
     assert np.array_equal(observation.valid, np.broadcast_to(good, raw.shape))
@@ -257,7 +258,7 @@ def test_calibration_undoes_dark_and_flat(tmp_path, mask):
 
 def test_a_dark_of_another_shape_is_refused(tmp_path, mask, cube):
     with pytest.raises(ValueError, match=r"a\.fits: dark has shape \(16, 16\): it must be.*\(16, 20\)"):
-        Observation.from_fits(write(tmp_path / "a.fits", cube), mask, dark=np.zeros((16, 16)))
+        read_observation(write(tmp_path / "a.fits", cube), mask, dark=np.zeros((16, 16)))
 
 
 # --- cropping
@@ -266,8 +267,8 @@ def test_a_dark_of_another_shape_is_refused(tmp_path, mask, cube):
 @pytest.mark.parametrize("crop", [6, 7, 12])
 def test_crop_puts_the_target_in_the_middle_and_the_sky_stays(tmp_path, mask, cube, crop):
     header = HEADER | SKY
-    whole = Observation.from_fits(write(tmp_path / "a.fits", cube, header), mask)
-    field = Observation.from_fits(tmp_path / "a.fits", mask, crop=crop)
+    whole = read_observation(write(tmp_path / "a.fits", cube, header), mask)
+    field = read_observation(tmp_path / "a.fits", mask, crop=crop)
     assert field.grid.shape == (crop, crop)
     first = (9 - crop // 2, 12 - crop // 2)
     window = (slice(first[0], first[0] + crop), slice(first[1], first[1] + crop))
@@ -280,18 +281,18 @@ def test_crop_puts_the_target_in_the_middle_and_the_sky_stays(tmp_path, mask, cu
 def test_each_file_is_cropped_around_its_own_star(tmp_path, mask, cube):
     moved = np.roll(cube, (-2, 3), (1, 2))
     paths = [write(tmp_path / "a.fits", cube, HEADER | SKY), write(tmp_path / "b.fits", moved[:2], HEADER | SKY)]
-    frames = Observation.from_fits(paths, mask, crop=6).frames
+    frames = read_observation(paths, mask, crop=6).frames
     assert frames.shape == (5, 6, 6)
     assert torch.equal(frames[:2], frames[3:])
-    given = Observation.from_fits(paths, mask, crop=6, target=(8, 8)).frames
+    given = read_observation(paths, mask, crop=6, target=(8, 8)).frames
     assert torch.equal(given[4], torch.from_numpy(moved[1, 5:11, 5:11]).double())
 
 
 def test_a_crop_that_does_not_fit_says_what_does(tmp_path, mask, cube):
     path = write(tmp_path / "a.fits", cube)
     with pytest.raises(ValueError, match=r"a\.fits: crop is 15.*row 9, column 12.*leaves at most 14"):
-        Observation.from_fits(path, mask, crop=15)
-    Observation.from_fits(path, mask, crop=14)
+        read_observation(path, mask, crop=15)
+    read_observation(path, mask, crop=14)
 
 
 @settings(derandomize=True, deadline=None)
@@ -335,9 +336,9 @@ def test_selection_keeps_the_best_in_their_order(tmp_path, mask, keep_by):
     frames = flux[:, None, None] * np.exp(-r2 / (2 * width[:, None, None] ** 2))
     frames *= (flux / frames.sum((1, 2)))[:, None, None]
     path = write(tmp_path / "a.fits", frames)
-    kept = Observation.from_fits(path, mask, keep=0.4, keep_by=keep_by).frames
+    kept = read_observation(path, mask, keep=0.4, keep_by=keep_by).frames
     assert torch.equal(kept, torch.from_numpy(frames[[1, 3]]))
-    best = Observation.from_fits(path, mask, keep=0.01, keep_by=keep_by).frames
+    best = read_observation(path, mask, keep=0.01, keep_by=keep_by).frames
     assert torch.equal(best, torch.from_numpy(frames[[1 if keep_by == "flux" else 3]]))
     # S1 of a Gaussian is 1 / (4 pi width^2)
     sharpness = frame_sharpness(frames, np.ones(frames.shape, dtype=bool))
@@ -359,7 +360,7 @@ def test_selection_keeps_the_best_in_their_order(tmp_path, mask, keep_by):
 )
 def test_options_are_checked_before_any_file_is_opened(mask, options, message):
     with pytest.raises(ValueError, match=message):
-        Observation.from_fits("nowhere.fits", mask, **options)
+        read_observation("nowhere.fits", mask, **options)
 
 
 def test_drift_is_the_movement_of_the_image(mask):
@@ -398,13 +399,13 @@ def test_damaged_files_are_refused_in_one_line(tmp_path, mask, cube):
     for name, content in files.items():
         (tmp_path / name).write_bytes(content)
         with pytest.raises(ValueError, match=r"is no FITS file, or is damaged") as caught:
-            Observation.from_fits(tmp_path / name, mask)
+            read_observation(tmp_path / name, mask)
         assert name in str(caught.value)
         assert "\n" not in str(caught.value)
     with pytest.raises(ValueError, match=r"there is no file .*absent\.fits"):
-        Observation.from_fits(tmp_path / "absent.fits", mask)
+        read_observation(tmp_path / "absent.fits", mask)
     with pytest.raises(ValueError, match=r"paths is empty"):
-        Observation.from_fits([], mask)
+        read_observation([], mask)
 
 
 def test_no_damage_brings_anything_but_one_line(tmp_path, mask, cube):
@@ -422,7 +423,7 @@ def test_no_damage_brings_anything_but_one_line(tmp_path, mask, cube):
             damaged = damaged[: rng.integers(len(damaged))]
         (tmp_path / "bad.fits").write_bytes(damaged.tobytes())
         try:
-            Observation.from_fits(tmp_path / "bad.fits", mask, crop=6)
+            read_observation(tmp_path / "bad.fits", mask, crop=6)
         except ValueError as error:
             refusals.append(str(error))
     assert all("bad.fits" in message and "\n" not in message for message in refusals)
@@ -439,19 +440,19 @@ def test_no_damage_brings_anything_but_one_line(tmp_path, mask, cube):
 )
 def test_arrays_of_another_kind_are_refused(tmp_path, mask, data, message):
     with pytest.raises(ValueError, match=message):
-        Observation.from_fits(write(tmp_path / "a.fits", data), mask)
+        read_observation(write(tmp_path / "a.fits", data), mask)
 
 
 def test_extensions_must_agree(tmp_path, mask, cube):
     path = write(tmp_path / "a.fits", cube, None, [("DQ", np.zeros((16, 16), dtype=np.int16))], "SCI")
     with pytest.raises(ValueError, match=r"DQ of shape \(16, 16\)"):
-        Observation.from_fits(path, mask)
+        read_observation(path, mask)
     path = write(tmp_path / "b.fits", cube, None, [("SCI", cube)], "SCI")
     with pytest.raises(ValueError, match=r"2 SCI extensions"):
-        Observation.from_fits(path, mask)
+        read_observation(path, mask)
     dead = write(tmp_path / "c.fits", cube, None, [("DQ", np.ones((16, 20), dtype=np.int16))], "SCI")
     with pytest.raises(ValueError, match=r"no valid pixel"):
-        Observation.from_fits(dead, mask)
+        read_observation(dead, mask)
 
 
 @pytest.mark.parametrize(
@@ -471,7 +472,7 @@ def test_a_list_of_unlike_files_is_refused(tmp_path, mask, cube, cards, size, me
         write(tmp_path / "b.fits", cube[..., :size], header | cards),
     ]
     with pytest.raises(ValueError, match=message):
-        Observation.from_fits(paths, mask)
+        read_observation(paths, mask)
 
 
 # --- files that are written
@@ -480,7 +481,7 @@ def test_a_list_of_unlike_files_is_refused(tmp_path, mask, cube, cards, size, me
 def test_observation_survives_its_own_file(tmp_path, mask, cube):
     extensions = [("ERR", cube / 10), ("DQ", np.eye(16, 20, dtype=np.int16))]
     header = {name: value for name, value in (HEADER | SKY).items() if name != "RDNOISE"}
-    observation = Observation.from_fits(write(tmp_path / "a.fits", cube, header, extensions, "SCI"), mask)
+    observation = read_observation(write(tmp_path / "a.fits", cube, header, extensions, "SCI"), mask)
     observation.save(tmp_path / "a.npz")
     back = Observation.load(tmp_path / "a.npz")
     assert back.readout_noise is None
@@ -493,7 +494,7 @@ def test_observation_survives_its_own_file(tmp_path, mask, cube):
 
 def test_restored_image_lies_where_the_frames_did_on_the_sky(tmp_path, mask, cube):
     header = HEADER | SKY | {"TARGNAME": "AB Dor"}
-    observation = Observation.from_fits(write(tmp_path / "a.fits", cube, header), mask, crop=8)
+    observation = read_observation(write(tmp_path / "a.fits", cube, header), mask, crop=8)
     result = result_for(observation)
     save_restored(tmp_path / "r.fits", result, observation, ["crop 8 pixels", "α " + "long " * 40])
     with fits.open(tmp_path / "r.fits", checksum=True) as hdus:
@@ -509,13 +510,13 @@ def test_restored_image_lies_where_the_frames_did_on_the_sky(tmp_path, mask, cub
     assert "R0" not in cards
     assert "crop 8 pixels" in str(cards["HISTORY"])
     # it is itself an image that can be read
-    again = Observation.from_fits(tmp_path / "r.fits", mask)
+    again = read_observation(tmp_path / "r.fits", mask)
     assert torch.equal(again.frames[0], result.object)
     assert again.grid.pixel_scale == pytest.approx(observation.grid.pixel_scale, rel=1e-12)
 
 
 def test_standard_deviations_are_an_extension(tmp_path, mask, cube):
-    observation = Observation.from_fits(write(tmp_path / "a.fits", cube, HEADER | SKY), mask, crop=8)
+    observation = read_observation(write(tmp_path / "a.fits", cube, HEADER | SKY), mask, crop=8)
     result = dataclasses.replace(result_for(observation), object_std=torch.rand(8, 8, dtype=torch.float64))
     save_restored(tmp_path / "r.fits", result, observation)
     with fits.open(tmp_path / "r.fits", checksum=True) as hdus:
@@ -523,12 +524,12 @@ def test_standard_deviations_are_an_extension(tmp_path, mask, cube):
         assert np.array_equal(hdus["ERR"].data, result.object_std)
         assert hdus["ERR"].header["BUNIT"] == "electron"
         assert hdus["ERR"].header["CRVAL1"] == hdus[0].header["CRVAL1"]
-    again = Observation.from_fits(tmp_path / "r.fits", mask)
+    again = read_observation(tmp_path / "r.fits", mask)
     assert torch.equal(again.errors[0], result.object_std)
 
 
 def test_nothing_is_overwritten_or_left_half_done(tmp_path, mask, cube):
-    observation = Observation.from_fits(write(tmp_path / "a.fits", cube), mask, crop=8)
+    observation = read_observation(write(tmp_path / "a.fits", cube), mask, crop=8)
     result = result_for(observation)
     (tmp_path / "r.fits").write_text("mine")
     with pytest.raises(ValueError, match=r"exists and is not overwritten"):
@@ -536,7 +537,7 @@ def test_nothing_is_overwritten_or_left_half_done(tmp_path, mask, cube):
     assert (tmp_path / "r.fits").read_text() == "mine"
     with pytest.raises(ValueError, match=r"does not end in \.fits"):
         save_restored(tmp_path / "r.png", result, observation)
-    other = Observation.from_fits(tmp_path / "a.fits", mask, crop=6)
+    other = read_observation(tmp_path / "a.fits", mask, crop=6)
     with pytest.raises(ValueError, match=r"object has shape \(8, 8\) and the frames \(6, 6\)"):
         save_restored(tmp_path / "s.fits", result, other)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.fits", "r.fits"]
@@ -576,8 +577,8 @@ def test_niriss_exposures_of_ab_dor():
     paths = sorted(REAL.glob("ab-dor*.fits"))
     mask = SparseAperture.from_catalog("jwst_niriss_ami_7")
     with pytest.raises(ValueError, match=r"no GAIN or EGAIN, which its unit DN/s needs: give gain"):
-        Observation.from_fits(paths, mask)
-    observation = Observation.from_fits(paths, mask, gain=1.62, crop=40)
+        read_observation(paths, mask)
+    observation = read_observation(paths, mask, gain=1.62, crop=40)
     assert observation.frames.shape == (9, 40, 40)
     assert observation.grid.wavelength == 4.817e-6
     # JWST user documentation: 0.0653 x 0.0658 arcsec

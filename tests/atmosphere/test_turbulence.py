@@ -3,10 +3,11 @@ import math
 import pytest
 import torch
 
+from torchmask.atmosphere.phase import TurbulencePhase
+from torchmask.atmosphere.screens import frozen_flow, phase_screens
+from torchmask.atmosphere.von_karman import modal_covariance, von_karman_structure_function
 from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture, SparseAperture
-from torchmask.optics.turbulence import TurbulencePhase, frozen_flow, phase_screens
-from torchmask.optics.von_karman import modal_covariance, von_karman_structure_function
 from torchmask.optics.zernike import zernike_basis
 
 WAVELENGTH = 550e-9

@@ -20,11 +20,11 @@ from torch import Tensor
 
 from torchmask.data.keywords import pixel_matrix
 from torchmask.grid import Grid
+from torchmask.observation import Observation
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.otf import OTF
 from torchmask.optics.zernike import ZernikePhase
 from torchmask.restoration.result import RestorationResult
-from torchmask.simulation.observation import Observation
 
 _SAMPLES_PER_HOLE = 8
 
@@ -38,7 +38,7 @@ class Observables:
     stations : (N, 2) centres of the holes, (u, v) towards east and north [m]
     visibilities : (B,) complex; from frames, pistons and all
     visibility_errors : (B,) rms of the amplitude, and of the phase times the amplitude
-    squared, squared_errors : (B,) |V|^2
+    vis2, vis2_errors : (B,) |V|^2
     closure_phases, closure_errors : (C,) rad
     triple_amplitudes, triple_errors : (C,) |V_ij V_jk V_ki|
 
@@ -49,7 +49,7 @@ class Observables:
     >>> point = Observables(
     ...     torch.tensor([[0, 1]]), torch.zeros(0, 3, dtype=torch.int64), stations, one + 0j, 0.01 * one,
     ...     one, 0.02 * one, none, none, none, none)
-    >>> float(point.squared[0])
+    >>> float(point.vis2[0])
     1.0
     """
 
@@ -58,8 +58,8 @@ class Observables:
     stations: Tensor
     visibilities: Tensor
     visibility_errors: Tensor
-    squared: Tensor
-    squared_errors: Tensor
+    vis2: Tensor
+    vis2_errors: Tensor
     closure_phases: Tensor
     closure_errors: Tensor
     triple_amplitudes: Tensor
@@ -95,13 +95,13 @@ def restored_observables(result: RestorationResult, observation: Observation) ->
     >>> from torchmask.grid import Grid
     >>> from torchmask.optics.aperture import SparseAperture
     >>> from torchmask.optics.detector import Detector
-    >>> from torchmask.simulation.observation import simulate_observation
+    >>> from torchmask.simulation.exposures import simulate_observation
     >>> star = torch.zeros(64, 64, dtype=torch.float64); star[32, 32] = 1e7  # electrons per frame
     >>> mask = SparseAperture([[0.0, 0.4], [-0.35, -0.2], [0.35, -0.25]], 0.15, 1.0)
     >>> seen = simulate_observation(star, mask, Grid.nyquist(1.0, 550e-9, 64), None, Detector(), n_frames=4)
     >>> from torchmask.restoration.myopic import MyopicDeconvolution
     >>> method = MyopicDeconvolution(seen.aperture, seen.grid, n_modes=3, max_iterations=20)
-    >>> restored_observables(method.restore(seen.frames), seen).squared.shape
+    >>> restored_observables(method.restore(seen.frames), seen).vis2.shape
     torch.Size([3])
     """
     aperture, grid = observation.aperture, observation.grid

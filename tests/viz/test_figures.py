@@ -17,12 +17,13 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Patch
 from matplotlib.transforms import Affine2D
 
-from torchmask import _drawing as drawing
-from torchmask import viz
 from torchmask.grid import Grid
-from torchmask.metrics import align, lowpass, score
+from torchmask.metrics import align, lowpass, relative_error
 from torchmask.optics.aperture import FullAperture, SparseAperture
-from torchmask.optics.otf import OTF, PSF, analytic_otf, subaperture_otf
+from torchmask.optics.otf import OTF, analytic_otf, subaperture_otf
+from torchmask.optics.psf import PSF
+from torchmask.viz import figures as viz
+from torchmask.viz import style as drawing
 
 GRID = Grid.nyquist(diameter=1.0, wavelength=550e-9, n_pixels=64)
 CENTERS = torch.tensor([[0.3, 0.1], [-0.35, 0.2], [0.05, -0.37]], dtype=torch.float64)
@@ -216,10 +217,10 @@ def test_comparison_shows_what_is_scored():
     panels = {ax.get_title(loc="left"): np.asarray(ax.images[0].get_array()) for ax in figure.axes}
     assert list(panels) == [
         "truth",
-        f"mask\none exposure, score {score(frame, truth, 0.3):.3f}",
-        f"mask\nrestored, score {score(restored, truth, 0.3):.3f}",
+        f"mask\none exposure, score {relative_error(frame, truth, 0.3):.3f}",
+        f"mask\nrestored, score {relative_error(restored, truth, 0.3):.3f}",
         "truth at the diffraction limit",
-        f"full\none exposure, score {score(frame, truth, 0.3):.3f}",
+        f"full\none exposure, score {relative_error(frame, truth, 0.3):.3f}",
         "full\nrestored, score 0.000",
     ]
 
@@ -300,7 +301,7 @@ def test_the_callers_style_and_pyplot_are_left_alone(tmp_path):
         viz.mask_figure(mask())
         assert dict(matplotlib.rcParams) == before
     code = (
-        "import sys, torch, torchmask.viz as viz, torchmask.tracking, torchmask.metrics\n"
+        "import sys, torch, torchmask.viz.figures as viz, torchmask.tracking, torchmask.metrics\n"
         "assert not {'matplotlib', 'tensorboard', 'skimage', 'rich', 'kornia'} & set(sys.modules)\n"
         "from torchmask.optics.aperture import FullAperture\n"
         "viz.mask_figure(FullAperture(1.0)).savefig(sys.argv[1])\n"

@@ -10,14 +10,16 @@ import torch
 from scipy.special import j0, j1
 from torch import nn
 
+from torchmask.atmosphere.phase import TurbulencePhase
+from torchmask.atmosphere.von_karman import von_karman_structure_function
 from torchmask.grid import Grid
+from torchmask.observation import Observation
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.detector import Detector
-from torchmask.optics.otf import PSF, analytic_otf
-from torchmask.optics.turbulence import TurbulencePhase
-from torchmask.optics.von_karman import von_karman_structure_function
-from torchmask.simulation import observation as module
-from torchmask.simulation.observation import Observation, simulate_observation
+from torchmask.optics.otf import analytic_otf
+from torchmask.optics.psf import PSF
+from torchmask.simulation import exposures as module
+from torchmask.simulation.exposures import simulate_observation
 
 STACKS = Path(__file__).parents[3] / "shared" / "stacks"
 WAVELENGTH = 550e-9

@@ -3,8 +3,8 @@ import math
 import pytest
 import torch
 
-from torchmask.optics.random_field import RandomField, split_spectrum
-from torchmask.optics.von_karman import von_karman_covariance, von_karman_structure_function
+from torchmask.atmosphere.random_field import RandomField, split_spectrum
+from torchmask.atmosphere.von_karman import von_karman_covariance, von_karman_structure_function
 
 
 def structure_function(bands, dy, dx):

@@ -17,7 +17,7 @@ import torch
 from scipy.fft import next_fast_len
 from torch import Tensor
 
-from torchmask.optics.von_karman import PSD_CONSTANT, von_karman_psd
+from torchmask.atmosphere.von_karman import PSD_CONSTANT, von_karman_psd
 
 _RATIO = 3.0  # of the frequencies of successive bands
 _CUTOFF = 2.0  # of the first band, in units of 1 / margin

@@ -16,9 +16,9 @@ import numpy as np
 from torch import Tensor
 
 from torchmask.data.keywords import FILTERS
-from torchmask.data.visibilities import Observables
+from torchmask.interferometry.visibilities import Observables
 from torchmask.io import as_array, atomic_write
-from torchmask.simulation.observation import Observation
+from torchmask.observation import Observation
 
 _ARRAY = "MASK"
 _ARCSEC = 180 * 3600 / math.pi
@@ -49,14 +49,14 @@ def save_oifits(
 
     Notes
     -----
-    Signs as in `torchmask.data.visibilities`. STA_INDEX counts holes from 1, in the order of `aperture.centers`;
+    Signs as in `torchmask.interferometry.visibilities`. STA_INDEX counts holes from 1, in the order of the centres;
     U1COORD, V1COORD belong to the first pair of a triangle (i, j), U2COORD, V2COORD to the second (j, k). STAXYZ are
     the holes' places in the pupil, towards east and north, FRAME = 'SKY'. What is not finite is flagged.
 
     Examples
     --------
     >>> import tempfile, torch
-    >>> from torchmask.data.fringes import frame_observables
+    >>> from torchmask.interferometry.fringes import frame_observables
     >>> from torchmask.grid import Grid
     >>> from torchmask.optics.aperture import SparseAperture
     >>> frames = torch.rand(4, 64, 64, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 1e4
@@ -110,7 +110,7 @@ def _measurements(observables: Observables, common: Mapping[str, str], mjd: floa
         "VISPHI": ("1D", "deg", values.angle().rad2deg()),
         "VISPHIERR": ("1D", "deg", (errors / values.abs()).rad2deg()),
     }
-    vis2 = {"VIS2DATA": ("1D", None, observables.squared), "VIS2ERR": ("1D", None, observables.squared_errors)}
+    vis2 = {"VIS2DATA": ("1D", None, observables.vis2), "VIS2ERR": ("1D", None, observables.vis2_errors)}
     absolute = {"AMPTYP": "absolute", "PHITYP": "absolute"}
     tables = [
         _table("OI_VIS", {**common, **absolute}, _rows(vis, uv, pairs, mjd, seconds)),

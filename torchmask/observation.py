@@ -1,0 +1,143 @@
+"""A stack of short exposures with what is known about them."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchmask.grid import Grid
+from torchmask.io import load_npz, save_npz
+from torchmask.optics.aperture import Aperture, FullAperture, SparseAperture
+
+_NEEDED_NUMBERS = ("subaperture_diameter", "mask_diameter", "pixel_scale", "wavelength")
+
+_NUMBERS = (*_NEEDED_NUMBERS, "readout_noise", "orientation", "central_obstruction", "r0", "outer_scale", "n_photons")
+
+_IMAGES = ("object", "psfs", "valid", "errors")
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """Short exposures of one object, how they were taken and, where it is known, the truth behind them.
+
+    frames : (T, H, W) electrons
+    aperture, grid : what they were taken through
+    readout_noise : electrons rms per pixel and frame; None where nobody knows it: the restoration measures it then
+    object : (H, W) the scene in expected electrons per frame, on the frames' pixels
+    psfs : (T, H, W) centred on pixel [H // 2, W // 2] and cropped to the field, not renormalised: what is missing to a
+        sum of 1 fell outside
+    r0, outer_scale : of the turbulence [m]
+    n_photons : electrons per frame, before the field was cropped
+    valid : (H, W) or (T, H, W) bool, False where a pixel is dead or saturated; None: all are valid
+    errors : (T, H, W) electrons rms of each pixel, or None
+    header : FITS cards that go with the frames: sky coordinates, target, telescope, filter, date
+
+    The truth (object, psfs, r0, outer_scale, n_photons) is None where nobody knows it, as in a real observation.
+
+    Examples
+    --------
+    >>> mask = SparseAperture([[0.0, 0.3], [0.3, -0.2], [-0.3, -0.2]], 0.2, 1.0)
+    >>> frames = torch.rand(5, 32, 32)
+    >>> observation = Observation(frames, mask, Grid.nyquist(1.0, 550e-9, 32), readout_noise=1.5)
+    >>> observation.object is None, len(observation.frames)
+    (True, 5)
+    """
+
+    frames: Tensor
+    aperture: Aperture
+    grid: Grid
+    readout_noise: float | None
+    object: Tensor | None = None
+    psfs: Tensor | None = None
+    r0: float | None = None
+    outer_scale: float | None = None
+    n_photons: float | None = None
+    valid: Tensor | None = None
+    errors: Tensor | None = None
+    header: Mapping[str, str | int | float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.frames.ndim != 3 or self.frames.shape[-2:] != self.grid.shape or not len(self.frames):
+            raise ValueError(
+                f"frames has shape {tuple(self.frames.shape)}: it must be (n_frames, {self.grid.shape[0]}, "
+                f"{self.grid.shape[1]}), with at least one frame"
+            )
+        noise = self.readout_noise
+        if noise is not None and not (math.isfinite(noise) and noise >= 0):
+            raise ValueError(f"readout_noise is {noise}: it must be finite and not negative")
+        for name, shape in (("object", self.grid.shape), ("psfs", self.frames.shape), ("errors", self.frames.shape)):
+            values = getattr(self, name)
+            if values is not None and tuple(values.shape) != tuple(shape):
+                raise ValueError(f"{name} has shape {tuple(values.shape)}: it must be {tuple(shape)}")
+        valid = self.valid
+        if valid is not None and (
+            valid.dtype != torch.bool or tuple(valid.shape) not in (self.grid.shape, tuple(self.frames.shape))
+        ):
+            raise ValueError(
+                f"valid is {valid.dtype} of shape {tuple(valid.shape)}: it must be bool, (H, W) or (T, H, W)"
+            )
+
+    def save(self, path: str | Path) -> None:
+        """Write everything to a new .npz file (compressed, without pickle; the format of `load`).
+
+        Raises ValueError if the file exists, its folder does not, or its name does not end in .npz.
+        """
+        aperture, grid = self.aperture, self.grid
+        values = {
+            "frames": self.frames,
+            "pixel_scale": grid.pixel_scale,
+            "wavelength": grid.wavelength,
+            "centers": aperture.centers,
+            "subaperture_diameter": aperture.subaperture_diameter,
+            "mask_diameter": aperture.mask_diameter,
+            "shape": aperture.shape,
+            "orientation": aperture.orientation,
+            "central_obstruction": aperture.central_obstruction,
+        }
+        optional = {name: getattr(self, name) for name in ("readout_noise", *_IMAGES, "r0", "outer_scale", "n_photons")}
+        if self.header:
+            optional["header"] = json.dumps(dict(self.header))
+        save_npz(path, values | {name: value for name, value in optional.items() if value is not None})
+
+    @classmethod
+    def load(cls, path: str | Path) -> Observation:
+        """Read what `save` wrote, or any .npz file with its keys.
+
+        Of an aperture, `shape`, `orientation` and `central_obstruction` may be missing, of an observation all that may
+        be None. One centred disc is a full pupil of its own diameter, whatever `mask_diameter` says.
+
+        Raises
+        ------
+        ValueError
+            If the file is missing, damaged, holds pickled objects, lacks a key or holds arrays that disagree.
+        """
+        stored = load_npz(path, required=("frames", "centers", *_NEEDED_NUMBERS))
+        try:
+            return cls._from_arrays(stored)
+        except (ValueError, TypeError) as error:
+            raise ValueError(f"{path} holds no valid observation: {error}") from error
+
+    @classmethod
+    def _from_arrays(cls, stored: dict[str, Any]) -> Observation:
+        number = {name: float(stored[name].item()) for name in _NUMBERS if name in stored}
+        centers, diameter = torch.from_numpy(stored["centers"]), number["subaperture_diameter"]
+        shape, orientation = str(stored.get("shape", "disc")), number.get("orientation", 0.0)
+        if len(centers) == 1 and not centers.any() and shape == "disc":
+            aperture = FullAperture(diameter, number.get("central_obstruction", 0.0), dtype=centers.dtype)
+        else:
+            aperture = SparseAperture(centers, diameter, number["mask_diameter"], shape, orientation)
+        frames = torch.from_numpy(stored["frames"])
+        height, width = frames.shape[-2:]
+        grid = Grid(height if height == width else (height, width), number["pixel_scale"], number["wavelength"])
+        optional: dict[str, Any] = {name: torch.from_numpy(stored[name]) for name in _IMAGES if name in stored}
+        optional |= {name: number[name] for name in ("r0", "outer_scale", "n_photons") if name in number}
+        if "header" in stored:
+            optional["header"] = json.loads(str(stored["header"]))
+        return cls(frames, aperture, grid, number.get("readout_noise"), **optional)

@@ -1,0 +1,23 @@
+"""Figures: masks, frequency coverage, transfer functions, images and curves."""
+
+from torchmask.viz.figures import (
+    comparison_figure,
+    frames_figure,
+    history_figure,
+    mask_figure,
+    mtf_figure,
+    psf_figure,
+    stretch,
+    uv_coverage_figure,
+)
+
+__all__ = [
+    "comparison_figure",
+    "frames_figure",
+    "history_figure",
+    "mask_figure",
+    "mtf_figure",
+    "psf_figure",
+    "stretch",
+    "uv_coverage_figure",
+]
