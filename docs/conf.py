@@ -2,7 +2,6 @@
 
 import re
 import shutil
-from importlib import metadata
 from pathlib import Path
 
 import torchmask
@@ -10,7 +9,7 @@ import torchmask
 project = "torchmask"
 author = "The torchmask authors"
 project_copyright = author
-release = metadata.version("torchmask")
+release = torchmask.__version__
 
 extensions = [
     "myst_nb",

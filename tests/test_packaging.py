@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -15,13 +16,20 @@ from pathlib import Path
 
 import pytest
 
+import torchmask
+
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 EXTRAS = PROJECT["optional-dependencies"]
 
 
+# Of the processes below: a PYTHONPATH to the sources would hide what is installed.
+ENVIRONMENT = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+
+
 def run(*command, **options):
-    done = subprocess.run([str(part) for part in command], capture_output=True, text=True, check=False, **options)
+    command = [str(part) for part in command]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=ENVIRONMENT, **options)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -33,6 +41,13 @@ def name_of(requirement):
 def test_all_is_every_extra():
     (everything,) = EXTRAS["all"]
     assert sorted(everything.removeprefix("torchmask[").removesuffix("]").split(",")) == sorted(set(EXTRAS) - {"all"})
+
+
+def test_the_citation_and_the_changelog_name_the_version():
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert re.findall(r"^version: (.*)$", citation, re.MULTILINE) == [torchmask.__version__]
+    assert re.findall(r"^## ([\d.]+)", changes, re.MULTILINE)[0] == torchmask.__version__
 
 
 @pytest.fixture(scope="module")
@@ -62,6 +77,7 @@ def test_the_wheel_holds_the_package_and_nothing_else(wheel):
     inside = {name for name in names if not name.startswith(information)}
     source = ROOT / "torchmask"
     wanted = {f"torchmask/{path.relative_to(source).as_posix()}" for path in source.rglob("*.py")}
+    assert information == f"torchmask-{torchmask.__version__}.dist-info/"
     assert inside == wanted | {"torchmask/py.typed", "torchmask/optics/masks.json"}
     assert information + "licenses/LICENSE" in names
     assert entries.split() == ["[console_scripts]", "torchmask", "=", PROJECT["scripts"]["torchmask"]]
@@ -120,7 +136,7 @@ def test_the_installed_command_runs(installed, tmp_path):
 @pytest.mark.slow
 def test_the_public_names_are_typed(installed, tmp_path):
     """As a type checker of a user's project sees them; what is left are attributes whose types it has to infer."""
-    environment = {**os.environ, "PATH": f"{installed.parent}:{os.environ['PATH']}"}
+    environment = {**ENVIRONMENT, "PATH": f"{installed.parent}:{os.environ['PATH']}"}
     environment["VIRTUAL_ENV"] = str(installed.parents[1])
     command = [sys.executable, "-m", "pyright", "--verifytypes", "torchmask", "--ignoreexternal", "--outputjson"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path, env=environment)

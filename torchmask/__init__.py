@@ -32,7 +32,7 @@ from torchmask.simulation.scene import SceneOptions, make_scene
 from torchmask.spectra import NoisePSD, PowerLawPSD
 from torchmask.tracking import RunLogger
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "OTF",

@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+import torchmask
 from torchmask.io import as_array, atomic_write, save_npz, to_json, write_json
 from torchmask.record import Callback, Record
 from torchmask.viz.figures import stretch
@@ -40,7 +41,7 @@ _IMAGES_PER_STAGE = 8  # of each array, and the last: TensorBoard shows 10 of a 
 _SMALLEST_IMAGE = 16  # pixels on a side; smaller arrays are tables of numbers
 _CHECKPOINT_INTERVAL = 5.0  # s
 _FLUSH_INTERVAL = 10  # s, of TensorBoard's events
-_PACKAGES = ("torchmask", "torch", "numpy", "scipy", "cma", "scikit-image", "kornia", "astropy", "trimesh")
+_PACKAGES = ("torch", "numpy", "scipy", "cma", "scikit-image", "kornia", "astropy", "trimesh")
 
 
 def fan_out(*callbacks: Callback) -> Callback:
@@ -288,7 +289,7 @@ def _claim(directory: Path) -> Path:
 
 
 def _environment(seed: int | None) -> dict[str, Any]:
-    versions = {"python": platform.python_version()}
+    versions = {"python": platform.python_version(), "torchmask": torchmask.__version__}
     for package in _PACKAGES:
         try:
             versions[package] = metadata.version(package)

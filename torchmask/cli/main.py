@@ -11,7 +11,8 @@ import os
 import sys
 import warnings
 from collections.abc import Sequence
-from importlib import metadata
+
+from torchmask import __version__
 
 COMMANDS = {
     "design": "search the mask with the smallest error of the restored image",
@@ -47,7 +48,7 @@ def _parser() -> argparse.ArgumentParser:
         epilog="`torchmask COMMAND --help` shows the options of a command, with their units.",
     )
     parser.add_argument("command", choices=COMMANDS, metavar="COMMAND", help="one of those above")
-    parser.add_argument("--version", action="version", version=f"torchmask {metadata.version('torchmask')}")
+    parser.add_argument("--version", action="version", version=f"torchmask {__version__}")
     return parser
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 import shutil
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
 
 import tyro
 
+from torchmask import __version__
 from torchmask.cli.config import stored
 from torchmask.cli.options import ARCSEC, MaskOptions, RunOptions, load_aperture
 from torchmask.cli.report import restored_figure
@@ -221,7 +221,7 @@ def history(options: Options, result: RestorationResult) -> list[str]:
     default = stored(Options())
     changed = {name: value for name, value in stored(options).items() if name != "stack" and value != default[name]}
     return [
-        f"torchmask {metadata.version('torchmask')}",
+        f"torchmask {__version__}",
         *(f"stack {path}" for path in options.stack),
         *(f"{name} = {value}" for name, value in changed.items()),
         *result.summary().splitlines(),
