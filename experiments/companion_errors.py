@@ -16,7 +16,7 @@ import torch
 from companion_fit import CompanionModel, Exposures, Fit
 from torch import Tensor
 
-from torchmask.data.keywords import ARCSEC
+from torchmask.grid import ARCSEC
 from torchmask.record import Callback, Record
 
 SIGNIFICANCE = 5.0  # times the scatter of the calibrator: what counts as found

@@ -43,11 +43,11 @@ from niriss_report import exposures_figure, findings, images_figure, search_figu
 from rich.console import Console
 from torch import Tensor
 
-from torchmask.data.keywords import ARCSEC, FILTERS, pixel_matrix
 from torchmask.data.observe import read_observation
-from torchmask.grid import Grid
+from torchmask.grid import ARCSEC, Grid
 from torchmask.io import save_npz, write_json
 from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.band import FILTERS
 from torchmask.progress import Progress
 from torchmask.record import Callback, Record
 from torchmask.restoration.myopic import MyopicDeconvolution
@@ -109,10 +109,10 @@ def read(folder: Path, star: str, crop: int) -> tuple[Exposures, Grid]:
         raise ValueError(f"{folder} has no {star}_*.fits: give the folder of the exposures with --data")
     aperture = SparseAperture.from_catalog(MASK)
     parts = [read_observation([path], aperture, gain=GAIN, crop=crop) for path in paths]
-    matrices = [pixel_matrix(part.header) for part in parts]  # (x, y) to (east, north) [deg]
+    matrices = [part.sky_matrix for part in parts]
     if any(matrix is None for matrix in matrices):
         raise ValueError(f"{folder}: the headers of {star}_*.fits have no CD matrix, which tells where north is")
-    to_pixels = np.stack([np.linalg.inv(np.radians(np.array(matrix)))[::-1] for matrix in matrices])
+    to_pixels = np.stack([np.linalg.inv(np.array(matrix))[::-1] for matrix in matrices])
     columns = {name: [getattr(part, name) for part in parts] for name in ("frames", "errors", "valid")}
     frames, errors, valid = (torch.cat(values) for values in columns.values())
     return Exposures(frames.double(), errors.double(), valid, torch.from_numpy(to_pixels)), parts[0].grid

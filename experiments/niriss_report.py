@@ -13,7 +13,7 @@ from companion_fit import Exposures, Fit
 from rich.table import Table
 from torch import Tensor
 
-from torchmask.data.keywords import ARCSEC
+from torchmask.grid import ARCSEC
 from torchmask.viz.style import COLORS, FAINT, new_figure, styled
 
 if TYPE_CHECKING:

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+ARCSEC = math.pi / 180 / 3600  # rad
+MAS = ARCSEC / 1000  # rad, a thousandth of an arcsecond
 _ROUNDING = 1e-9  # relative slack, so that a grid made for exactly Nyquist is accepted as such
 
 
@@ -130,7 +132,7 @@ class Grid:
         for name, value in (("diameter", diameter), ("subaperture_diameter", subaperture_diameter)):
             if value is not None and not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{name} is {value}: it must be finite and positive, in m")
-        (height, width), arcsec = self.shape, math.degrees(self.pixel_scale) * 3600
+        (height, width), arcsec = self.shape, self.pixel_scale / ARCSEC
         cutoff = self.cutoff(diameter)
         if self._aliases(diameter):
             clean = max(0.0, 1 - cutoff)

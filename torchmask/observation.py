@@ -1,26 +1,35 @@
-"""A stack of short exposures with what is known about them."""
+"""A stack of short exposures with what is known about them, and the checks that make it one."""
 
 from __future__ import annotations
 
 import json
 import math
+import re
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchmask.grid import Grid
 from torchmask.io import load_npz, save_npz
 from torchmask.optics.aperture import Aperture, FullAperture, SparseAperture
+from torchmask.optics.bad_pixels import fill_bad_pixels
 
 _NEEDED_NUMBERS = ("subaperture_diameter", "mask_diameter", "pixel_scale", "wavelength")
 
 _NUMBERS = (*_NEEDED_NUMBERS, "readout_noise", "orientation", "central_obstruction", "r0", "outer_scale", "n_photons")
 
 _IMAGES = ("object", "psfs", "valid", "errors")
+
+_CELESTIAL = re.compile(
+    r"WCSAXES|CRPIX[12]|CRVAL[12]|CTYPE[12]|CUNIT[12]|CDELT[12]|CROTA[12]|CD[12]_[12]|PC[12]_[12]|P[VS][12]_\d+"
+    r"|LONPOLE|LATPOLE|RADESYS|EQUINOX|[AB]P?_(ORDER|DMAX|\d+_\d+)"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +93,15 @@ class Observation:
                 f"valid is {valid.dtype} of shape {tuple(valid.shape)}: it must be bool, (H, W) or (T, H, W)"
             )
 
+    @property
+    def sky_matrix(self) -> Tensor | None:
+        """(2, 2) from pixels (x, y) to angles (east, north) on the sky [rad]; None if the header tells no directions.
+
+        Needs astropy (extra `data`).
+        """
+        matrix = pixel_matrix(self.header) if self.header else None
+        return None if matrix is None else torch.from_numpy(matrix).deg2rad()
+
     def save(self, path: str | Path) -> None:
         """Write everything to a new .npz file (compressed, without pickle; the format of `load`).
 
@@ -141,3 +159,71 @@ class Observation:
         if "header" in stored:
             optional["header"] = json.loads(str(stored["header"]))
         return cls(frames, aperture, grid, number.get("readout_noise"), **optional)
+
+
+def check_frames(frames: Tensor | np.ndarray, valid: Tensor | np.ndarray | None, grid: Grid) -> tuple[Tensor, Tensor]:
+    """Frames (T, H, W) in float64 with pixels that are not valid filled in, and `valid` as (T, H, W).
+
+    Pixels that are not valid carry no weight in what is done with the frames; to fill them (`fill_bad_pixels`) keeps
+    them from spoiling means and Fourier transforms.
+
+    Raises ValueError if a shape is wrong, a valid pixel is not finite, or a frame holds no light.
+    """
+    frames = frames if isinstance(frames, Tensor) else torch.as_tensor(frames)  # which also moves to a default device
+    if frames.ndim != 3 or tuple(frames.shape[1:]) != grid.shape or not len(frames):
+        raise ValueError(
+            f"frames has shape {tuple(frames.shape)}: it must be (n_frames, {grid.shape[0]}, {grid.shape[1]}), with "
+            "at least one frame, as the grid says"
+        )
+    frames = frames.detach().double()
+    if valid is None:
+        valid = torch.ones_like(frames, dtype=torch.bool)
+    else:
+        valid = torch.as_tensor(valid, device=frames.device)
+        if valid.dtype != torch.bool or tuple(valid.shape) not in (grid.shape, tuple(frames.shape)):
+            raise ValueError(
+                f"valid is {valid.dtype} of shape {tuple(valid.shape)}: it must be bool, of shape {grid.shape} or "
+                f"{tuple(frames.shape)}"
+            )
+        valid = valid.expand(frames.shape)
+        frames = fill_bad_pixels(frames, valid)
+    bad = ~torch.isfinite(frames).flatten(1).all(1)
+    if bool(bad.any()):
+        raise ValueError(
+            f"frames {bad.nonzero().flatten().tolist()} hold values that are not finite: mark those pixels in `valid`"
+        )
+    dark = frames.mean((1, 2)) <= 0
+    if bool(dark.any()):
+        raise ValueError(f"frames {dark.nonzero().flatten().tolist()} hold no light: leave them out")
+    return frames, valid
+
+
+def pixel_matrix(header: Any) -> np.ndarray | None:
+    """(2, 2) matrix from pixels (x, y) to the sky [deg], from CD, PC and CDELT, or CROTA and CDELT; None without."""
+    from astropy.io.fits import Header
+    from astropy.wcs import WCS
+
+    if not any(name in header for name in ("CD1_1", "CD1_2", "CDELT1")):
+        return None
+    cards = Header()
+    for name, value in celestial_cards(header).items():
+        cards[name] = value
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # astropy's corrections of old-fashioned cards
+            wcs = WCS(cards, naxis=2)
+            if not all(str(unit) for unit in wcs.wcs.cunit):  # plain pixel coordinates, which say nothing of the sky
+                return None
+            scale = [unit.to("deg") for unit in wcs.wcs.cunit]
+            matrix = np.diag(scale) @ wcs.pixel_scale_matrix
+    except (ValueError, TypeError, AttributeError, MemoryError):  # cards that make no sense, units that are no angle
+        return None
+    return matrix if np.isfinite(matrix).all() and np.linalg.det(matrix) != 0 else None
+
+
+def celestial_cards(header: Any) -> dict[str, Any]:
+    """The cards of the two sky axes of a header, as they are."""
+    cards = {name: header[name] for name in header if _CELESTIAL.fullmatch(name)}
+    if "WCSAXES" in cards:
+        cards["WCSAXES"] = 2  # a cube's third axis is left behind
+    return cards

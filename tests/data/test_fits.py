@@ -11,11 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchmask.data.calibration import calibrate, crop_corner, find_target, frame_drift, frame_sharpness
-from torchmask.data.keywords import ARCSEC, pixel_matrix, shift_cards
+from torchmask.data.keywords import shift_cards
 from torchmask.data.observe import read_observation
 from torchmask.data.restored import save_restored
-from torchmask.grid import Grid
-from torchmask.observation import Observation
+from torchmask.grid import ARCSEC, Grid
+from torchmask.observation import Observation, pixel_matrix
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.psf import PSF
 from torchmask.restoration.result import RestorationResult

@@ -12,9 +12,9 @@ import pytest
 import torch
 from companion_fit import CompanionModel, Exposures
 
-from torchmask.data.keywords import ARCSEC, FILTERS
-from torchmask.grid import Grid
+from torchmask.grid import ARCSEC, Grid
 from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.band import FILTERS
 from torchmask.optics.psf import psf_from_samples
 from torchmask.optics.zernike import ZernikePhase
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -12,7 +11,6 @@ import tyro
 from torchmask.design.manufacture import load_mask
 from torchmask.optics.aperture import Aperture, FullAperture, SparseAperture
 
-ARCSEC = math.pi / (180 * 3600)  # rad
 FULL = "full"  # what stands for a full pupil among the names of masks
 MASK_SUFFIXES = (".json", ".dxf", ".fits")
 

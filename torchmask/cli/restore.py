@@ -12,12 +12,12 @@ import tyro
 
 from torchmask import __version__
 from torchmask.cli.config import stored
-from torchmask.cli.options import ARCSEC, MaskOptions, RunOptions, load_aperture
+from torchmask.cli.options import MaskOptions, RunOptions, load_aperture
 from torchmask.cli.report import restored_figure
 from torchmask.cli.run import Run, new_run
 from torchmask.data.observe import read_observation
 from torchmask.data.restored import save_restored
-from torchmask.grid import Grid
+from torchmask.grid import ARCSEC, Grid
 from torchmask.io import write_json
 from torchmask.metrics import relative_error, ssim
 from torchmask.observation import Observation

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 import torch
 
 from torchmask.atmosphere.phase import TurbulencePhase
-from torchmask.cli.options import ARCSEC, MaskOptions, RunOptions, load_aperture
+from torchmask.cli.options import MaskOptions, RunOptions, load_aperture
 from torchmask.cli.report import log_observation
 from torchmask.cli.run import new_run
-from torchmask.grid import Grid
+from torchmask.grid import ARCSEC, Grid
 from torchmask.optics.detector import Detector
 from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene

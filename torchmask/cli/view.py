@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import tyro
 
 from torchmask.cli.masks import describe
-from torchmask.cli.options import ARCSEC, DebugOptions
+from torchmask.cli.options import DebugOptions
 from torchmask.cli.report import restored_figure
 from torchmask.data.fits import read_fits
 from torchmask.design.manufacture import load_mask
+from torchmask.grid import ARCSEC
 from torchmask.io import atomic_write, load_npz, read_json
 from torchmask.observation import Observation
 from torchmask.optics.aperture import SparseAperture

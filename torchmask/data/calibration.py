@@ -8,6 +8,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import torch
+
+from torchmask.optics.bad_pixels import fill_bad_pixels
 
 SELECTIONS = ("sharpness", "flux")
 
@@ -57,23 +60,11 @@ def calibrate(
     return np.where(np.isfinite(values), values, 0.0), valid & good, sensitivity
 
 
-def fill(frames: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Frames whose invalid pixels are the mean of the valid ones around them, weighted by a Gaussian of 1 pixel."""
-    from scipy.ndimage import gaussian_filter
-
-    if valid.all():
-        return frames
-    sigma = (0, 1, 1)
-    weight = gaussian_filter(valid.astype(float), sigma, mode="nearest")
-    around = gaussian_filter(np.where(valid, frames, 0.0), sigma, mode="nearest")
-    return np.where(valid, frames, around / np.maximum(weight, 1e-6))
-
-
 def find_target(frames: np.ndarray, valid: np.ndarray, blur: float) -> tuple[int, int]:
     """(row, column) where the mean frame, blurred by a Gaussian of `blur` pixels rms, is brightest."""
     from scipy.ndimage import gaussian_filter
 
-    mean = gaussian_filter(fill(frames, valid).mean(0), blur, mode="nearest")
+    mean = gaussian_filter(_filled(frames, valid).mean(0), blur, mode="nearest")
     row, column = np.unravel_index(mean.argmax(), mean.shape)
     return int(row), int(column)
 
@@ -137,8 +128,12 @@ def frame_drift(frames: np.ndarray, valid: np.ndarray | None = None, upsampling:
     from skimage.registration import phase_cross_correlation
 
     frames = np.asarray(frames, dtype=float)
-    filled = frames if valid is None else fill(frames, np.asarray(valid, dtype=bool))
+    filled = frames if valid is None else _filled(frames, valid)
     # Whitening, the default, would raise the noise beyond the mask's cut-off.
     plain: dict[str, Any] = {"normalization": None, "upsample_factor": upsampling}
     shifts = [phase_cross_correlation(filled[0], frame, **plain)[0] for frame in filled]
     return -np.array(shifts)[:, ::-1] + 0.0  # no negative zeros
+
+
+def _filled(frames: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    return fill_bad_pixels(torch.tensor(frames), torch.tensor(valid, dtype=torch.bool)).numpy()

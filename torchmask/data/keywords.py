@@ -12,21 +12,10 @@ from typing import Any
 
 import numpy as np
 
-ARCSEC = math.pi / 180 / 3600
+from torchmask.grid import ARCSEC
+from torchmask.observation import celestial_cards, pixel_matrix
+from torchmask.optics.band import FILTERS, band_of_header
 
-# Effective wavelength and width [m]. Source: table of the aperture-masking filters in AMICAL (Soulain et al. 2020,
-# SPIE 11446, 1144611), after STScI's NIRISS documentation.
-FILTERS = {
-    ("NIRISS", "F277W"): (2.776e-6, 0.715e-6),
-    ("NIRISS", "F380M"): (3.828e-6, 0.205e-6),
-    ("NIRISS", "F430M"): (4.286e-6, 0.202e-6),
-    ("NIRISS", "F480M"): (4.817e-6, 0.298e-6),
-}
-
-_CELESTIAL = re.compile(
-    r"WCSAXES|CRPIX[12]|CRVAL[12]|CTYPE[12]|CUNIT[12]|CDELT[12]|CROTA[12]|CD[12]_[12]|PC[12]_[12]|P[VS][12]_\d+"
-    r"|LONPOLE|LATPOLE|RADESYS|EQUINOX|[AB]P?_(ORDER|DMAX|\d+_\d+)"
-)
 _ABOUT = ("OBJECT", "TARGNAME", "TARG_RA", "TARG_DEC", "RA", "DEC", "TELESCOP", "INSTRUME", "FILTER", "DATE-OBS")
 _ABOUT += ("TIME-OBS", "MJD-OBS", "MJD-AVG", "OBSERVER")
 
@@ -49,25 +38,6 @@ def number(header: Any, names: tuple[str, ...], path: Any) -> float | None:
             raise ValueError(f"{path}: {name} is {value!r}, which is no positive number")
         return float(value)
     return None
-
-
-def pixel_matrix(header: Any) -> np.ndarray | None:
-    """(2, 2) matrix from pixels (x, y) to the sky [deg], from CD, PC and CDELT, or CROTA and CDELT; None without."""
-    from astropy.wcs import WCS
-
-    if not any(name in header for name in ("CD1_1", "CD1_2", "CDELT1")):
-        return None
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # astropy's corrections of old-fashioned cards
-            wcs = WCS(_as_header(celestial_cards(header)), naxis=2)
-            if not all(str(unit) for unit in wcs.wcs.cunit):  # plain pixel coordinates, which say nothing of the sky
-                return None
-            scale = [unit.to("deg") for unit in wcs.wcs.cunit]
-            matrix = np.diag(scale) @ wcs.pixel_scale_matrix
-    except (ValueError, TypeError, AttributeError, MemoryError):  # cards that make no sense, units that are no angle
-        return None
-    return matrix if np.isfinite(matrix).all() and np.linalg.det(matrix) != 0 else None
 
 
 def pixel_scale(header: Any, path: Any, given: float | None) -> float:
@@ -101,11 +71,12 @@ def wavelength(header: Any, path: Any, given: float | None) -> float:
         if not 1e-8 < value < 1e-2:
             raise ValueError(f"{path}: WAVELEN is {value:g}, which is no wavelength in metres: give wavelength [m]")
         return value
-    name = (str(header.get("INSTRUME", "")).strip().upper(), str(header.get("FILTER", "")).strip().upper())
-    if name in FILTERS:
-        return FILTERS[name][0]
-    known = ", ".join(f"{instrument} {band}" for instrument, band in FILTERS)
-    what = f" (FILTER is {name[1]!r} of INSTRUME {name[0]!r}; known: {known})" if name[1] else ""
+    band = band_of_header(header)
+    if band is not None:
+        return band.wavelength
+    instrument, name = (str(header.get(card, "")).strip().upper() for card in ("INSTRUME", "FILTER"))
+    known = ", ".join(" ".join(names) for names in FILTERS)
+    what = f" (FILTER is {name!r} of INSTRUME {instrument!r}; known: {known})" if name else ""
     raise missing(path, "WAVELEN, nor a FILTER that is known", f"wavelength [m]{what}")
 
 
@@ -185,14 +156,6 @@ def _unknown_unit(text: str, path: Any) -> ValueError:
     )
 
 
-def celestial_cards(header: Any) -> dict[str, Any]:
-    """The cards of the two sky axes of a header, as they are."""
-    cards = {name: header[name] for name in header if _CELESTIAL.fullmatch(name)}
-    if "WCSAXES" in cards:
-        cards["WCSAXES"] = 2  # a cube's third axis is left behind
-    return cards
-
-
 def kept_cards(header: Any) -> dict[str, Any]:
     """The cards that go with an observation: sky coordinates, target, telescope, filter and date."""
     return celestial_cards(header) | {name: header[name] for name in _ABOUT if name in header}
@@ -205,12 +168,3 @@ def shift_cards(cards: dict[str, Any], x: int, y: int) -> dict[str, Any]:
         if name in cards:
             moved[name] = float(cards[name]) - offset
     return moved
-
-
-def _as_header(cards: dict[str, Any]) -> Any:
-    from astropy.io.fits import Header
-
-    header = Header()
-    for name, value in cards.items():
-        header[name] = value
-    return header

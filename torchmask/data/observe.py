@@ -13,8 +13,8 @@ import torch
 from torchmask.data import keywords
 from torchmask.data.calibration import SELECTIONS, best_frames, calibrate, crop_corner, find_target
 from torchmask.data.fits import FITSImages, read_fits
-from torchmask.grid import Grid
-from torchmask.observation import Observation
+from torchmask.grid import ARCSEC, Grid
+from torchmask.observation import Observation, pixel_matrix
 from torchmask.optics.aperture import Aperture
 
 PathLike = str | Path
@@ -178,7 +178,7 @@ def _check_alike(files: Sequence[FITSImages], wavelengths: Sequence[float], scal
     kinds: tuple[tuple[str, Sequence[Any], Any], ...] = (
         ("filters", [str(file.header.get("FILTER", "")).strip() for file in files], str),
         ("wavelengths", wavelengths, lambda value: f"{value:.5g} m"),
-        ("pixel scales", scales, lambda value: f"{value / keywords.ARCSEC:.5g} arcsec"),
+        ("pixel scales", scales, lambda value: f"{value / ARCSEC:.5g} arcsec"),
         ("image shapes", [file.values.shape[1:] for file in files], str),
     )
     for what, values, format_value in kinds:
@@ -193,7 +193,7 @@ def _check_alike(files: Sequence[FITSImages], wavelengths: Sequence[float], scal
 
 def _check_rotation(files: Sequence[FITSImages], size: int) -> None:
     """Raise ValueError if files are turned or mirrored against the first by more than half a pixel at a corner."""
-    matrices = [keywords.pixel_matrix(file.header) for file in files]
+    matrices = [pixel_matrix(file.header) for file in files]
     first = matrices[0]
     for file, matrix in zip(files, matrices, strict=True):
         if first is None or matrix is None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
 
-from torchmask.data.keywords import ARCSEC
+from torchmask.grid import ARCSEC
 from torchmask.io import as_array, atomic_write
 from torchmask.observation import Observation
 from torchmask.restoration.result import RestorationResult

@@ -15,10 +15,9 @@ from torchmask.interferometry.visibilities import (
     sky_stations,
     triangle_sides,
 )
-from torchmask.observation import Observation
+from torchmask.observation import Observation, check_frames
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.otf import subaperture_otf
-from torchmask.restoration.initialization import check_frames
 
 _FIELD = 4  # the envelope of the fringes is computed on a field this many times as wide, against its wrap-around
 _WORST_CONDITION = 1e6  # of the normal equations of the fringes

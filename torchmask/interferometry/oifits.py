@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from torchmask.data.keywords import FILTERS
+from torchmask.grid import ARCSEC
 from torchmask.interferometry.visibilities import Observables
 from torchmask.io import as_array, atomic_write
 from torchmask.observation import Observation
+from torchmask.optics.band import band_of_header
 
 _ARRAY = "MASK"
-_ARCSEC = 180 * 3600 / math.pi
 
 
 def save_oifits(
@@ -75,10 +75,10 @@ def save_oifits(
         raise ValueError(f"the observables are of {len(observables.stations)} holes and the observation's mask has {n}")
     header = observation.header
     if bandwidth is None:
-        name = (str(header.get("INSTRUME", "")).strip().upper(), str(header.get("FILTER", "")).strip().upper())
-        if name not in FILTERS:
+        band = band_of_header(header)
+        if band is None:
             raise ValueError("the width of the band is not known (no FILTER that is): give bandwidth [m]")
-        bandwidth = FILTERS[name][1]
+        bandwidth = band.width
     if not (math.isfinite(bandwidth) and bandwidth > 0):
         raise ValueError(f"bandwidth is {bandwidth}: it must be finite and positive, in m")
 
@@ -226,7 +226,7 @@ def _array(observables: Observables, observation: Observation) -> Any:
     n, aperture = len(observables.stations), observation.aperture
     names = [f"H{index + 1}" for index in range(n)]
     places = np.concatenate([as_array(observables.stations), np.zeros((n, 1))], axis=1)
-    field = observation.grid.wavelength / aperture.subaperture_diameter * _ARCSEC
+    field = observation.grid.wavelength / aperture.subaperture_diameter / ARCSEC
     columns = {
         "TEL_NAME": ("16A", None, names),
         "STA_NAME": ("16A", None, names),

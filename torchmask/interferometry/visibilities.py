@@ -14,17 +14,16 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from torchmask.data.keywords import pixel_matrix
 from torchmask.grid import Grid
 from torchmask.observation import Observation
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.otf import OTF
 from torchmask.optics.zernike import ZernikePhase
-from torchmask.restoration.result import RestorationResult
 
 _SAMPLES_PER_HOLE = 8
 
@@ -71,7 +70,29 @@ class Observables:
         return self.stations[self.pairs[:, 1]] - self.stations[self.pairs[:, 0]]
 
 
-def restored_observables(result: RestorationResult, observation: Observation) -> Observables:
+class Restored(Protocol):
+    """What of a restoration its visibilities need; a `RestorationResult` has it.
+
+    object : (H, W) on the frames' pixels, in the frames' units
+    coefficients : (T, N, J) Zernike coefficients of the frames [rad rms]
+    noise : rms of a pixel of a frame, in the frames' units
+    chi_square : (T,) mean square of the residuals in units of the noise
+    """
+
+    @property
+    def object(self) -> Tensor: ...
+
+    @property
+    def coefficients(self) -> Tensor: ...
+
+    @property
+    def noise(self) -> float: ...
+
+    @property
+    def chi_square(self) -> Tensor: ...
+
+
+def restored_observables(result: Restored, observation: Observation) -> Observables:
     """Visibilities and closure phases of a restored object, freed of the aberrations that were restored with it.
 
     Errors are those that noise alone would leave if the restored aberrations were exact: the noise of the frames (or
@@ -82,6 +103,7 @@ def restored_observables(result: RestorationResult, observation: Observation) ->
     Parameters
     ----------
     result : RestorationResult
+        Or anything else that is `Restored`.
     observation : Observation
         That it was restored from.
 
@@ -158,11 +180,10 @@ def sky_stations(observation: Observation) -> Tensor:
     With the matrix M from pixels to the sky, nu . x = u . (M x) for u = M^-T nu.
     """
     centers = observation.aperture.centers.detach().double().cpu()
-    matrix = pixel_matrix(observation.header) if observation.header else None
+    matrix = observation.sky_matrix
     if matrix is None:
         return centers
-    to_sky = torch.from_numpy(matrix).deg2rad() / observation.grid.pixel_scale
-    return centers @ torch.linalg.inv(to_sky)
+    return centers @ torch.linalg.inv(matrix / observation.grid.pixel_scale)
 
 
 def pixel_positions(grid: Grid) -> Tensor:
@@ -179,7 +200,7 @@ def fringe_waves(aperture: Aperture, grid: Grid, pairs: Tensor) -> Tensor:
     return torch.polar(torch.ones_like(phase), phase)
 
 
-def _transmitted(result: RestorationResult, aperture: Aperture, grid: Grid, pairs: Tensor) -> Tensor:
+def _transmitted(result: Restored, aperture: Aperture, grid: Grid, pairs: Tensor) -> Tensor:
     """(1 + B,) |OTF|^2 of the restored aberrations, summed over frames and the frequencies around 0 and baselines."""
     n_modes = result.coefficients.shape[-1]
     samples = _SAMPLES_PER_HOLE * grid.period / (aperture.subaperture_diameter * min(grid.shape))

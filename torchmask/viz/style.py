@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 import numpy as np
 
-from torchmask.grid import Grid
+from torchmask.grid import ARCSEC, MAS, Grid
 from torchmask.optics.aperture import Aperture
 
 if TYPE_CHECKING:
@@ -45,7 +45,6 @@ _STYLE: dict[Any, Any] = {
     "lines.linewidth": 1.6,
     "figure.dpi": 110.0,
 }
-_ARCSEC = math.degrees(1) * 3600
 
 
 def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
@@ -93,7 +92,7 @@ def length_unit(length: float) -> tuple[str, float]:
 
 def angle_unit(angle: float) -> tuple[str, float]:
     """Arcseconds or milliarcseconds for `angle` [rad], and how many of them make a radian."""
-    return ("arcsec", _ARCSEC) if angle * _ARCSEC >= 0.5 else ("mas", 1e3 * _ARCSEC)
+    return ("arcsec", 1 / ARCSEC) if angle >= 0.5 * ARCSEC else ("mas", 1 / MAS)
 
 
 def round_below(value: float) -> float:

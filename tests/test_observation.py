@@ -1,0 +1,213 @@
+"""An observation and its file, its directions on the sky, and the checks that frames pass."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from torchmask.grid import Grid
+from torchmask.observation import Observation, check_frames
+from torchmask.optics.aperture import FullAperture, SparseAperture
+
+GRID = Grid((16, 20), 1e-7, 550e-9)
+IMAGES = ("frames", "object", "psfs", "valid", "errors")
+
+
+@pytest.fixture
+def mask():
+    return SparseAperture([[0.0, 0.38], [0.33, -0.2], [-0.35, -0.15]], 0.2, 1.0)
+
+
+def frames_of(n, seed=0):
+    return torch.rand(n, *GRID.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+def sky_cards(angle, parity=-1.0):
+    """North turned by `angle` [rad] from the rows; east to the left for parity -1."""
+    degrees = math.degrees(GRID.pixel_scale)
+    cards = {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CUNIT1": "deg", "CUNIT2": "deg"}
+    cards |= {"CD1_1": parity * degrees * math.cos(angle), "CD1_2": -parity * degrees * math.sin(angle)}
+    return cards | {"CD2_1": degrees * math.sin(angle), "CD2_2": degrees * math.cos(angle)}
+
+
+# --- the file
+
+
+def test_everything_survives_the_file(tmp_path, mask):
+    whole = Observation(
+        frames_of(3),
+        mask,
+        GRID,
+        readout_noise=1.5,
+        object=frames_of(1, 1)[0],
+        psfs=frames_of(3, 2),
+        r0=0.15,
+        outer_scale=20.0,
+        n_photons=1e6,
+        valid=frames_of(3, 3) > 0.1,
+        errors=frames_of(3, 4),
+        header={"OBJECT": "satellite", "CRPIX1": 5.0, "EQUINOX": 2000},
+    )
+    whole.save(tmp_path / "a.npz")
+    back = Observation.load(tmp_path / "a.npz")
+    for name in IMAGES:
+        assert torch.equal(getattr(back, name), getattr(whole, name)), name
+    for name in ("grid", "readout_noise", "r0", "outer_scale", "n_photons", "header"):
+        assert getattr(back, name) == getattr(whole, name), name
+    assert torch.equal(back.aperture.centers, mask.centers)
+    for name in ("subaperture_diameter", "mask_diameter", "shape", "orientation", "central_obstruction"):
+        assert getattr(back.aperture, name) == getattr(mask, name), name
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_what_is_not_known_is_not_known_afterwards(tmp_path, dtype):
+    pupil = FullAperture(1.0, central_obstruction=0.25)
+    Observation(frames_of(2).to(dtype), pupil, GRID, readout_noise=None).save(tmp_path / "a.npz")
+    back = Observation.load(tmp_path / "a.npz")
+    assert isinstance(back.aperture, FullAperture)
+    assert back.aperture.central_obstruction == 0.25
+    assert back.frames.dtype == dtype
+    unknown = ("readout_noise", "object", "psfs", "r0", "outer_scale", "n_photons", "valid", "errors")
+    assert all(getattr(back, name) is None for name in unknown)
+    assert back.header == {}
+
+
+def test_files_of_version_0_1_are_read(tmp_path):
+    """The keys that 0.1.0 wrote, as numpy writes them."""
+    frames = np.random.default_rng(0).random((2, 8, 8), dtype=np.float32)
+    old = {
+        "frames": frames,
+        "pixel_scale": 2.75e-7,
+        "wavelength": 550e-9,
+        "centers": np.array([[0.0, 0.3], [0.3, -0.2], [-0.3, -0.2]]),
+        "subaperture_diameter": 0.2,
+        "mask_diameter": 1.0,
+        "shape": "hexagon",
+        "orientation": 0.1,
+        "central_obstruction": 0.0,
+        "readout_noise": 2.0,
+        "object": 100 * frames[0],
+        "psfs": frames / 64,
+        "valid": np.ones((8, 8), dtype=bool),
+        "r0": 0.15,
+        "outer_scale": 20.0,
+        "n_photons": 1e5,
+        "header": '{"OBJECT": "satellite"}',
+    }
+    np.savez(tmp_path / "old.npz", **old)
+    back = Observation.load(tmp_path / "old.npz")
+    assert torch.equal(back.frames, torch.from_numpy(frames))
+    assert torch.equal(back.object, torch.from_numpy(old["object"]))
+    assert torch.equal(back.psfs, torch.from_numpy(old["psfs"]))
+    assert back.valid.all()
+    assert back.grid == Grid(8, 2.75e-7, 550e-9)
+    assert (back.aperture.shape, back.aperture.orientation) == ("hexagon", 0.1)
+    assert (back.readout_noise, back.r0, back.outer_scale, back.n_photons) == (2.0, 0.15, 20.0, 1e5)
+    assert back.header == {"OBJECT": "satellite"}
+    # the least that such a file had to hold
+    needed = ("frames", "centers", "subaperture_diameter", "mask_diameter", "pixel_scale", "wavelength")
+    np.savez(tmp_path / "least.npz", **{name: old[name] for name in needed})
+    least = Observation.load(tmp_path / "least.npz")
+    assert (least.aperture.shape, least.aperture.orientation) == ("disc", 0.0)
+    assert least.readout_noise is None
+    for name in needed:
+        np.savez(tmp_path / f"no_{name}.npz", **{key: old[key] for key in needed if key != name})
+        with pytest.raises(ValueError, match=f"has no {name}"):
+            Observation.load(tmp_path / f"no_{name}.npz")
+
+
+def test_a_file_whose_parts_disagree_says_so(tmp_path, mask):
+    Observation(frames_of(2), mask, GRID, readout_noise=None).save(tmp_path / "a.npz")
+    parts = dict(np.load(tmp_path / "a.npz"))
+    np.savez(tmp_path / "b.npz", **parts | {"psfs": np.ones((3, 4, 4))})
+    with pytest.raises(ValueError, match=r"b\.npz holds no valid observation: psfs has shape \(3, 4, 4\)"):
+        Observation.load(tmp_path / "b.npz")
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"frames": torch.ones(3, 16, 16)}, r"frames has shape \(3, 16, 16\): it must be \(n_frames, 16, 20\)"),
+        ({"frames": torch.ones(0, 16, 20)}, r"with at least one frame"),
+        ({"valid": torch.ones(3, 16, 20)}, r"valid is torch.float32 of shape \(3, 16, 20\): it must be bool"),
+        ({"valid": torch.ones(2, 16, 20, dtype=torch.bool)}, r"valid is torch.bool of shape \(2, 16, 20\)"),
+        ({"errors": torch.ones(16, 20)}, r"errors has shape \(16, 20\): it must be \(3, 16, 20\)"),
+        ({"object": torch.ones(3, 16, 20)}, r"object has shape \(3, 16, 20\): it must be \(16, 20\)"),
+        ({"readout_noise": -1.0}, r"readout_noise is -1.0"),
+        ({"readout_noise": math.nan}, r"readout_noise is nan"),
+    ],
+)
+def test_an_observation_of_parts_that_disagree_is_refused(mask, fields, message):
+    with pytest.raises(ValueError, match=message):
+        Observation(**{"frames": torch.ones(3, 16, 20), "readout_noise": None} | fields, aperture=mask, grid=GRID)
+
+
+# --- the sky
+
+
+@pytest.mark.parametrize("parity", [-1.0, 1.0])
+def test_the_sky_matrix_leads_from_pixels_to_east_and_north(mask, parity):
+    pytest.importorskip("astropy")
+    angle = 0.3
+    observation = Observation(frames_of(1), mask, GRID, None, header=sky_cards(angle, parity))
+    c, s = math.cos(angle), math.sin(angle)
+    expected = GRID.pixel_scale * torch.tensor([[parity * c, -parity * s], [s, c]], dtype=torch.float64)
+    torch.testing.assert_close(observation.sky_matrix, expected, rtol=1e-12, atol=0)  # a card holds 13 digits
+
+
+@pytest.mark.parametrize("cards", [{}, {"OBJECT": "star"}, {"CDELT1": 1.0, "CDELT2": 1.0}])
+def test_without_sky_coordinates_there_is_no_sky_matrix(mask, cards):
+    pytest.importorskip("astropy")
+    assert Observation(frames_of(1), mask, GRID, None, header=cards).sky_matrix is None
+
+
+# --- what frames are
+
+
+def test_bad_pixels_may_hold_anything():
+    frames, valid = frames_of(3), torch.ones(GRID.shape, dtype=torch.bool)
+    valid[5, 6] = valid[0, 0] = False
+    spoilt = frames.clone()
+    spoilt[:, 5, 6], spoilt[:, 0, 0] = math.nan, math.inf
+    filled, mask = check_frames(spoilt, valid, GRID)
+    assert torch.equal(mask, valid.expand(3, -1, -1))
+    assert torch.equal(filled[:, valid], frames[:, valid])
+    around = (frames[:, 4:7, 5:8].sum((1, 2)) - frames[:, 5, 6]) / 8
+    torch.testing.assert_close(filled[:, 5, 6], around)
+
+
+def test_arrays_and_frames_with_a_gradient_are_frames_too():
+    frames = frames_of(3)
+    valid = frames > 0.1
+    expected = check_frames(frames, valid, GRID)
+    for given in ((frames.numpy(), valid.numpy()), (frames.clone().requires_grad_(), valid)):
+        for one, other in zip(expected, check_frames(*given, GRID), strict=True):
+            assert torch.equal(one, other)
+            assert not other.requires_grad
+    assert check_frames(frames.float(), None, GRID)[0].dtype == torch.float64
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda f: f[0], "at least one frame"),
+        (lambda f: f[:, :-1], "as the grid says"),
+        (lambda f: f[:0], "at least one frame"),
+        (lambda f: f.index_fill(0, torch.tensor([1]), math.nan), r"frames \[1\] hold values that are not finite"),
+        (lambda f: f.index_fill(0, torch.tensor([2]), 0.0), r"frames \[2\] hold no light"),
+        (lambda f: -f, r"frames \[0, 1, 2\] hold no light"),
+    ],
+)
+def test_what_is_no_stack_of_frames_is_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        check_frames(change(frames_of(3)), None, GRID)
+
+
+def test_valid_pixels_must_fit_the_frames():
+    ones = torch.ones(2, *GRID.shape, dtype=torch.bool)  # for three frames
+    for valid in (torch.ones(GRID.shape), ones[0, :4, :4], ones):
+        with pytest.raises(ValueError, match=r"valid is torch\.\w+ of shape .*: it must be bool"):
+            check_frames(frames_of(3), valid, GRID)
+    with pytest.raises(ValueError, match=r"hold no light"):
+        check_frames(frames_of(3), ~ones[0], GRID)
