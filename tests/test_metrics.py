@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from skimage.metrics import structural_similarity
 
-from torchmask.metrics import align, lowpass, relative_error, ssim
+from torchmask.metrics import align, lowpass, relative_error, shift, ssim
 
 STACKS = Path(__file__).parents[2] / "shared" / "stacks"
 
@@ -81,6 +81,55 @@ def test_lowpass_keeps_the_rim_and_nothing_beyond():
     assert low.dtype == torch.float32
     torch.testing.assert_close(low[1], torch.ones(n, n))
     assert torch.autograd.gradcheck(lambda image: lowpass(image, 0.3), (stack[:, :6, :7],))
+
+
+SIDES = st.integers(3, 24)
+OFFSETS = st.floats(-30, 30)
+
+
+def noise(*shape: int, dtype: torch.dtype = torch.float64, seed: int = 0) -> torch.Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(dtype)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_shift_by_whole_pixels_is_a_roll(dtype):
+    image = noise(2, 12, 15, dtype=dtype)
+    for dy, dx in ((0, 0), (3, -4), (-12, 15), (17, 40)):
+        moved_by = shift(image, (dy, dx))
+        assert moved_by.dtype == dtype
+        # values of up to 4 through two FFTs, and phases of up to pi for each pixel of the way, each with its rounding
+        atol = (20 + 4 * math.pi * (abs(dy) + abs(dx))) * torch.finfo(dtype).eps
+        torch.testing.assert_close(moved_by, image.roll((dy, dx), (-2, -1)), rtol=0, atol=atol)
+
+
+@settings(derandomize=True, deadline=None, max_examples=40)
+@given(SIDES, SIDES, OFFSETS, OFFSETS, OFFSETS, OFFSETS, st.integers(0, 1000))
+def test_shifts_follow_the_dft_add_and_have_their_opposite_as_adjoint(rows, columns, dy, dx, more_y, more_x, seed):
+    image, other = noise(2, rows, columns, seed=seed)
+    there, back = (shift(x, o) for x, o in ((image, (dy, dx)), (other, (-dy, -dx))))
+    assert float((there * other).sum()) == pytest.approx(float((image * back).sum()), abs=1e-11 * rows * columns)
+    close = {"rtol": 0, "atol": 1e-12 * rows * columns}
+    odd = image[: rows - 1 + rows % 2, : columns - 1 + columns % 2]  # below Nyquist every frequency has its sign
+    torch.testing.assert_close(shift(odd, (dy, dx)), moved(odd, dy, dx), **close)
+    both = shift(shift(odd, (dy, dx)), (more_y, more_x))
+    torch.testing.assert_close(both, shift(odd, (dy + more_y, dx + more_x)), **close)
+    torch.testing.assert_close(shift(shift(odd, (dy, dx)), (-dy, -dx)), odd, **close)
+
+
+def test_the_wave_at_nyquist_vanishes_half_a_pixel_further():
+    wave = torch.tensor([1.0, -1.0], dtype=torch.float64).repeat(4, 3)
+    torch.testing.assert_close(shift(wave, (0.0, 0.5)), torch.zeros_like(wave), rtol=0, atol=1e-15)
+    torch.testing.assert_close(shift(wave, (0.5, 1.0)), -wave, rtol=0, atol=1e-15)
+
+
+def test_each_image_has_its_offset_and_both_have_gradients():
+    images, offsets = noise(3, 1, 5, 6).requires_grad_(), noise(3, 2, 2, seed=1).requires_grad_()
+    shifted = shift(images, offsets)
+    assert shifted.shape == (3, 2, 5, 6)
+    torch.testing.assert_close(shifted[2, 1], shift(images[2, 0], tuple(offsets[2, 1].tolist())), rtol=0, atol=1e-14)
+    assert torch.autograd.gradcheck(shift, (images, offsets))
+    with pytest.raises(ValueError, match=r"offset has shape \(3,\): its last axis must be \(dy, dx\)"):
+        shift(images, torch.zeros(3))
 
 
 def test_align_in_the_units_of_the_truth():

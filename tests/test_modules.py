@@ -104,6 +104,10 @@ MODULES: dict[str, Entry] = {
         lambda: Detector(1.5),
         lambda module, dtype: module(1e3 * random(8, 8, dtype=dtype), seeded()),
     ),
+    "detector that differentiates": Entry(
+        lambda: Detector(1.5, noise="gaussian"),
+        lambda module, dtype: module(1e3 * random(8, 8, dtype=dtype), seeded()),
+    ),
     "exposure model": Entry(lambda: ExposureModel(mask(), GRID, 4), exposed, lambda: ExposureModel(moved(), GRID, 4)),
     "myopic deconvolution": Entry(
         lambda: MyopicDeconvolution(mask(), GRID, 3, max_iterations=3),

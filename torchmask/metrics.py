@@ -34,6 +34,46 @@ def lowpass(image: Any, cutoff: float) -> Tensor:
     return torch.fft.irfft2(torch.fft.rfft2(image) * kept, s=image.shape[-2:])
 
 
+def shift(image: Tensor, offset: Tensor | tuple[float, float]) -> Tensor:
+    """Move images by any fraction of a pixel, with wrap-around, by the shift theorem: what is band-limited stays exact.
+
+    Parameters
+    ----------
+    image : (..., H, W) tensor
+    offset : (..., 2) tensor or (dy, dx)
+        Rows and columns by which each image moves [pixels]; leading axes broadcast against those of `image`.
+
+    Returns
+    -------
+    Tensor
+        (..., H, W), of the dtype and device of `image`; differentiable in both arguments.
+
+    Raises
+    ------
+    ValueError
+        If the last axis of `offset` is not (dy, dx).
+
+    Notes
+    -----
+    A whole number of pixels is a roll; the adjoint is the shift by `-offset`. Shifts add, and the one by `-offset` is
+    the inverse, but for the highest frequency of an even side, 1/2 cycles/pixel: its wave, +1 and -1 in turn, vanishes
+    half a pixel further.
+
+    Examples
+    --------
+    >>> image = torch.zeros(5, 6); image[1, 2] = 1.0
+    >>> shift(image, (1.0, -2.0)).round().nonzero().tolist()
+    [[2, 0]]
+    """
+    move = torch.as_tensor(offset, dtype=image.dtype, device=image.device)
+    if move.shape[-1:] != (2,):
+        raise ValueError(f"offset has shape {tuple(move.shape)}: its last axis must be (dy, dx), in pixels")
+    nu_y, nu_x = _frequencies(image.shape, image.dtype, image.device)
+    angle = -2 * math.pi * (nu_y * move[..., 0, None, None] + nu_x * move[..., 1, None, None])
+    turned = torch.fft.rfft2(image) * torch.polar(torch.ones_like(angle), angle)
+    return torch.fft.irfft2(turned, s=image.shape[-2:])
+
+
 def align(estimate: Any, truth: Any, cutoff: float) -> Tensor:
     """Low-pass `estimate`, move it and scale it so that it fits the low-passed `truth` best.
 
@@ -67,7 +107,7 @@ def align(estimate: Any, truth: Any, cutoff: float) -> Tensor:
     reference, image = lowpass(truth, cutoff), lowpass(estimate, cutoff)
     if not float(image.norm()) > 0:
         raise ValueError("the estimate is zero below the cut-off: no gain fits it to the truth")
-    image = _shift(image, _registration(image, reference))
+    image = shift(image, _registration(image, reference))
     return image * ((image * reference).sum() / (image * image).sum())
 
 
@@ -122,13 +162,6 @@ def _frequencies(shape: torch.Size, dtype: torch.dtype, device: torch.device) ->
     return nu_y[:, None], nu_x
 
 
-def _shift(image: Tensor, offset: Tensor) -> Tensor:
-    """Move an image by `offset` (dy, dx) [pixels], with wrap-around, by the shift theorem."""
-    nu_y, nu_x = _frequencies(image.shape, image.dtype, image.device)
-    phase = torch.exp(-2j * math.pi * (nu_y * offset[0] + nu_x * offset[1]))
-    return torch.fft.irfft2(torch.fft.rfft2(image) * phase, s=image.shape)
-
-
 def _registration(image: Tensor, reference: Tensor) -> Tensor:
     """The shift (dy, dx) of `image` with the highest correlation with `reference`.
 
@@ -143,7 +176,7 @@ def _registration(image: Tensor, reference: Tensor) -> Tensor:
     start = np.array([dy if dy < rows / 2 else dy - rows, dx if dx < columns / 2 else dx - columns], float)
 
     def loss(offset: Tensor) -> Tensor:
-        return -(_shift(image, offset) * reference).sum() / norm
+        return -(shift(image, offset) * reference).sum() / norm
 
     def value_and_gradient(offset: np.ndarray) -> tuple[float, np.ndarray]:
         leaf = torch.from_numpy(offset.copy()).requires_grad_()

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 import torchmask as tm
+from torchmask.optics.otf import analytic_otf
 from torchmask.optics.psf import psf_from_samples
 
 GRID = tm.Grid.nyquist(diameter=1.0, wavelength=550e-9, n_pixels=64)
@@ -46,6 +47,45 @@ def test_leading_axes_are_free_and_frames_come_before_sub_apertures_and_modes():
     layer = tm.ZernikePhase(mask, GRID, n_modes=3)
     phase = layer(torch.zeros(4, 7, 2, 3, dtype=torch.float64))  # (batch, frame, sub-aperture, mode)
     assert tm.PSF(mask, GRID)(phase).shape == (4, 7, 64, 64)
+
+
+POPULATION = torch.tensor(
+    [[[0.25, 0.1], [-0.25, -0.1]], [[-0.25, -0.1], [0.25, 0.1]], [[0.0, 0.3], [0.1, -0.3]]], dtype=torch.float64
+)
+"""As many masks as there are frames below, so that axes in another order would have the same shape."""
+
+
+@pytest.mark.parametrize("kind", [tm.PSF, tm.OTF])
+def test_masks_of_a_population_come_before_their_frames(kind):
+    coefficients = torch.randn(3, 3, 2, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+    def images(centers, coefficients):
+        mask = tm.SparseAperture(centers, 0.2, 1.0)
+        return kind(mask, GRID)(tm.ZernikePhase(mask, GRID, n_modes=4)(coefficients))
+
+    together = images(POPULATION, coefficients)  # (mask, frame, H, W)
+    alone = torch.stack([images(c, a) for c, a in zip(POPULATION, coefficients, strict=True)])
+    torch.testing.assert_close(together, alone, rtol=0, atol=1e-14)
+    # one frame each, without an axis for it
+    torch.testing.assert_close(images(POPULATION, coefficients[:, 1]), alone[:, 1], rtol=0, atol=1e-14)
+
+
+def test_pistons_of_a_population_have_their_frames_after_the_masks():
+    mask = tm.SparseAperture(POPULATION, 0.2, 1.0)
+    pistons = torch.randn(3, 3, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    together = analytic_otf(mask, GRID, pistons)
+    alone = [analytic_otf(tm.SparseAperture(c, 0.2, 1.0), GRID, p) for c, p in zip(POPULATION, pistons, strict=True)]
+    torch.testing.assert_close(together, torch.stack(alone), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("wind", [{}, {"wind": (3.0, 1.0), "frame_interval": 0.01}], ids=["independent", "frozen flow"])
+def test_turbulence_over_a_population_is_the_same_screen_for_all_masks_frame_by_frame(wind):
+    samples = tm.SparseAperture(POPULATION, 0.2, 1.0).samples(GRID)
+    phase = tm.TurbulencePhase(0.1, 20.0, **wind)(samples, 3, torch.Generator().manual_seed(0))
+    assert phase.shape == (3, 3, *samples.weights.shape[-2:])  # (mask, frame, hole, sample)
+    assert torch.equal(phase[0, :, 0], phase[1, :, 1])  # the first two masks have their holes in another order
+    assert torch.equal(phase[0, :, 1], phase[1, :, 0])
+    assert float((phase[:, 0] - phase[:, 1]).std()) > 0.1  # frames differ
 
 
 def test_wind_to_the_right_carries_the_phase_to_the_right():

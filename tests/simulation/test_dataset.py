@@ -84,6 +84,64 @@ def test_workers_draw_the_same_stacks(start):
             assert equal({name: values[i] for name, values in batch.items()}, dataset[2 * k + i])
 
 
+def stars(index, generator):
+    """As many stars as the index says, anywhere in the middle of the field."""
+    image = torch.zeros(32, 32)
+    for row, column in torch.randint(8, 24, (index + 1, 2), generator=generator).tolist():
+        image[row, column] += 1.0
+    return image
+
+
+def test_scenes_of_ones_own_are_what_the_stacks_show():
+    dataset = stacks(scene=stars, seed=3)
+    assert set(dataset[0]) == {"frames", "object", "psfs", "n_photons", "r0"}
+    for index in range(4):
+        item = dataset[index]
+        assert item["object"].dtype == torch.float32
+        count = item["object"] / item["object"].sum() * (index + 1)
+        torch.testing.assert_close(count, count.round(), rtol=0, atol=1e-5)
+        assert float(item["object"].sum()) == pytest.approx(float(item["n_photons"]), rel=1e-5)
+    given = torch.arange(32.0 * 32).reshape(32, 32)  # of any brightness, from an archive
+    shown = stacks(scene=lambda index, generator: given)[2]["object"]
+    torch.testing.assert_close(shown, given * (shown.sum() / given.sum()), rtol=1e-6, atol=0)
+
+
+def test_own_scenes_depend_on_seed_and_index_alone():
+    first, other = stacks(scene=stars, seed=5), stacks(length=100, scene=stars, seed=5)
+    assert all(equal(first[i], other[i]) for i in (3, 1, 0))
+    assert not torch.equal(first[2]["object"] > 0, stacks(scene=stars, seed=6)[2]["object"] > 0)
+    # what the scene draws leaves the turbulence and the noise as they were
+    flat = stacks(scene=lambda index, generator: torch.ones(32, 32), seed=5)
+    assert torch.equal(flat[2]["psfs"], first[2]["psfs"])
+
+
+@pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")  # from Python 3.12 on
+def test_workers_draw_the_same_own_scenes():
+    dataset = stacks(scene=stars)
+    loader = DataLoader(dataset, batch_size=2, num_workers=2, multiprocessing_context="fork")
+    for k, batch in enumerate(loader):
+        for i in range(2):
+            assert equal({name: values[i] for name, values in batch.items()}, dataset[2 * k + i])
+
+
+@pytest.mark.parametrize(
+    ("scene", "error", "message"),
+    [
+        ("satellite", TypeError, "scene is a str: it must be a function of an index and a generator"),
+        (lambda index, generator: [[1.0]], TypeError, r"scene\(0, generator\) gave a list"),
+        (lambda index, generator: torch.zeros(32, 32), ValueError, r"scene\(0, generator\) gave 0 as its light"),
+        (lambda index, generator: torch.full((32, 32), math.nan), ValueError, "gave nan as its light"),
+        (lambda index, generator: torch.ones(16, 32), ValueError, r"scene has shape \(16, 32\)"),
+        (lambda index, generator: torch.ones(32, 32) - 2 * torch.eye(32), ValueError, "negative light"),
+    ],
+)
+def test_bad_scenes_are_refused_when_it_is_made(scene, error, message):
+    with pytest.raises(error, match=message):
+        stacks(scene=scene)
+    with pytest.raises(ValueError, match="scene and path"):
+        stacks(scene=stars, path="satellite.obj")
+
+
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_batches_go_to_a_gpu():
     batch = next(iter(DataLoader(stacks(), batch_size=2, pin_memory=True)))

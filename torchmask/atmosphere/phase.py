@@ -32,8 +32,8 @@ class TurbulencePhase(nn.Module):
 
     Notes
     -----
-    `forward(samples, n_frames, generator)` returns (n_frames, ..., N, P) [rad], dtype and device of the samples; all
-    masks of a population see the same screens. Frames are snapshots: nothing moves during an exposure.
+    `forward(samples, n_frames, generator)` returns (..., n_frames, N, P) [rad], dtype and device of the samples
+    (..., N, P); all masks of a population see the same screens. Frames are snapshots: nothing moves during an exposure.
 
     Examples
     --------
@@ -74,7 +74,7 @@ class TurbulencePhase(nn.Module):
             time = torch.arange(n_frames, dtype=torch.float64, device="cpu") * self.frame_interval
             path = time[:, None] * time.new_tensor(self.wind)
             screens = frozen_flow(shape, samples.step, self.r0, self.outer_scale, path, **like)
-        return screens.flatten(1)[:, place]
+        return screens.flatten(1)[:, place].movedim(0, -3)
 
     def extra_repr(self) -> str:
         flow = "" if self.wind is None else f", wind={self.wind}, frame_interval={self.frame_interval}"

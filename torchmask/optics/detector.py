@@ -7,6 +7,8 @@ import math
 import torch
 from torch import Tensor, nn
 
+NOISES = ("poisson", "gaussian")
+
 
 def image_formation(scene: Tensor, psfs: Tensor) -> Tensor:
     """Blur a scene by linear convolution: light that leaves the field is lost, none comes back on the other side.
@@ -75,17 +77,30 @@ def _wide_raster(psfs: Tensor, image: Tensor) -> tuple[int, int]:
 
 
 class Detector(nn.Module):
-    """Photon noise, and Gaussian read-out noise of zero mean.
+    """Noise of the light and of the read-out, independent from pixel to pixel.
 
     Parameters
     ----------
     readout_noise : float
-        Electrons rms per pixel and frame.
+        Electrons rms per pixel and frame: Gaussian, of zero mean.
+    noise : {"poisson", "gaussian"}
+        Of the light. "poisson" counts photons, as a detector does. Its frames carry no gradient, because a count is a
+        step function of the light. "gaussian" adds normal noise of the same variance as count and read-out together,
+        `expected + readout_noise**2`, and differentiates: train through this one.
 
     Raises
     ------
     ValueError
-        If `readout_noise` is not finite or is negative.
+        If `readout_noise` is not finite or is negative, or `noise` is neither of the two.
+
+    Notes
+    -----
+    A Gaussian frame is y = m + s e with m the expected light, s^2 = m + readout_noise^2 and e a standard normal number
+    that is drawn whatever m is (Kingma & Welling, Auto-Encoding Variational Bayes, 2014, section 2.4). So
+    dy/dm = 1 + e / (2 s), with the growth of the noise included. The second term is at most |e| / (2 readout_noise);
+    without read-out noise it grows without bound towards the dark, and is left out where s^2 is no more than the
+    rounding of the FFTs that formed m: a dark pixel has the gradient 1 of its mean. Gaussian pixels may be negative,
+    and stand in poorly for counts of less than about ten photons.
 
     Examples
     --------
@@ -93,13 +108,19 @@ class Detector(nn.Module):
     >>> frame = detector(torch.full((64, 64), 100.0), generator=torch.Generator().manual_seed(0))
     >>> bool((frame.mean() - 100).abs() < 1)
     True
+    >>> light = torch.full((64, 64), 100.0, requires_grad=True)
+    >>> Detector(1.5, noise="gaussian")(light).requires_grad, Detector(1.5)(light).requires_grad
+    (True, False)
     """
 
-    def __init__(self, readout_noise: float = 0.0) -> None:
+    def __init__(self, readout_noise: float = 0.0, noise: str = "poisson") -> None:
         super().__init__()
         if not (math.isfinite(readout_noise) and readout_noise >= 0):
             raise ValueError(f"readout_noise is {readout_noise}: it must be finite and not negative, in electrons rms")
+        if noise not in NOISES:
+            raise ValueError(f"noise is {noise!r}: it must be one of {', '.join(NOISES)}")
         self.readout_noise: float = float(readout_noise)
+        self.noise: str = noise
 
     def forward(self, expected: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Draw frames (..., H, W) [electrons] whose mean is `expected` (..., H, W) [electrons].
@@ -110,14 +131,22 @@ class Detector(nn.Module):
         """
         if not bool(torch.isfinite(expected).all()):
             raise ValueError("expected holds values that are not finite: electrons per pixel are needed")
-        rounding = 32 * torch.finfo(expected.dtype).eps * torch.linalg.vector_norm(expected)
+        rounding = 32 * torch.finfo(expected.dtype).eps * torch.linalg.vector_norm(expected.detach())
         if bool((expected < -rounding).any()):
             raise ValueError("expected holds negative light beyond rounding errors: no pixel may be negative")
         device = expected.device if generator is None else generator.device
-        mean = expected.clamp(min=0).to(device)
-        noise = torch.randn(mean.shape, generator=generator, dtype=mean.dtype, device=device)
-        counts = torch.poisson(mean, generator=generator)
-        return (counts + self.readout_noise * noise).to(expected.device)
+        normal = torch.randn(expected.shape, generator=generator, dtype=expected.dtype, device=device)
+        if self.noise == "gaussian":
+            variance = expected.clamp(min=0) + self.readout_noise**2
+            return expected + _root(variance, rounding) * normal.to(expected.device)
+        counts = torch.poisson(expected.detach().clamp(min=0).to(device), generator=generator)
+        return (counts + self.readout_noise * normal).to(expected.device)
 
     def extra_repr(self) -> str:
-        return f"readout_noise={self.readout_noise:.6g}"
+        return f"readout_noise={self.readout_noise:.6g}, noise={self.noise!r}"
+
+
+def _root(variance: Tensor, rounding: Tensor) -> Tensor:
+    """Square root, without its gradient where that would divide by no more than rounding errors."""
+    known = variance > rounding
+    return torch.where(known, torch.where(known, variance, 1).sqrt(), variance.detach().sqrt())

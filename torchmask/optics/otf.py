@@ -93,11 +93,14 @@ class OTF(PSF):
 def analytic_otf(aperture: Aperture, grid: Grid, pistons: Tensor | None = None) -> Tensor:
     """OTF of clear sub-apertures with a piston each, in closed form: the sum of the overlaps of all pairs.
 
-    `pistons` (..., N) [rad], or None for a perfect wavefront. Returns complex (..., H, W) in FFT order, wrapped on
+    `pistons` (..., [frame,] N) [rad], or None for a perfect wavefront: where there are more axes than the centres
+    (..., N, 2) have, the last one before N is the frame. Returns complex (..., [frame,] H, W) in FFT order, wrapped on
     the frequency torus as a sampled PSF is. Source: DESIGN, section 2; the autocorrelation theorem.
     """
     grid.require_sampling(aperture.extent)
     centers = aperture.centers
+    if pistons is not None and pistons.ndim >= centers.ndim:
+        centers = centers.unsqueeze(-3)
     nu_y, nu_x = grid.frequencies(centers.dtype, centers.device)
     n = aperture.n_subapertures
     total = None

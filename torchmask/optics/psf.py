@@ -26,10 +26,12 @@ def fold(images: Tensor, shape: tuple[int, int]) -> Tensor:
 def psf_from_samples(samples: PupilSamples, phase: Tensor | None = None) -> Tensor:
     """PSF of a sampled pupil on its whole raster, unit sum, origin at [0, 0].
 
-    PSF = |FFT(P exp(i phase))|^2 with `phase` (..., N, P) [rad] on the samples; leading axes (frames, populations)
-    broadcast against those of the samples. Returns (..., rows, columns).
+    PSF = |FFT(P exp(i phase))|^2 with `phase` (..., [frame,] N, P) [rad] on the samples (..., N, P): where it has more
+    axes than they, the last one before N is the frame. Returns (..., [frame,] rows, columns).
     """
     weights, index = samples.weights, samples.index
+    if phase is not None and phase.ndim > weights.ndim:
+        weights, index = weights.unsqueeze(-3), index.unsqueeze(-3)
     if phase is None:
         field = weights.to(torch.complex64 if weights.dtype == torch.float32 else torch.complex128)
     else:
@@ -74,9 +76,9 @@ class PSF(nn.Module):
 
     Notes
     -----
-    `forward(phase)` takes the phase [rad] on `samples()`, (..., N, P), as `ZernikePhase` and `TurbulencePhase` give
-    it, or None for a perfect wavefront, and returns (..., H, W). A phase 2 pi s x pixel_scale / wavelength moves
-    the image by +s pixels.
+    `forward(phase)` takes the phase [rad] on `samples()`, (..., [frame,] N, P), as `ZernikePhase` and `TurbulencePhase`
+    give it, or None for a perfect wavefront, and returns (..., [frame,] H, W). A phase
+    2 pi s x pixel_scale / wavelength moves the image by +s pixels.
 
     Examples
     --------

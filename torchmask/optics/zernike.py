@@ -149,9 +149,9 @@ class ZernikePhase(nn.Module):
 
     Notes
     -----
-    `forward(coefficients)` takes (..., N, J) in rad rms and returns the phase (..., N, P) [rad]; leading axes (frames)
-    broadcast against those of the centres. The basis is kept while the centres stay where they were, and evaluated
-    anew, differentiably, when they train or have moved.
+    `forward(coefficients)` takes (..., [frame,] N, J) in rad rms and returns the phase (..., [frame,] N, P) [rad]:
+    where there are more axes than the centres (..., N, 2) have, the last one before N is the frame. The basis is kept
+    while the centres stay where they were, and evaluated anew, differentiably, when they train or have moved.
 
     Examples
     --------
@@ -189,6 +189,8 @@ class ZernikePhase(nn.Module):
         centers = self.aperture.centers
         moved = centers.requires_grad or not torch.equal(centers, self.basis_centers)
         basis = self._evaluate() if moved else self.basis
+        if coefficients.ndim >= basis.ndim:
+            basis = basis.unsqueeze(-4)
         return torch.einsum("...npj,...nj->...np", basis, coefficients)
 
 

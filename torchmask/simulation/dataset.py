@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,11 +19,14 @@ from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.detector import Detector
 from torchmask.simulation.exposures import simulate_observation
-from torchmask.simulation.render import load_mesh, render_mesh
+from torchmask.simulation.render import Mesh, load_mesh, render_mesh
 from torchmask.simulation.satellite import satellite_mesh
 
 Range = tuple[float, float]
 """Lowest and highest value; twice the same to hold it fixed."""
+
+Scene = Callable[[int, torch.Generator], Tensor]
+"""Gives the target of a stack, (H, W), from the stack's index and a generator that is seeded for it alone."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +66,7 @@ class StackRanges:
 
 
 class StackDataset(Dataset[dict[str, Tensor]]):
-    """Stacks of short exposures of a target in random poses, sunlight, flux and turbulence, with the truth.
+    """Stacks of short exposures of random targets in random flux and turbulence, with the truth.
 
     Stack i is drawn when it is asked for, from `seed` and i alone: the same whichever worker draws it, in whatever
     order.
@@ -77,10 +82,15 @@ class StackDataset(Dataset[dict[str, Tensor]]):
     n_frames : int
         Exposures in a stack, T.
     ranges : StackRanges, optional
+    scene : callable, optional
+        Targets of your own: `scene(index, generator)` gives what stack `index` shows, a tensor (H, W) on the grid's
+        pixels, at least 0 and of any brightness. An archive of images takes the index; chance comes from the
+        generator, never from elsewhere, so that a stack stays the same in every worker. Without it, a mesh in random
+        poses and sunlight.
     path : str or Path, optional
-        A mesh (.obj, .stl, .ply, .glb ...); without one, the packaged satellite.
+        The mesh (.obj, .stl, .ply, .glb ...); without one, the packaged satellite.
     size : float
-        Larger side of the target's outline as a fraction of the field.
+        Larger side of the mesh's outline as a fraction of the field.
     outer_scale : float
         Of the turbulence [m].
     readout_noise : float
@@ -92,8 +102,11 @@ class StackDataset(Dataset[dict[str, Tensor]]):
     Raises
     ------
     ValueError
-        For a length or number of frames below 1, a negative seed, a mesh file that is missing or damaged, and whatever
-        `simulate_observation` refuses; all when it is made, which takes as long as one stack.
+        For a length or number of frames below 1, a negative seed, a mesh file that is missing or damaged or beside a
+        `scene`, a black scene, and whatever `simulate_observation` refuses; for stack 0 when it is made, which takes
+        as long as one stack.
+    TypeError
+        If `scene` is not callable or gives something other than a tensor.
 
     Notes
     -----
@@ -103,10 +116,11 @@ class StackDataset(Dataset[dict[str, Tensor]]):
     object : (H, W) the truth, expected electrons per pixel and frame before any blur
     psfs : (T, H, W) centred on pixel [H // 2, W // 2], cropped to the field
     n_photons, r0 : () of this stack [electrons per frame], [m]
-    attitude, sun : (3,) [degrees]; unit vector, right, up and towards the viewer
+    attitude, sun : (3,) of the mesh [degrees]; unit vector, right, up and towards the viewer
 
-    With the start method "spawn", or "forkserver", a script needs the usual `if __name__ == "__main__"`. For several
-    targets, use `torch.utils.data.ConcatDataset`.
+    With the start method "spawn", or "forkserver", a script needs the usual `if __name__ == "__main__"`, and `scene`
+    must be a function of a module or another object that can be pickled. For several meshes, use
+    `torch.utils.data.ConcatDataset`.
 
     Examples
     --------
@@ -117,6 +131,16 @@ class StackDataset(Dataset[dict[str, Tensor]]):
     >>> batch = next(iter(DataLoader(stacks, batch_size=2)))
     >>> batch["frames"].shape, batch["object"].shape
     (torch.Size([2, 4, 32, 32]), torch.Size([2, 32, 32]))
+
+    Own scenes, here three stars:
+
+    >>> def stars(index, generator):
+    ...     image = torch.zeros(32, 32)
+    ...     image.view(-1)[torch.randint(32 * 32, (3,), generator=generator)] = 1.0
+    ...     return image
+    >>> stacks = StackDataset(mask, Grid.nyquist(1.0, 550e-9, 32), length=100, n_frames=4, scene=stars)
+    >>> int((stacks[7]["object"] > 0).sum())
+    3
     """
 
     def __init__(
@@ -127,6 +151,7 @@ class StackDataset(Dataset[dict[str, Tensor]]):
         n_frames: int = 8,
         ranges: StackRanges | None = None,
         *,
+        scene: Scene | None = None,
         path: str | Path | None = None,
         size: float = 0.7,
         outer_scale: float = 20.0,
@@ -138,6 +163,10 @@ class StackDataset(Dataset[dict[str, Tensor]]):
             raise ValueError(f"length is {length}: it must be a whole number of at least 1")
         if seed != int(seed) or seed < 0:
             raise ValueError(f"seed is {seed}: it must be a whole number of at least 0")
+        if scene is not None and not callable(scene):
+            raise TypeError(f"scene is a {type(scene).__name__}: it must be a function of an index and a generator")
+        if scene is not None and path is not None:
+            raise ValueError("scene and path are two targets: give one of them")
         self.aperture: Aperture = copy.deepcopy(aperture).requires_grad_(False).to("cpu", dtype)
         self.grid = grid
         self.length: int = int(length)
@@ -148,7 +177,8 @@ class StackDataset(Dataset[dict[str, Tensor]]):
         self.detector: Detector = Detector(readout_noise)
         self.seed: int = int(seed)
         self.dtype = dtype
-        self._mesh = satellite_mesh() if path is None else load_mesh(path)
+        self.scene = scene
+        self._mesh = None if scene is not None else satellite_mesh() if path is None else load_mesh(path)
         self[0]  # refuses what cannot be simulated now rather than in a worker
 
     def __len__(self) -> int:
@@ -158,10 +188,8 @@ class StackDataset(Dataset[dict[str, Tensor]]):
         if not 0 <= index < self.length:
             raise IndexError(f"there is no stack {index}: there are {self.length}, from 0")
         random = np.random.default_rng([self.seed, index])
-        attitude = [random.uniform(*turn) for turn in self.ranges.attitude]
-        sun = _direction(math.radians(random.uniform(*self.ranges.sun_angle)), random.uniform(0, 2 * math.pi))
+        image, pose = self._own(index, random) if self._mesh is None else self._posed(self._mesh, random)
         n_photons, r0 = (_log_uniform(random, bounds) for bounds in (self.ranges.n_photons, self.ranges.r0))
-        image = render_mesh(self._mesh, self.grid.shape, attitude=attitude, sun=sun, size=self.size, device="cpu")
         observation = simulate_observation(
             (image * (n_photons / image.sum())).to(self.dtype),
             self.aperture,
@@ -169,14 +197,36 @@ class StackDataset(Dataset[dict[str, Tensor]]):
             TurbulencePhase(r0, self.outer_scale),
             self.detector,
             self.n_frames,
-            torch.Generator().manual_seed(int(random.integers(2**62))),
+            _seeded(random),
         )
         assert observation.object is not None
         assert observation.psfs is not None
-        conditions = {"n_photons": n_photons, "r0": r0, "attitude": attitude, "sun": sun}
         arrays = {"frames": observation.frames, "object": observation.object, "psfs": observation.psfs}
+        conditions = {"n_photons": n_photons, "r0": r0} | pose
         like = {"dtype": self.dtype, "device": "cpu"}
         return arrays | {name: torch.tensor(value, **like) for name, value in conditions.items()}
+
+    def _posed(self, mesh: Mesh, random: np.random.Generator) -> tuple[Tensor, dict[str, Any]]:
+        """The mesh as it is seen this time, and how it is turned and lit."""
+        attitude = [random.uniform(*turn) for turn in self.ranges.attitude]
+        sun = _direction(math.radians(random.uniform(*self.ranges.sun_angle)), random.uniform(0, 2 * math.pi))
+        image = render_mesh(mesh, self.grid.shape, attitude=attitude, sun=sun, size=self.size, device="cpu")
+        return image, {"attitude": attitude, "sun": sun}
+
+    def _own(self, index: int, random: np.random.Generator) -> tuple[Tensor, dict[str, Any]]:
+        """What the caller's scene gives, checked as far as its brightness is concerned."""
+        assert self.scene is not None
+        image = self.scene(index, _seeded(random))
+        if not isinstance(image, Tensor):
+            raise TypeError(f"scene({index}, generator) gave a {type(image).__name__}: it must give a tensor (H, W)")
+        light = float(image.sum())
+        if not light > 0:
+            raise ValueError(f"scene({index}, generator) gave {light:.3g} as its light: it must be positive")
+        return image.detach().to("cpu", torch.float64), {}
+
+
+def _seeded(random: np.random.Generator) -> torch.Generator:
+    return torch.Generator().manual_seed(int(random.integers(2**62)))
 
 
 def _direction(polar: float, azimuth: float) -> tuple[float, float, float]:
