@@ -14,7 +14,7 @@ import numpy as np
 
 from torchmask.grid import ARCSEC
 from torchmask.observation import celestial_cards, pixel_matrix
-from torchmask.optics.band import FILTERS, band_of_header
+from torchmask.optics.band import FILTERS, filter_of_header
 
 _ABOUT = ("OBJECT", "TARGNAME", "TARG_RA", "TARG_DEC", "RA", "DEC", "TELESCOP", "INSTRUME", "FILTER", "DATE-OBS")
 _ABOUT += ("TIME-OBS", "MJD-OBS", "MJD-AVG", "OBSERVER")
@@ -71,7 +71,7 @@ def wavelength(header: Any, path: Any, given: float | None) -> float:
         if not 1e-8 < value < 1e-2:
             raise ValueError(f"{path}: WAVELEN is {value:g}, which is no wavelength in metres: give wavelength [m]")
         return value
-    band = band_of_header(header)
+    band = filter_of_header(header)
     if band is not None:
         return band.wavelength
     instrument, name = (str(header.get(card, "")).strip().upper() for card in ("INSTRUME", "FILTER"))

@@ -19,7 +19,7 @@ from torchmask.grid import ARCSEC
 from torchmask.interferometry.visibilities import Observables
 from torchmask.io import as_array, atomic_write
 from torchmask.observation import Observation
-from torchmask.optics.band import band_of_header
+from torchmask.optics.band import filter_of_header
 
 _ARRAY = "MASK"
 
@@ -75,7 +75,7 @@ def save_oifits(
         raise ValueError(f"the observables are of {len(observables.stations)} holes and the observation's mask has {n}")
     header = observation.header
     if bandwidth is None:
-        band = band_of_header(header)
+        band = filter_of_header(header)
         if band is None:
             raise ValueError("the width of the band is not known (no FILTER that is): give bandwidth [m]")
         bandwidth = band.width

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.grid import Grid
+from torchmask.observation import check_frames
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.psf import PSF
-from torchmask.restoration.initialization import check_frames
 
 _OVERSAMPLING = 4  # of the pupil: phases change within the cells of the Nyquist raster
 

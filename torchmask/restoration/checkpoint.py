@@ -2,36 +2,75 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from torchmask.io import load_npz, save_npz
-from torchmask.restoration.problem import State
+from torchmask.io import as_array, load_npz, save_npz
+from torchmask.restoration.candidates import Candidates
+from torchmask.restoration.objective import MyopicObjective
+from torchmask.restoration.state import Calibration, State
+
+
+class Status(Enum):
+    """Whether a restoration goes on, and why it ended if not."""
+
+    RUNNING = "running"
+    CONVERGED = "converged"
+    START_LIMIT = "the iterations of a start were spent"
+    ITERATION_LIMIT = "max_iterations was reached"
+
+
+@dataclass(frozen=True)
+class Ending:
+    """Where one start of a restoration ended, and why.
+
+    decrease : fraction by which the last segment lowered the cost; None where the iterations were spent
+    """
+
+    state: State
+    status: Status
+    decrease: float | None = None
 
 
 @dataclass
 class Progress:
     """Everything a later segment of a restoration depends on.
 
+    candidates : the state, with several candidates for each frame while a tournament goes on
+    status, decrease : of the present start, as in `Ending`
+    escapes : how often lost frames and the object's place have been looked for in this start
     starts : how many there were, with the present one; began : iterations before it
-    rival : where the best of the earlier ones ended, and rival_message why
-    relocations : how often lost frames and the object's place have been looked for
-    message : why it stopped, empty until then
+    rival : where the best of the earlier starts ended
+    alike : whether the last two starts ended alike
     """
 
-    state: State
+    candidates: Candidates
     costs: list[float] = field(default_factory=list)
     n_evaluations: int = 0
-    relocations: int = 0
+    status: Status = Status.RUNNING
+    decrease: float | None = None
+    escapes: int = 0
     starts: int = 1
     began: int = 0
-    rival: State | None = None
-    rival_message: str = ""
-    message: str = ""
+    rival: Ending | None = None
+    alike: bool = False
+
+    @property
+    def state(self) -> State:
+        """Object, aberrations and calibration so far."""
+        return self.candidates.state
+
+    @state.setter
+    def state(self, state: State) -> None:
+        self.candidates = Candidates(state, self.candidates.n_each)
 
     @property
     def iterations(self) -> int:
@@ -39,30 +78,81 @@ class Progress:
         return len(self.costs) - self.began
 
 
-_NUMBERS = ("n_evaluations", "relocations", "starts", "began")
-_TEXTS = ("rival_message", "message")
+_NUMBERS = ("n_evaluations", "escapes", "starts", "began", "alike")
 
 
-def save_checkpoint(path: str | Path, progress: Progress, fingerprint: str) -> None:
-    """Write or replace an .npz file; `fingerprint` says which frames and settings it belongs to."""
-    arrays: dict[str, Any] = {name: getattr(progress, name) for name in ("costs", *_NUMBERS, *_TEXTS)}
-    for prefix, state in (("", progress.state), ("rival_", progress.rival)):
-        if state is not None:
-            arrays |= {prefix + item.name: getattr(state, item.name) for item in fields(State)}
-    save_npz(path, arrays | {"fingerprint": fingerprint}, replace=True)
+@dataclass(frozen=True)
+class Checkpoint:
+    """The .npz file that a restoration writes its progress to.
+
+    fingerprint : says which frames, priors and settings it belongs to
+    """
+
+    path: Path
+    fingerprint: str
+
+    def save(self, progress: Progress) -> None:
+        """Write or replace the file."""
+        now = Ending(progress.state, progress.status, progress.decrease)
+        arrays: dict[str, Any] = {name: getattr(progress, name) for name in ("costs", *_NUMBERS)}
+        arrays |= {"n_candidates": progress.candidates.n_each, "fingerprint": self.fingerprint}
+        arrays |= _ending_arrays("", now)
+        if progress.rival is not None:
+            arrays |= _ending_arrays("rival_", progress.rival)
+        save_npz(self.path, arrays, replace=True)
+
+    def load(self, device: torch.device) -> Progress | None:
+        """What was saved, None where there is no file. Raises ValueError if it is damaged or of another fingerprint."""
+        if not self.path.exists():
+            return None
+        stored = load_npz(self.path, required=("fingerprint",))
+        if stored["fingerprint"].item() != self.fingerprint:
+            raise ValueError(
+                f"{self.path} is the checkpoint of other frames or settings, or of another version: give another name "
+                "or remove it"
+            )
+        missing = [name for name in ("z", "status", "costs", "n_candidates", *_NUMBERS) if name not in stored]
+        if missing:
+            raise ValueError(f"{self.path} has no {', '.join(missing)}: it is damaged, remove it to begin anew")
+        now = _ending(stored, "", device)
+        return Progress(
+            Candidates(now.state, stored["n_candidates"].item()),
+            np.atleast_1d(stored["costs"]).tolist(),
+            status=now.status,
+            decrease=now.decrease,
+            rival=_ending(stored, "rival_", device) if "rival_z" in stored else None,
+            **{name: stored[name].item() for name in _NUMBERS},
+        )
 
 
-def load_checkpoint(path: str | Path, fingerprint: str, device: torch.device) -> Progress:
-    """Read what `save_checkpoint` wrote. Raises ValueError if it is damaged or of another fingerprint."""
-    names = [item.name for item in fields(State)]
-    stored = load_npz(path, required=(*names, "costs", *_NUMBERS, *_TEXTS, "fingerprint"))
-    if stored["fingerprint"].item() != fingerprint:
-        raise ValueError(f"{path} is the checkpoint of other frames or settings: give another name or remove it")
+def fingerprint_of(objective: MyopicObjective, settings: Sequence[object], known: Sequence[Tensor | None]) -> str:
+    """Tells whether a checkpoint belongs to these frames, priors and settings, and to what is known besides."""
+    prior = objective.prior
+    digest = hashlib.sha256(repr((*settings, objective.free, repr(prior))).encode())
+    samples = objective.model.pupil.samples()
+    tensors = [objective.frames, objective.precision, samples.basis, samples.weights, *prior.state_dict().values()]
+    for tensor in [*tensors, *known]:
+        digest.update(b"none" if tensor is None else as_array(tensor).tobytes())
+    return digest.hexdigest()
 
-    def state(prefix: str) -> State:
-        values = (stored[prefix + name] for name in names)
-        return State(*(torch.from_numpy(v).to(device) if v.ndim else float(v) for v in values))  # type: ignore[arg-type]
 
-    rival = state("rival_") if "rival_z" in stored else None
-    others = {name: stored[name].item() for name in (*_NUMBERS, *_TEXTS)}
-    return Progress(state(""), np.atleast_1d(stored["costs"]).tolist(), rival=rival, **others)
+def _ending_arrays(prefix: str, ending: Ending) -> dict[str, Any]:
+    state, calibration = ending.state, ending.state.calibration
+    values = {"image": state.image, "z": state.z, "status": ending.status.name}
+    values |= {item.name: getattr(calibration, item.name) for item in fields(Calibration)}
+    if ending.decrease is not None:
+        values["decrease"] = ending.decrease
+    return {prefix + name: value for name, value in values.items()}
+
+
+def _ending(stored: dict[str, np.ndarray], prefix: str, device: torch.device) -> Ending:
+    def tensor(name: str) -> Tensor:
+        return torch.from_numpy(stored[prefix + name]).to(device)
+
+    weight = float(stored[prefix + "aberration_weight"])
+    calibration = Calibration(tensor("transmission"), tensor("noise_inflation"), weight)
+    decrease = stored.get(prefix + "decrease")
+    status = Status[stored[prefix + "status"].item()]
+    return Ending(
+        State(tensor("image"), tensor("z"), calibration), status, None if decrease is None else float(decrease)
+    )

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import time
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,42 +15,45 @@ from torch import Tensor, nn
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture
+from torchmask.optics.band import Band
 from torchmask.record import Callback
-from torchmask.restoration.initialization import check_frames
-from torchmask.restoration.model import ExposureModel
+from torchmask.restoration.aberrations import AberrationBasis, estimated_basis, turbulent_basis
+from torchmask.restoration.assembly import add_deviations, assemble_result
+from torchmask.restoration.checkpoint import Checkpoint, fingerprint_of
+from torchmask.restoration.forward import ExposureModel
+from torchmask.restoration.frames import FrameStack
+from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.parallel import each_on_a_core
-from torchmask.restoration.priors import root, whitening
+from torchmask.restoration.priors import ObjectPrior, TotalVariation, as_prior, check_prior
+from torchmask.restoration.projected_lbfgs import Minimizer, ProjectedLBFGS
 from torchmask.restoration.result import RestorationResult
-from torchmask.restoration.run import Restoration
+from torchmask.restoration.schedule import Schedule
+from torchmask.restoration.solver import Solver, Traits
+from torchmask.restoration.starts import Known
 
 
-class MyopicDeconvolution(nn.Module):
+class MyopicDeconvolution:
     """Restores an object from short exposures with unknown aberrations.
 
     Minimises, over an object o >= 0 and the whitened aberrations z of every frame (a = L z, L L^T the von Karman
     covariance of the Zernike modes of all sub-apertures), in units of the stack's mean pixel,
 
-        1/2 sum_t || (g_t window(h_t(a_t) * o) - y_t) / sigma ||^2  +  mu TV(o)  +  1/2 ||z||^2
+        1/2 sum_t || (g_t window(h_t(a_t) * o) - y_t) / sigma ||^2  +  prior(o)  +  1/2 ||z||^2
 
-    by bounded L-BFGS in variables scaled by the diagonal of the Hessian, from zero aberrations and the clipped mean
-    frame. It restarts every 100 iterations: then the scales, the transmission g_t of each frame and, if r0 is not
-    given, the strength of the turbulence are brought up to date; sigma falls from what the mean frame leaves
-    unexplained to the noise or to what the model cannot explain, if that is more; a mask's frames that fit badly start
-    anew from random aberrations, and the object is moved between the pixels to where it fits best. When nothing moves
-    any more, each frame has its own sigma, so that one which no aberrations explain does little harm: a frame whose
-    chi-square is n times that of the best counts n times less, or n^2 times through a full pupil. A full pupil has
-    many more minima: each of its frames begins with 16 random candidates, which share one object and of which the
-    worse half is dropped after 30, 100 and 200 iterations, and all but the best after 300.
+    from the clipped mean frame on. `torchmask.restoration.solver` tells the course of it: how the noise sigma and the
+    transmissions g_t are brought up to date on the way, and how it leaves local minima.
 
     Parameters
     ----------
     aperture : Aperture
+        One that moves or trains is followed: a restoration takes it where it lies when it begins.
     grid : Grid
         Of the frames.
     n_modes : int, optional
         Zernike modes per sub-aperture, Noll 1 to n_modes. None: 6, or 231 for a full pupil.
     r0, outer_scale : float, optional
-        Of the turbulence [m]. None: r0 is estimated from the restored aberrations; 20 mask diameters.
+        Of the turbulence [m]. None: r0 is estimated from the restored aberrations, and the outer scale is taken as 20
+        mask diameters.
     readout_noise : float, optional
         [electrons rms per pixel]. None: the noise is measured beyond the cut-off frequency.
     wavelengths, weights : sequence of float, optional
@@ -59,16 +63,22 @@ class MyopicDeconvolution(nn.Module):
         Zernike modes per sub-aperture, Noll 1 to static_modes, of aberrations common to all frames, such as those of
         the telescope, besides the `n_modes` of each frame. Their prior is turbulence as strong as a hole is wide,
         whatever `r0`. Coefficients then have max(n_modes, static_modes) modes, and are the sum of both.
-    tv_weight : float
-        mu.
+    prior : callable
+        Of the object: a function or module that maps an image (H', W'), in units of the stack's mean pixel and on a
+        field somewhat wider than the frames, to a scalar that PyTorch differentiates. At hand are `TotalVariation` and
+        `EdgePreserving`. If it has methods `gradient(image)` and `curvature(image)`, they are used.
     aberration_prior : bool
         False leaves out 1/2 ||z||^2; z are the Zernike coefficients then.
     max_iterations : int
-        Of a start. A restoration that leaves 0.13 % of the change from frame to frame unexplained, and more than the
-        noise can leave, may have missed the object: it starts again from random aberrations, up to three times as long
-        as that is so and no two end alike, and the best is kept.
+        Of all starts together. One start takes 1000 at most. A restoration that leaves 0.13 % of the change from frame
+        to frame unexplained, and more than the noise can leave, may have missed the object: it starts again from random
+        aberrations, up to three times as long as that is so and no two end alike, and the best is kept.
     tolerance : float
         Converged when 100 iterations lower the cost by less than this fraction.
+    minimizer : Minimizer
+        What descends: `ProjectedLBFGS`, or an optimiser of PyTorch by `TorchMinimizer`.
+    schedule : Schedule
+        When the restoration does what.
     dtype : torch.dtype
         Of the model; float32 takes half the time. Object, aberrations and cost are always kept in float64.
 
@@ -76,6 +86,8 @@ class MyopicDeconvolution(nn.Module):
     ------
     ValueError
         For numbers out of range, and for a grid that the aperture cannot be sampled on.
+    TypeError
+        If the prior cannot be called.
 
     Examples
     --------
@@ -102,75 +114,74 @@ class MyopicDeconvolution(nn.Module):
         wavelengths: Sequence[float] | None = None,
         weights: Sequence[float] | None = None,
         static_modes: int = 0,
-        tv_weight: float = 1.0,
+        prior: Callable[[Tensor], Tensor] | None = None,
         aberration_prior: bool = True,
-        max_iterations: int = 1000,
+        max_iterations: int = 4000,
         tolerance: float = 1e-4,
+        minimizer: Minimizer | None = None,
+        schedule: Schedule | None = None,
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
     ) -> None:
-        super().__init__()
-        if aperture.centers.ndim != 2:
-            raise ValueError(
-                f"centers has shape {tuple(aperture.centers.shape)}: one mask (n_subapertures, 2) is needed"
-            )
-        for name, value in (("r0", r0), ("outer_scale", outer_scale), ("tv_weight", tv_weight)):
-            if value is not None and not (math.isfinite(value) and value > 0):
-                raise ValueError(f"{name} is {value}: it must be finite and positive")
-        if readout_noise is not None and not (math.isfinite(readout_noise) and readout_noise >= 0):
-            raise ValueError(f"readout_noise is {readout_noise}: it must be finite and at least 0, in electrons rms")
-        if max_iterations < 1 or not tolerance >= 0:
-            raise ValueError(
-                f"max_iterations is {max_iterations} and tolerance {tolerance}: they must be at least 1 and at least 0"
-            )
-        if static_modes < 0:
-            raise ValueError(f"static_modes is {static_modes}: it must be at least 0")
-        if n_modes is not None and n_modes < 1:
-            raise ValueError(f"n_modes is {n_modes}: it must be a whole number of at least 1, or None for the default")
-        symmetric = aperture.n_subapertures == 1
-        n_modes = n_modes or (231 if symmetric else 6)
+        _check_settings(aperture, r0, outer_scale, readout_noise, n_modes, static_modes, max_iterations, tolerance)
+        if wavelengths is None and weights is not None:
+            raise ValueError("weights are given without wavelengths: give both")
+        self.many_minima: bool = aperture.n_subapertures == 1
         self.known_r0: bool = r0 is not None
         # Masks are made for holes of about r0; a full pupil that needs a restoration spans several.
-        self.r0: float = r0 or aperture.subaperture_diameter / (7 if symmetric else 1)
+        self.r0: float = r0 or aperture.subaperture_diameter / (7 if self.many_minima else 1)
         self.outer_scale: float = outer_scale or 20 * aperture.mask_diameter
         self.readout_noise: float | None = readout_noise
-        self.tv_weight: float = tv_weight
         self.aberration_prior: bool = aberration_prior
         self.max_iterations: int = max_iterations
         self.tolerance: float = tolerance
         self.aperture: Aperture = aperture
         self.grid: Grid = grid
-        self.n_modes: int = max(n_modes, static_modes)
+        self.band: Band = Band.of([grid.wavelength] if wavelengths is None else wavelengths, weights)
+        self.frame_modes: int = n_modes or (231 if self.many_minima else 6)
+        self.static_modes: int = static_modes
+        self.prior: ObjectPrior = as_prior(TotalVariation() if prior is None else prior)
+        self.minimizer: Minimizer = minimizer or ProjectedLBFGS()
+        self.schedule: Schedule = schedule or Schedule()
+        self._options = {"dtype": dtype, "device": device}
+        self._model: ExposureModel = self._build(self._turbulence())
 
-        def mixing(modes: int, r0: float) -> Tensor:
-            """Coefficients (N J) of the modes 1 to `modes` from their parameters."""
-            n_sub = aperture.n_subapertures
-            columns = (
-                whitening(aperture, modes, r0, self.outer_scale)
-                if aberration_prior
-                else torch.eye(n_sub * modes, device="cpu")
+    @property
+    def n_modes(self) -> int:
+        """J, Zernike modes per sub-aperture of the coefficients that come back."""
+        return max(self.frame_modes, self.static_modes)
+
+    @property
+    def model(self) -> ExposureModel:
+        """The model of the exposures, with the aperture where it lies now."""
+        if not torch.equal(self._model.pupil.aperture.centers, self.aperture.centers.detach()):
+            self._model = self._build(self._turbulence())
+        return self._model
+
+    def _turbulence(self) -> AberrationBasis:
+        options = (self.r0, self.outer_scale)
+        with torch.no_grad():
+            return turbulent_basis(
+                self.aperture, self.frame_modes, self.static_modes, *options, whitened=self.aberration_prior
             )
-            rows = columns.unflatten(0, (n_sub, modes))
-            return nn.functional.pad(rows, (0, 0, 0, self.n_modes - modes)).flatten(0, 1)
 
-        columns = mixing(n_modes, self.r0)
-        static = mixing(static_modes, aperture.subaperture_diameter) if static_modes else columns[:, :0]
-        self._build = partial(ExposureModel, aperture, grid, self.n_modes, wavelengths=wavelengths, weights=weights)
-        mixed = torch.cat([columns, static.to(columns)], dim=1)
-        self.model: ExposureModel = self._build(mixed, n_static=static.shape[1], dtype=dtype, device=device)
+    def _build(self, basis: AberrationBasis, aperture: Aperture | None = None) -> ExposureModel:
+        return ExposureModel(aperture or still(self.aperture), self.grid, basis, self.band, **self._options)
 
-    def model_of_errors(self, covariance: Tensor) -> ExposureModel:
-        """The model in which the errors of estimated coefficients, of `covariance` (N J, N J) [rad^2], are white."""
-        size = self.aperture.n_subapertures * self.n_modes
-        if tuple(covariance.shape) != (size, size):
-            raise ValueError(
-                f"covariance has shape {tuple(covariance.shape)}: it must be ({size}, {size}), sub-aperture by "
-                f"sub-aperture, of {self.aperture.n_subapertures} x {self.n_modes} coefficients"
-            )
-        if self.model.n_static:
+    def _model_of_errors(self, covariance: Tensor) -> ExposureModel:
+        if self.static_modes:
             raise ValueError("covariance is given with static_modes: what is common to all frames is in the estimate")
-        basis = self.model.basis
-        return self._build(root(covariance.to(basis.device, torch.float64)), dtype=basis.dtype, device=basis.device)
+        return self._build(estimated_basis(self.aperture, self.n_modes, covariance))
+
+    def objective(self, frames: Tensor | np.ndarray, *, valid: Tensor | np.ndarray | None = None) -> MyopicObjective:
+        """The cost of object and aberrations behind `frames` (T, H, W) [electrons], to minimise in a way of your own.
+
+        It is differentiable in the centres of the aperture too. Arguments and errors as for `restore`.
+        """
+        stack = self._stack(frames, valid)
+        model = self._build(self._turbulence(), self.aperture)
+        stack = stack.to(model.dtype, model.device)
+        return MyopicObjective(model, stack.frames, stack.precision, self.prior)
 
     def restore(
         self,
@@ -182,6 +193,7 @@ class MyopicDeconvolution(nn.Module):
         known_object: Tensor | None = None,
         start: RestorationResult | None = None,
         n_samples: int = 0,
+        seed: int = 0,
         checkpoint: str | Path | None = None,
         callback: Callback | None = None,
     ) -> RestorationResult:
@@ -207,6 +219,8 @@ class MyopicDeconvolution(nn.Module):
         n_samples : int
             Drawn from the posterior for the standard deviations of object and coefficients, which cost about as much
             as 50 iterations each; 8 are enough. 0: no standard deviations.
+        seed : int
+            Of the random starts and candidates.
         checkpoint : path, optional
             An .npz file, written every 100 iterations. If it exists, the restoration goes on from it, and ends in the
             same result as if it had never been interrupted.
@@ -218,7 +232,8 @@ class MyopicDeconvolution(nn.Module):
         ValueError
             If a shape is wrong, a valid pixel or what is known is not finite, a frame or the known object holds no
             light, both object and aberrations are known, `covariance` is not one or stands without coefficients or
-            beside static modes, or the checkpoint is damaged or belongs to other frames, settings or known values.
+            beside static modes, the prior is no finite and differentiable scalar, or the checkpoint is damaged or
+            belongs to other frames, settings or known values.
 
         Warns
         -----
@@ -226,13 +241,82 @@ class MyopicDeconvolution(nn.Module):
             If the noise of the frames disagrees with `readout_noise`, or the object seems to reach the border.
         """
         started = time.perf_counter()
-        frames, valid = check_frames(frames, valid, self.grid)
+        stack = self._stack(frames, valid)
         if n_samples < 0 or n_samples == 1:
             raise ValueError(f"n_samples is {n_samples}: 0 for no standard deviations, or at least 2")
-        if covariance is not None and coefficients is None:
-            raise ValueError("covariance is given without coefficients: it is that of their errors, give both")
-        if coefficients is not None and known_object is not None and covariance is None:
-            raise ValueError("coefficients and known_object are both given: nothing is left to restore")
-        with each_on_a_core(self.model.basis.device) as parallel:
-            run = Restoration(self, frames, valid, covariance, callback, parallel)
-            return run(coefficients, known_object, start, n_samples, checkpoint, started)
+        known = Known(coefficients, covariance, known_object)
+        known.check()
+        model = self.model if covariance is None else self._model_of_errors(covariance)
+        stack = stack.to(model.dtype, model.device)
+        with each_on_a_core(model.device) as parallel:
+            objective = MyopicObjective(
+                model, stack.frames, stack.precision, self.prior, free=known.free, parallel=parallel
+            )
+            traits = self._traits(known, seed)
+            has_r0 = self.aberration_prior and not traits.estimated and Free.ABERRATIONS in known.free
+            solver = Solver(objective, stack, traits, self.schedule, self.minimizer, callback)
+            check_prior(self.prior, model.window.embed(stack.frames.mean(0).clamp(min=0)).double())
+            file = self._checkpoint(checkpoint, solver, known)
+            progress = solver.solve(known, start, file)
+            result = assemble_result(solver.objective, stack, progress, r0=self.r0 if has_r0 else None)
+            if n_samples:
+                cutoff = min(0.5, self.grid.cutoff(self.aperture.extent))
+                result = add_deviations(result, solver.objective, stack, progress, cutoff, n_samples)
+        return replace(result, seconds=time.perf_counter() - started)
+
+    def _stack(self, frames: Tensor | np.ndarray, valid: Tensor | np.ndarray | None) -> FrameStack:
+        bluest = replace(self.grid, wavelength=self.band.shortest)
+        return FrameStack.of(frames, valid, bluest, self.aperture, self.readout_noise)
+
+    def _checkpoint(self, path: str | Path | None, solver: Solver, known: Known) -> Checkpoint | None:
+        if path is None:
+            return None
+        settings = (self.aberration_prior, self.known_r0, self.minimizer, self.schedule, solver.traits.seed)
+        given = (known.coefficients, known.covariance, known.object)
+        return Checkpoint(Path(path), fingerprint_of(solver.objective, settings, given))
+
+    def _traits(self, known: Known, seed: int) -> Traits:
+        estimated = known.covariance is not None
+        return Traits(
+            many_minima=self.many_minima,
+            estimated=estimated,
+            prior_on_aberrations=self.aberration_prior,
+            r0_is_open=self.aberration_prior and not self.known_r0 and not estimated,
+            max_iterations=self.max_iterations,
+            tolerance=self.tolerance,
+            seed=seed,
+        )
+
+
+def still(aperture: Aperture) -> Aperture:
+    """A copy of an aperture that stays where it is while the other moves or trains."""
+    centers = aperture.centers.detach().clone()
+    if isinstance(aperture.centers, nn.Parameter):
+        centers = nn.Parameter(centers, requires_grad=False)
+    return copy.deepcopy(aperture, {id(aperture.centers): centers})
+
+
+def _check_settings(
+    aperture: Aperture,
+    r0: float | None,
+    outer_scale: float | None,
+    readout_noise: float | None,
+    n_modes: int | None,
+    static_modes: int,
+    max_iterations: int,
+    tolerance: float,
+) -> None:
+    if aperture.centers.ndim != 2:
+        raise ValueError(f"centers has shape {tuple(aperture.centers.shape)}: one mask (n_subapertures, 2) is needed")
+    for name, value in (("r0", r0), ("outer_scale", outer_scale)):
+        if value is not None and not (math.isfinite(value) and value > 0):
+            raise ValueError(f"{name} is {value}: it must be finite and positive, in m")
+    if readout_noise is not None and not (math.isfinite(readout_noise) and readout_noise >= 0):
+        raise ValueError(f"readout_noise is {readout_noise}: it must be finite and at least 0, in electrons rms")
+    for name, count, least in (("n_modes", n_modes, 1), ("static_modes", static_modes, 0)):
+        if count is not None and count < least:
+            raise ValueError(f"{name} is {count}: it must be a whole number of at least {least}")
+    if max_iterations < 1 or not tolerance >= 0:
+        raise ValueError(
+            f"max_iterations is {max_iterations} and tolerance {tolerance}: they must be at least 1 and at least 0"
+        )

@@ -18,10 +18,12 @@ import torch
 from torch import Tensor
 
 from torchmask.metrics import lowpass
+from torchmask.restoration.adjoint import curvature
 from torchmask.restoration.conjugate import Operator, conjugate_gradients
 from torchmask.restoration.linearization import Linearization
+from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.priors import divergence, gradient
-from torchmask.restoration.problem import JointProblem, State
+from torchmask.restoration.state import State
 
 _REACH = 0.7  # resolution elements (1 / cut-off) over which gradients are alike: 0.5 to 1.4 tried, docs/restoration.md
 _ROUNDS, _FEW = 3, 6  # of expectation maximisation, and its samples, which the mean over the reach makes enough
@@ -31,7 +33,7 @@ _ITERATIONS = 50  # of conjugate gradients: variances of what is below the cut-o
 
 
 def standard_deviations(
-    problem: JointProblem, state: State, cutoff: float, photon_share: float, n_samples: int
+    objective: MyopicObjective, state: State, cutoff: float, photon_share: float, n_samples: int
 ) -> tuple[Tensor, Tensor]:
     """Of the object (H', W') below `cutoff` [cycles/pixel], and `n_samples` (S, T, K) of the aberrations.
 
@@ -41,12 +43,12 @@ def standard_deviations(
     """
     generator = torch.Generator().manual_seed(0)
     reach = _REACH / cutoff
-    slope, power = problem.object_quadratic(state)
+    slope, power = objective.object_quadratic(state.image, state.z, state.calibration)
     prior = _gradient_prior(power, state.image, reach, generator)
     sizes = [min(_BATCH, n_samples - start) for start in range(0, n_samples, _BATCH)]
-    drawn = [_sample(problem, state, power, prior, photon_share, size, generator) for size in sizes]
+    drawn = [_sample(objective, state, power, prior, photon_share, size, generator) for size in sizes]
     objects, aberrations = (torch.cat(part) for part in zip(*drawn, strict=True))
-    off = lowpass(_bias(state.image, slope, power, prior), cutoff).square() if "object" in problem.free else 0.0
+    off = lowpass(_bias(state.image, slope, power, prior), cutoff).square() if Free.OBJECT in objective.free else 0.0
     variance = smooth(lowpass(objects, cutoff).square().mean(0) + off, reach)
     return variance.clamp(min=0).sqrt(), aberrations
 
@@ -77,7 +79,7 @@ def _solve_for_object(power: Tensor, prior: Tensor, right: Tensor) -> Tensor:
 
 
 def _sample(
-    problem: JointProblem,
+    objective: MyopicObjective,
     state: State,
     power: Tensor,
     prior: Tensor,
@@ -86,14 +88,14 @@ def _sample(
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
     """Samples of object (S, H', W') and aberrations (S, T, K), given the gradients' inverse variances `prior`."""
-    model, n_static = problem.model, problem.model.n_static
-    precision = problem.scaled_data(state)[1]
-    tangent = Linearization(model, state.image, state.z, problem.parallel)
-    z_prior = torch.zeros_like(state.z[0]) + problem.prior(state)
-    curvature = model.curvature(state.image, state.z, precision, generator)[0] + z_prior
-    least = _LEAST * float(curvature.max())
-    curvature, hold = curvature.clamp(min=least), torch.where(z_prior > 0, z_prior, least)
-    by_object, by_aberrations = (float(name in problem.free) for name in ("object", "aberrations"))
+    model, basis = objective.model, objective.model.aberrations
+    precision = objective.scaled_data(state.calibration)[1]
+    tangent = Linearization(model, state.image, state.z, objective.parallel)
+    z_prior = torch.zeros_like(state.z[0]) + objective.aberration_weight(state.calibration, state.z)
+    z_curvature = curvature(model, state.image, state.z, precision, generator)[0] + z_prior
+    least = _LEAST * float(z_curvature.max())
+    z_curvature, hold = z_curvature.clamp(min=least), torch.where(z_prior > 0, z_prior, least)
+    by_object, by_aberrations = (float(part in objective.free) for part in (Free.OBJECT, Free.ABERRATIONS))
     n, shape = state.image.numel(), (n_samples, *state.z.shape)
     settle = _object_preconditioner(power, prior)
 
@@ -101,7 +103,7 @@ def _sample(
         return x[:, :n].view(-1, *state.image.shape), x[:, n:].view(shape)
 
     def join(image: Tensor, z: Tensor) -> Tensor:
-        return torch.cat([by_object * image.flatten(1), by_aberrations * _alike(z, n_static).flatten(1)], dim=1)
+        return torch.cat([by_object * image.flatten(1), by_aberrations * basis.mean_common(z).flatten(1)], dim=1)
 
     def hessian(x: Tensor) -> Tensor:
         image, z = split(x)
@@ -110,12 +112,12 @@ def _sample(
 
     def precondition(x: Tensor) -> Tensor:
         image, z = split(x)
-        return join(settle(image), z / curvature)
+        return join(settle(image), z / z_curvature)
 
-    brightness = problem.model(state.image, state.z).clamp(min=0)
-    share = photon_share / state.excess[:, None, None].to(brightness)
+    brightness = model(state.image, state.z).clamp(min=0)
+    share = photon_share / state.calibration.noise_inflation[:, None, None].to(brightness)
     variance = 1 + share * (brightness / brightness.mean() - 1)  # over that which the misfit assumes
-    noise = (precision * variance).sqrt() * _white((n_samples, *problem.frames.shape), brightness, generator)
+    noise = (precision * variance).sqrt() * _white((n_samples, *objective.frames.shape), brightness, generator)
     by_image, by_z = tangent.adjoint(noise)
     by_image = by_image + _prior_noise(prior, n_samples, generator)
     by_z = by_z + z_prior.sqrt() * _white(shape, state.z, generator)
@@ -135,13 +137,6 @@ def _object_preconditioner(power: Tensor, prior: Tensor) -> Operator:
     smoothness = 4 * ((math.pi * nu_y).sin() ** 2 + (math.pi * nu_x).sin() ** 2)
     inverse = 1 / (level * power + smoothness)
     return lambda x: scale * _filter(scale * x, inverse)
-
-
-def _alike(z: Tensor, n_static: int) -> Tensor:
-    """z (S, T, K) with the aberrations that are common to all frames replaced by their mean."""
-    if not n_static:
-        return z
-    return torch.cat([z[..., :-n_static], z[..., -n_static:].mean(1, keepdim=True).expand(-1, z.shape[1], -1)], dim=2)
 
 
 def _white(shape: tuple[int, ...], like: Tensor, generator: torch.Generator) -> Tensor:

@@ -1,31 +1,218 @@
-"""What a restoration assumes: edges are sparse in the object, and the aberrations are turbulence."""
+"""What a restoration assumes of the object: a penalty on images, with what a minimiser wants to know of it."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from torchmask.atmosphere.von_karman import modal_covariance
-from torchmask.optics.aperture import Aperture
-
-_LEAST_ERROR = 1e-3  # rad
-_ROUNDING = 1e-6  # of a covariance that may come from float32
+_PROBES = 8  # draws for the diagonal of a Hessian that is known by its action only
+_SEED = 0
 
 
-def total_variation(image: Tensor, epsilon: float = 0.01) -> tuple[Tensor, Tensor]:
-    """Isotropic smoothed total variation of `image` (..., H, W) and its gradient.
+class ObjectPrior(nn.Module):
+    """A penalty on the object: `forward(image)` (H', W') -> scalar, the lower the likelier.
 
-    sum sqrt(dx^2 + dy^2 + epsilon^2) - epsilon over pixels, with forward differences that are periodic at the border
-    (Rudin, Osher & Fatemi, Physica D 60, 259, 1992). Values are (...), the gradient has the shape of `image`.
+    Images are in units of the stack's mean pixel and lie on the object's field, somewhat wider than the frames. A
+    subclass need write `forward` only, by operations of PyTorch: `gradient` and `curvature` follow by differentiation.
+    One that knows them in closed form overrides them, which saves time.
     """
-    dy, dx, length = _slopes(image, epsilon)
-    return (length - epsilon).sum(dim=(-2, -1)), divergence(dy / length, dx / length)
+
+    def forward(self, image: Tensor) -> Tensor:
+        raise TypeError(f"{type(self).__name__} has no forward(image) that returns a scalar: write one")
+
+    def value_and_gradient(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """The penalty of `image` (H', W') and its gradient (H', W')."""
+        with torch.enable_grad():
+            leaf = image.detach().requires_grad_()
+            value = self(leaf)
+            (slope,) = torch.autograd.grad(value, leaf)
+        return value.detach(), slope
+
+    def curvature(self, image: Tensor) -> Tensor:
+        """About the diagonal of the Hessian at `image` (H', W'), or of a quadratic that majorises it; not negative.
+
+        By Hessian-vector products with random signs (Bekas, Kokiopoulou & Saad, Appl. Numer. Math. 57, 1214, 2007).
+        """
+        generator = torch.Generator().manual_seed(_SEED)
+        diagonal = torch.zeros_like(image)
+        with torch.enable_grad():
+            leaf = image.detach().requires_grad_()
+            (slope,) = torch.autograd.grad(self(leaf), leaf, create_graph=True)
+            if not slope.requires_grad:  # linear: no curvature
+                return diagonal
+            for _ in range(_PROBES):
+                signs = torch.randint(2, image.shape, generator=generator, device="cpu").to(image) * 2 - 1
+                (curved,) = torch.autograd.grad(slope, leaf, signs, retain_graph=True, materialize_grads=True)
+                diagonal += signs * curved / _PROBES
+        return diagonal.clamp(min=0)
 
 
-def total_variation_curvature(image: Tensor, epsilon: float = 0.01) -> Tensor:
-    """Diagonal of a quadratic that majorises `total_variation` at `image`, same shape: the sum of 1/length around."""
-    inverse = 1 / _slopes(image, epsilon)[2]
-    return 2 * inverse + inverse.roll(1, -2) + inverse.roll(1, -1)
+class TotalVariation(ObjectPrior):
+    """weight * sum of sqrt(dx^2 + dy^2 + epsilon^2) - epsilon over the pixels: edges are few.
+
+    Isotropic and smoothed, forward differences that are periodic at the border (Rudin, Osher & Fatemi, Physica D 60,
+    259, 1992).
+
+    Parameters
+    ----------
+    weight : float
+        mu, in units of frames of mean 1.
+    epsilon : float
+        Slopes below it, in mean pixels, count as noise rather than as edges.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite and positive.
+
+    Examples
+    --------
+    >>> image = torch.zeros(4, 4, dtype=torch.float64); image[1:3, 1:3] = 1.0
+    >>> round(float(TotalVariation(epsilon=1e-9)(image)), 6)  # six straight slopes, one over a corner
+    7.414214
+    """
+
+    def __init__(self, weight: float = 1.0, epsilon: float = 0.01) -> None:
+        super().__init__()
+        _require_positive(weight=weight, epsilon=epsilon)
+        self.weight: float = float(weight)
+        self.epsilon: float = float(epsilon)
+
+    def forward(self, image: Tensor) -> Tensor:
+        return self.weight * (self._slopes(image)[2] - self.epsilon).sum(dim=(-2, -1))
+
+    def value_and_gradient(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        dy, dx, length = self._slopes(image)
+        value = (length - self.epsilon).sum(dim=(-2, -1))
+        return self.weight * value, self.weight * divergence(dy / length, dx / length)
+
+    def curvature(self, image: Tensor) -> Tensor:
+        inverse = 1 / self._slopes(image)[2]
+        return self.weight * (2 * inverse + inverse.roll(1, -2) + inverse.roll(1, -1))
+
+    def _slopes(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        dy, dx = gradient(image)
+        return dy, dx, torch.sqrt(dy**2 + dx**2 + self.epsilon**2)
+
+    def extra_repr(self) -> str:
+        return f"weight={self.weight:g}, epsilon={self.epsilon:g}"
+
+
+class EdgePreserving(ObjectPrior):
+    """weight * threshold^2 * sum of |g| / threshold - log(1 + |g| / threshold): quadratic in slopes, linear in edges.
+
+    g is the slope of a pixel as for `TotalVariation`. Slopes well below the threshold are penalised by their square,
+    as noise, edges well above it by their height (Mugnier, Fusco & Conan, J. Opt. Soc. Am. A 21, 1841, 2004): an object
+    may be shaded smoothly, where total variation makes steps.
+
+    Parameters
+    ----------
+    weight : float
+        In units of frames of mean 1; multiplies half the square of small slopes.
+    threshold : float
+        Between the two, in mean pixels per pixel.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite and positive.
+
+    Examples
+    --------
+    >>> image = torch.zeros(4, 4, dtype=torch.float64); image[1, 1] = 1e-3
+    >>> round(float(EdgePreserving()(image)) / (0.5 * 4e-6), 2)  # half the squares of four small slopes
+    1.0
+    """
+
+    def __init__(self, weight: float = 2.0, threshold: float = 0.5) -> None:
+        super().__init__()
+        _require_positive(weight=weight, threshold=threshold)
+        self.weight: float = float(weight)
+        self.threshold: float = float(threshold)
+
+    def forward(self, image: Tensor) -> Tensor:
+        return self.value_and_gradient(image)[0]
+
+    def value_and_gradient(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        dy, dx, ratio = self._slopes(image)
+        value = self.weight * self.threshold**2 * (ratio - torch.log1p(ratio)).sum(dim=(-2, -1))
+        return value, self.weight * divergence(dy / (1 + ratio), dx / (1 + ratio))
+
+    def curvature(self, image: Tensor) -> Tensor:
+        inverse = 1 / (1 + self._slopes(image)[2])
+        return self.weight * (2 * inverse + inverse.roll(1, -2) + inverse.roll(1, -1))
+
+    def _slopes(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        dy, dx = gradient(image)
+        squared = dy**2 + dx**2
+        flat = squared == 0  # where a square root has no derivative, and none is needed
+        return dy, dx, torch.where(flat, 0.0, torch.where(flat, 1.0, squared).sqrt()) / self.threshold
+
+    def extra_repr(self) -> str:
+        return f"weight={self.weight:g}, threshold={self.threshold:g}"
+
+
+class FunctionPrior(ObjectPrior):
+    """A penalty that is any function or module of an image, with its gradient and curvature where it has them.
+
+    `function.gradient(image)` and `function.curvature(image)`, both (H', W') -> (H', W'), are used if they exist.
+    """
+
+    def __init__(self, function: Callable[[Tensor], Tensor]) -> None:
+        super().__init__()
+        self.function = function
+
+    def forward(self, image: Tensor) -> Tensor:
+        return self.function(image)
+
+    def value_and_gradient(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        known = getattr(self.function, "gradient", None)
+        if known is None:
+            return super().value_and_gradient(image)
+        with torch.no_grad():
+            return self(image), known(image)
+
+    def curvature(self, image: Tensor) -> Tensor:
+        known = getattr(self.function, "curvature", None)
+        return super().curvature(image) if known is None else known(image)
+
+    def __repr__(self) -> str:
+        if isinstance(self.function, nn.Module):
+            return repr(self.function)
+        named = getattr(self.function, "__qualname__", None)  # the repr of a function holds an address
+        return f"{self.function.__module__}.{named}" if named else repr(self.function)
+
+
+def as_prior(prior: Callable[[Tensor], Tensor]) -> ObjectPrior:
+    """An `ObjectPrior` of whatever maps an image to a scalar. Raises TypeError for what cannot be called."""
+    if not callable(prior):
+        raise TypeError(f"prior is {prior!r}: it must be a function or module that maps an image to a scalar")
+    return prior if isinstance(prior, ObjectPrior) else FunctionPrior(prior)
+
+
+def check_prior(prior: ObjectPrior, image: Tensor) -> None:
+    """Raise ValueError unless `prior` is a finite, differentiable scalar at `image` (H', W')."""
+    try:
+        with torch.enable_grad():
+            value = prior(image.detach().requires_grad_())
+    except (RuntimeError, IndexError) as error:
+        raise ValueError(f"the prior {prior!r} fails on an image {tuple(image.shape)}: {error}") from error
+    if not isinstance(value, Tensor) or value.ndim:
+        what = f"a tensor of shape {tuple(value.shape)}" if isinstance(value, Tensor) else f"a {type(value).__name__}"
+        raise ValueError(f"the prior {prior!r} returns {what} for an image: it must return a scalar tensor")
+    if not math.isfinite(float(value.detach())):
+        raise ValueError(f"the prior {prior!r} is {float(value.detach())} at the mean frame: it must be finite there")
+    if not value.requires_grad:
+        raise ValueError(f"the prior {prior!r} does not depend on the image by operations that PyTorch differentiates")
+    slope = prior.value_and_gradient(image)[1]
+    if slope.shape != image.shape or not bool(torch.isfinite(slope).all()):
+        raise ValueError(
+            f"the gradient of the prior {prior!r} at the mean frame has shape {tuple(slope.shape)} or is not finite: "
+            f"it must be finite, of shape {tuple(image.shape)}"
+        )
 
 
 def gradient(image: Tensor) -> tuple[Tensor, Tensor]:
@@ -38,38 +225,7 @@ def divergence(dy: Tensor, dx: Tensor) -> Tensor:
     return dy.roll(1, -2) - dy + dx.roll(1, -1) - dx
 
 
-def _slopes(image: Tensor, epsilon: float) -> tuple[Tensor, Tensor, Tensor]:
-    dy, dx = gradient(image)
-    return dy, dx, torch.sqrt(dy**2 + dx**2 + epsilon**2)
-
-
-def whitening(aperture: Aperture, n_modes: int, r0: float, outer_scale: float) -> Tensor:
-    """L (N J, K) with L L^T the von Karman covariance of all modes, less the piston common to all sub-apertures.
-
-    Coefficients a = L z, sub-aperture by sub-aperture, follow von Karman statistics if z is white noise. The mean
-    piston cannot be seen; without it K = N J - 1. r0 and outer_scale in m, L in rad.
-    """
-    covariance = modal_covariance(aperture, n_modes, r0, outer_scale)
-    n_sub = aperture.n_subapertures
-    common = torch.zeros(n_sub, n_modes, dtype=covariance.dtype, device=covariance.device)
-    common[:, 0] = n_sub**-0.5
-    remove = torch.eye(n_sub * n_modes, dtype=covariance.dtype, device=covariance.device)
-    remove = remove - torch.outer(common.flatten(), common.flatten())
-    values, vectors = torch.linalg.eigh(remove @ covariance @ remove)
-    return (vectors[:, 1:] * values[1:].clamp(min=0).sqrt()).flip(1)
-
-
-def root(covariance: Tensor) -> Tensor:
-    """Symmetric square root R (K, K) [rad] of a covariance (K, K) [rad^2], whose least error is taken as 1 mrad.
-
-    Raises ValueError if the covariance is not finite, not symmetric or has negative eigenvalues.
-    """
-    if not bool(torch.isfinite(covariance).all()):
-        raise ValueError("covariance holds values that are not finite")
-    largest = float(covariance.abs().max())
-    if float((covariance - covariance.T).abs().max()) > _ROUNDING * largest:
-        raise ValueError("covariance is not symmetric")
-    values, vectors = torch.linalg.eigh(covariance)
-    if float(values[0]) < -_ROUNDING * largest * len(values):
-        raise ValueError(f"covariance has an eigenvalue of {float(values[0]):.3g} rad^2: none may be negative")
-    return (vectors * values.clamp(min=_LEAST_ERROR**2).sqrt()) @ vectors.T
+def _require_positive(**numbers: float) -> None:
+    for name, value in numbers.items():
+        if not (math.isfinite(value) and value > 0):
+            raise ValueError(f"{name} is {value}: it must be finite and positive")

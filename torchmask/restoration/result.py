@@ -7,6 +7,7 @@ from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,11 +21,11 @@ class RestorationResult:
     object : (H, W) electrons per frame and pixel, on the pixels of the frames
     extended_object : (H', W') the same with the margin around the field, rows and columns beyond H and W
     coefficients : (T, N, J) Zernike coefficients [rad rms]
-    gains : (T,) transmission of each frame, 1 on average
+    transmission : (T,) of each frame, 1 on average
     model : (T, H, W) the frames that object and coefficients make [electrons]
     residuals : (T, H, W) (frames - model) / noise, 0 where a pixel is not valid
     chi_square : (T,) mean square of the residuals
-    tv_weight : mu, in units of frames of mean 1
+    prior : the prior on the object, as it describes itself; weights are in units of frames of mean 1
     r0 : Fried parameter of the prior on the aberrations [m], NaN without prior or where they are known
     noise : electrons rms per pixel, averaged over the stack
     cost : (iterations,) what was minimised, one start after the other
@@ -53,11 +54,11 @@ class RestorationResult:
     object: Tensor
     extended_object: Tensor
     coefficients: Tensor
-    gains: Tensor
+    transmission: Tensor
     model: Tensor
     residuals: Tensor
     chi_square: Tensor
-    tv_weight: float
+    prior: str
     r0: float
     noise: float
     cost: Tensor
@@ -75,8 +76,15 @@ class RestorationResult:
 
     @classmethod
     def load(cls, path: str | Path) -> RestorationResult:
-        """Read what `save` wrote; tensors on the CPU. Raises ValueError for a missing, damaged or foreign file."""
-        stored = load_npz(path, required=[item.name for item in fields(cls) if item.default is MISSING])
+        """Read what `save` wrote, version 0.1 included; tensors on the CPU.
+
+        Raises ValueError for a missing, damaged or foreign file.
+        """
+        stored = _as_of_now(load_npz(path, required=("object", "coefficients", "chi_square")))
+        needed = [item.name for item in fields(cls) if item.default is MISSING]
+        missing = [name for name in needed if name not in stored]
+        if missing:
+            raise ValueError(f"{path} has no {', '.join(missing)}: it is no saved restoration, or a damaged one")
         names = [item.name for item in fields(cls) if item.name in stored]
         values: dict[str, Any] = {name: torch.from_numpy(stored[name]) for name in names if stored[name].ndim}
         values.update({name: stored[name].item() for name in names if not stored[name].ndim})
@@ -91,7 +99,15 @@ class RestorationResult:
             f"{n_sub} x {n_modes} aberrations each",
             f"{self.message} after {len(self.cost)} iterations, {self.n_evaluations} evaluations, {self.seconds:.1f} s",
             f"chi-square per pixel {float(chi.mean()):.3f} (worst frame {int(chi.argmax())}: {float(chi.max()):.3f})",
-            f"noise {self.noise:.3g} electrons rms, TV weight {self.tv_weight:g}"
+            f"noise {self.noise:.3g} electrons rms, prior {self.prior}"
             + ("" if math.isnan(self.r0) else f", r0 {self.r0:.3g} m"),
         ]
         return "\n".join(lines)
+
+
+def _as_of_now(stored: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The arrays of a file under today's names: version 0.1 knew one prior and called transmissions gains."""
+    if "gains" not in stored or "tv_weight" not in stored:
+        return stored
+    described = f"TotalVariation(weight={stored['tv_weight'].item():g}, epsilon=0.01)"
+    return stored | {"transmission": stored["gains"], "prior": np.asarray(described)}

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -17,6 +18,9 @@ _CURVED = 2.2e-16  # a correction is kept if s . y exceeds this times y . y
 _BACKTRACKS = 20
 
 Cost = Callable[[Tensor], tuple[float, Tensor]]
+"""x (n,) -> (value, gradient (n,))."""
+AfterIteration = Callable[[Tensor, float, int], None]
+"""Gets (x, value, evaluations so far)."""
 
 
 @dataclass(frozen=True)
@@ -29,6 +33,28 @@ class Minimum:
     n_evaluations: int
     converged: bool
     message: str
+
+
+class Minimizer(Protocol):
+    """Whatever lowers a cost from a start, under lower bounds (-inf where there is none)."""
+
+    def __call__(
+        self, cost: Cost, start: Tensor, lower: Tensor, *, max_iterations: int, callback: AfterIteration | None = None
+    ) -> Minimum: ...
+
+
+@dataclass(frozen=True)
+class ProjectedLBFGS:
+    """`minimize_bounded` as a `Minimizer`; `n_corrections` pairs of steps and gradient changes are kept."""
+
+    n_corrections: int = 20
+
+    def __call__(
+        self, cost: Cost, start: Tensor, lower: Tensor, *, max_iterations: int, callback: AfterIteration | None = None
+    ) -> Minimum:
+        return minimize_bounded(
+            cost, start, lower, max_iterations=max_iterations, n_corrections=self.n_corrections, callback=callback
+        )
 
 
 class Corrections:
@@ -105,7 +131,7 @@ def minimize_bounded(
     n_corrections: int = 20,
     gradient_tolerance: float = 0.0,
     cost_tolerance: float = 1e-12,
-    callback: Callable[[Tensor, float, int], None] | None = None,
+    callback: AfterIteration | None = None,
 ) -> Minimum:
     """Minimise `cost` over x >= `lower` by L-BFGS with two-metric projection.
 

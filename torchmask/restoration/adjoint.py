@@ -1,0 +1,115 @@
+"""How far a model of the exposures is from the frames, with gradients and curvature by its adjoint, written by hand.
+
+They cost six FFTs a frame (and two more for every further wavelength) in a memory that does not grow with the frames.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchmask.restoration.forward import ExposureModel, intensity
+from torchmask.restoration.parallel import Map
+from torchmask.restoration.pupil import OpenSamples
+
+_PROBES = 4  # draws of noise per frame for the curvature
+
+
+class DataFidelity(NamedTuple):
+    """Half the weighted squared residuals, (T,), and the gradients of their sum; None where not asked for."""
+
+    value: Tensor
+    object_gradient: Tensor | None
+    aberration_gradient: Tensor | None
+
+
+@torch.no_grad()
+def data_fidelity(
+    model: ExposureModel,
+    image: Tensor,
+    z: Tensor,
+    frames: Tensor,
+    precision: Tensor,
+    *,
+    want_object: bool = True,
+    want_aberrations: bool = True,
+    parallel: Map = map,
+) -> DataFidelity:
+    """1/2 sum precision (model - frames)^2 of every frame, and its gradients.
+
+    Parameters
+    ----------
+    model : ExposureModel
+    image : (H', W') tensor
+    z : (T, K) tensor
+    frames : (T, H, W) tensor
+    precision : tensor that broadcasts to the frames' shape, with its first axis of length T or 1
+        Inverse noise variance of each pixel, 0 where a pixel is not valid.
+    want_object, want_aberrations : bool
+        Which gradients to compute.
+    parallel : callable
+        Goes over the frames, a few at a time, as `map` does.
+    """
+    shape, samples = model.window.field.shape, model.pupil.samples()
+    spectrum = torch.fft.rfft2(image.to(model.dtype))
+    conjugate = spectrum.conj().resolve_conj()
+    phase = samples.phase(z)  # of all frames at once: one large matrix product is faster than many small ones
+
+    @torch.no_grad()  # which holds for one thread only
+    def compare(part: slice) -> tuple[Tensor, Tensor | None, Tensor | None]:
+        field = samples.field(phase[part])
+        amplitude = model.amplitude(samples, field)
+        transfer = torch.fft.rfft2(intensity(amplitude))
+        error = model.window.crop(torch.fft.irfft2(transfer * spectrum, s=shape)) - frames[part]
+        residual = error * (precision[part] if len(precision) > 1 else precision)
+        value = 0.5 * torch.linalg.vecdot(residual.flatten(1), error.flatten(1)).double()
+        if not (want_object or want_aberrations):
+            return value, None, None
+        back = torch.fft.rfft2(residual, s=shape)
+        by_object = (transfer.conj() * back).sum(0) if want_object else None
+        if not want_aberrations:
+            return value, by_object, None
+        psf_gradient = torch.fft.irfft2(back * conjugate, s=shape)
+        return value, by_object, pull_back(samples, field, amplitude, psf_gradient)
+
+    values, by_object, slopes = zip(*parallel(compare, model.chunks(len(z))), strict=True)
+    return DataFidelity(
+        torch.cat(values),
+        torch.fft.irfft2(sum(by_object[1:], by_object[0]), s=shape).to(image.dtype) if want_object else None,
+        (torch.cat(slopes) @ samples.basis).to(z.dtype) if want_aberrations else None,
+    )
+
+
+def pull_back(samples: OpenSamples, field: Tensor, amplitude: Tensor, psf_gradient: Tensor) -> Tensor:
+    """Gradient with respect to the phase (T, P) from that with respect to the PSF (T, H', W')."""
+    back = torch.fft.ifft2(amplitude * psf_gradient[:, None], norm="forward").flatten(1)
+    back = back.index_select(1, samples.index)
+    return 2 * (back.imag * field.real - back.real * field.imag)
+
+
+@torch.no_grad()
+def curvature(
+    model: ExposureModel, image: Tensor, z: Tensor, precision: Tensor, generator: torch.Generator
+) -> tuple[Tensor, float]:
+    """Diagonal of the Gauss-Newton Hessian of `data_fidelity`: mean over frames for each z (K,); for an object pixel.
+
+    J^T W J is the covariance of J^T W^(1/2) n with white noise n, so a few draws of noise per frame suffice for
+    a diagonal that is averaged over frames (Bekas, Kokiopoulou & Saad, Appl. Numer. Math. 57, 1214, 2007).
+    """
+    shape, samples = model.window.field.shape, model.pupil.samples()
+    conjugate = torch.fft.rfft2(image.to(model.dtype)).conj().resolve_conj()
+    total, pixel = torch.zeros_like(z[0]), 0.0
+    for part in model.chunks(len(z)):
+        field = samples.field(samples.phase(z[part]))
+        amplitude = model.amplitude(samples, field)
+        weight = (precision[part] if len(precision) > 1 else precision).expand(len(field), *model.window.grid.shape)
+        for _ in range(_PROBES):
+            noise = torch.randn(weight.shape, dtype=weight.dtype, device="cpu", generator=generator).to(weight)
+            back = torch.fft.irfft2(torch.fft.rfft2(noise * weight.sqrt(), s=shape) * conjugate, s=shape)
+            gradient = pull_back(samples, field, amplitude, back) @ samples.basis
+            total += (gradient**2).sum(0).to(z.dtype) / _PROBES
+        energy = (intensity(amplitude) ** 2).sum((1, 2))
+        pixel += float((energy * weight.mean((1, 2))).sum())
+    return total / len(z), pixel

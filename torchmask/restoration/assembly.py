@@ -1,0 +1,71 @@
+"""What a finished restoration hands back, put together from where it ended."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+
+from torchmask.restoration.checkpoint import Progress, Status
+from torchmask.restoration.frames import FrameStack
+from torchmask.restoration.objective import MyopicObjective
+from torchmask.restoration.posterior import standard_deviations
+from torchmask.restoration.result import RestorationResult
+
+
+@torch.no_grad()
+def assemble_result(
+    objective: MyopicObjective, stack: FrameStack, progress: Progress, r0: float | None
+) -> RestorationResult:
+    """The result of a restoration that has ended; `r0` [m] is that of the aberration basis, None if they are known."""
+    model, state = objective.model, progress.state
+    transmission, weight = state.calibration.transmission, state.calibration.aberration_weight
+    made = torch.cat([model(state.image, state.z[part]) for part in model.chunks(len(state.z))])
+    frames = made * transmission[:, None, None].to(made)
+    residuals = (objective.frames - frames) * objective.precision.sqrt()
+    return RestorationResult(
+        object=(model.window.crop(state.image) * stack.unit).clone(),
+        extended_object=state.image * stack.unit,
+        coefficients=model.aberrations.coefficients(state.z),
+        transmission=transmission,
+        model=frames * stack.unit,
+        residuals=residuals,
+        chi_square=(residuals**2).sum((1, 2)) / stack.valid.sum((1, 2)).clamp(min=1),
+        prior=repr(objective.prior),
+        r0=math.nan if r0 is None else r0 * weight ** (3 / 5),
+        noise=stack.variance**0.5,
+        cost=torch.tensor(progress.costs, dtype=torch.float64, device="cpu"),
+        converged=progress.status is Status.CONVERGED,
+        message=_message(progress),
+        n_evaluations=progress.n_evaluations,
+        seconds=0.0,
+    )
+
+
+def add_deviations(
+    result: RestorationResult,
+    objective: MyopicObjective,
+    stack: FrameStack,
+    progress: Progress,
+    cutoff: float,
+    n_samples: int,
+) -> RestorationResult:
+    """The result with standard deviations of the object below `cutoff` [cycles/pixel] and of the coefficients."""
+    model = objective.model
+    image, z = standard_deviations(objective, progress.state, cutoff, stack.photon_share, n_samples)
+    spread = torch.stack([model.aberrations.coefficients(sample) for sample in z]).square().mean((0, 1)).sqrt()
+    return replace(result, object_std=model.window.crop(image) * stack.unit, coefficients_std=spread)
+
+
+def _message(progress: Progress) -> str:
+    iterations = len(progress.costs)
+    if progress.status is Status.CONVERGED:
+        message = f"converged: the last segment lowered the cost by a fraction {progress.decrease or 0.0:.1e}"
+    elif progress.status is Status.ITERATION_LIMIT:
+        message = f"stopped at max_iterations = {iterations}"
+    else:
+        message = f"stopped after the {progress.iterations} iterations that a start may take"
+    if progress.starts > 1:
+        message += f"; the best of {progress.starts} starts" + (", two of which ended alike" if progress.alike else "")
+    return message

@@ -1,0 +1,87 @@
+"""A tournament of many first aberrations for every frame of a full pupil, of which the better ones live on.
+
+Phase retrieval over a full pupil has many minima, most of them poor, and even the true object does not lead a random
+start into a good one. So all candidates of all frames evolve together with one object, from blurred to sharp, and
+half of each frame's candidates are dropped at the end of every stage.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchmask.restoration.calibration import calibrate
+from torchmask.restoration.objective import MyopicObjective
+from torchmask.restoration.state import Calibration, State
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """A state that holds several candidates for each frame: T first ones, T second ones, and so on.
+
+    n_each : candidates for each frame; 1: the state is that of the frames themselves
+    """
+
+    state: State
+    n_each: int
+
+
+Descend = Callable[[MyopicObjective, State], State]
+
+
+def several(state: State, n_each: int) -> Candidates:
+    """So many copies of `state` as candidates."""
+    now = state.calibration
+    repeated = Calibration(now.transmission.repeat(n_each), now.noise_inflation.repeat(n_each), now.aberration_weight)
+    return Candidates(State(state.image, state.z.repeat(n_each, 1), repeated), n_each)
+
+
+def with_candidates(objective: MyopicObjective, n_each: int) -> MyopicObjective:
+    """The objective with every frame `n_each` times, in single precision.
+
+    The object's prior counts as many times, so that it holds the same balance.
+    """
+    model = objective.model.single()
+    single = MyopicObjective(
+        model,
+        objective.frames.to(model.dtype),
+        objective.precision.to(model.dtype),
+        objective.prior,
+        centre=objective.centre,
+        free=objective.free,
+        parallel=objective.parallel,
+    )
+    every = torch.arange(len(objective.frames), device=objective.frames.device).repeat(n_each)
+    return single.of_frames(every, prior_copies=n_each)
+
+
+def play_stage(
+    objective: MyopicObjective,
+    candidates: Candidates,
+    n_kept: int,
+    descend: Descend,
+    recalibrate: Descend = calibrate,
+) -> Candidates:
+    """One stage of a tournament: all candidates descend, are calibrated, and the best `n_kept` of each frame are left.
+
+    `objective` is that of the frames themselves.
+    """
+    crowded = with_candidates(objective, candidates.n_each)
+    state = recalibrate(crowded, descend(crowded, candidates.state))
+    return select(crowded, replace(candidates, state=state), n_kept)
+
+
+def select(crowded: MyopicObjective, candidates: Candidates, n_kept: int) -> Candidates:
+    """The best candidates of each frame, the very best first; `crowded` is the objective of all of them."""
+    state = candidates.state
+    costs = crowded.frame_costs(state.image, state.z, state.calibration).unflatten(0, (candidates.n_each, -1))
+    return Candidates(state.of_frames(_rows(costs.argsort(0)[:n_kept])), n_kept)
+
+
+def _rows(numbers: Tensor) -> Tensor:
+    """Places of the candidates `numbers` (kept, T) of each frame among all candidates."""
+    n_frames = numbers.shape[1]
+    return (numbers * n_frames + torch.arange(n_frames, device=numbers.device)).flatten()

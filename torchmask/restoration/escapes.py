@@ -1,0 +1,127 @@
+"""Two ways out of a local minimum, which no descent takes.
+
+Frames: with the object known, the aberrations of a frame are a small problem of their own, so several random starts
+are cheap. The object's place between the pixels: the frames cannot tell it, as a shift of the object and opposite tilts
+of all frames make the same images. The priors on the object can, because edges and points that lie on the pixels have
+the least total variation and no negative side lobes; a descent hardly moves along this direction, so the best place is
+looked for directly.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from torchmask.metrics import shift
+from torchmask.restoration.calibration import calibrate
+from torchmask.restoration.descent import Variables, descend
+from torchmask.restoration.forward import ExposureModel
+from torchmask.restoration.objective import Free, MyopicObjective
+from torchmask.restoration.priors import ObjectPrior
+from torchmask.restoration.projected_lbfgs import Minimizer, minimize_bounded
+from torchmask.restoration.schedule import Schedule
+from torchmask.restoration.state import State
+
+
+def restart_outlier_frames(
+    objective: MyopicObjective,
+    state: State,
+    first_inflation: float,
+    schedule: Schedule,
+    minimizer: Minimizer,
+    seed: int,
+) -> tuple[State, int]:
+    """Aberrations of outlying frames from the best of several random starts, and the evaluations that it took.
+
+    A frame keeps its aberrations unless others lower its cost; it is `state` itself that comes back if all do.
+    """
+    inflation = calibrate(objective, state).calibration.noise_inflation
+    lost = (inflation > schedule.outlying * inflation.quantile(0.25)).nonzero().flatten()
+    if not len(lost):
+        return state, 0
+    part, basis = objective.of_frames(lost, free=Free.ABERRATIONS), objective.model.aberrations
+    generator = torch.Generator().manual_seed(seed)
+    n_evaluations = 0
+
+    def count(cost: float, evaluations: int, variables: Variables) -> None:
+        nonlocal n_evaluations
+        n_evaluations += evaluations
+
+    now = state.of_frames(lost)
+    best, least = now.z, part.frame_costs(now.image, now.z, now.calibration)
+    spread = float((state.z - objective.centre).square().mean(1).sqrt().median())  # whatever lost frames have come to
+    for _ in range(schedule.restarts):
+        noise = torch.randn(now.z.shape, dtype=now.z.dtype, device="cpu", generator=generator).to(now.z)
+        fresh = basis.with_common_of(part.centre + spread * noise, now.z)
+        trial = replace(now, z=fresh).with_noise_inflation(first_inflation)
+        for _ in range(schedule.restart_rounds):  # of falling noise, without which most starts fall into poor minima
+            trial = descend(part, trial, schedule.restart_iterations, minimizer, count)
+            left = calibrate(part, trial).calibration.noise_inflation
+            trial = trial.calibrated(noise_inflation=left)
+        costs = part.frame_costs(trial.image, trial.z, now.calibration)
+        best = torch.where((costs < least)[:, None], trial.z, best)
+        least = torch.minimum(costs, least)
+    spent = n_evaluations * len(lost) // len(state.z)
+    if torch.equal(best, now.z):
+        return state, spent
+    z = state.z.clone()
+    z[lost] = best
+    return replace(state, z=z), spent
+
+
+def centre_on_pixels(objective: MyopicObjective, state: State, schedule: Schedule) -> State:
+    """The state moved by less than a pixel to where the cost is least, or `state` itself.
+
+    For each position the object is settled in the quadratic approximation of the misfit in the object, for known PSFs
+    and a full field: that needs no more frames, only FFTs of the object.
+    """
+    gradient, power = objective.object_quadratic(state.image, state.z, state.calibration)
+
+    def settle(offset: tuple[float, float]) -> tuple[float, Tensor]:
+        image, slope = shift(state.image, offset), shift(gradient, offset)
+        return _settle(image, slope, power, objective.prior, schedule.pixel_iterations)
+
+    stay = best = settle((0.0, 0.0))
+    place = (0.0, 0.0)
+    for step in schedule.pixel_steps:
+        for dy, dx in ((step, 0.0), (-step, 0.0), (0.0, step), (0.0, -step)):
+            offset = (place[0] + dy, place[1] + dx)
+            if (trial := settle(offset))[0] < best[0]:
+                best, place = trial, offset
+    z = state.z - tilt(objective.model, place).to(state.z)
+    change = (state.z - objective.centre) ** 2 - (z - objective.centre) ** 2
+    held = 0.5 * float((objective.aberration_weight(state.calibration, state.z) * change).sum())
+    return replace(state, image=best[1], z=z) if stay[0] - best[0] + held > 0 else state
+
+
+def _settle(
+    centre: Tensor, gradient: Tensor, power: Tensor, prior: ObjectPrior, max_iterations: int
+) -> tuple[float, Tensor]:
+    """Minimise <gradient, o - centre> + 1/2 |o - centre|^2_power + prior(o) over o >= 0: (value, o)."""
+    start = centre.clamp(min=0)
+    scale = (power.mean() + prior.curvature(start)).rsqrt()
+
+    def cost(x: Tensor) -> tuple[float, Tensor]:
+        image = x.view_as(centre) * scale
+        change = image - centre
+        curved = torch.fft.irfft2(torch.fft.rfft2(change) * power, s=change.shape)
+        penalty, slope = prior.value_and_gradient(image)
+        value = (change * (gradient + 0.5 * curved)).sum() + penalty
+        return float(value), ((gradient + curved + slope) * scale).flatten()
+
+    x = (start / scale).flatten()
+    found = minimize_bounded(cost, x, torch.zeros_like(x), max_iterations=max_iterations)
+    return found.value, found.x.view_as(centre) * scale
+
+
+def tilt(model: ExposureModel, offset: tuple[float, float]) -> Tensor:
+    """The parameters (K,) that move every image by `offset` (dy, dx) pixels, as closely as the modes can."""
+    samples = model.pupil.samples()
+    phase = 2 * math.pi * (samples.positions * samples.positions.new_tensor([offset[1], offset[0]])).sum(-1)
+    # A constant phase does nothing; it may take up the mean piston, which the modes need not contain.
+    modes = torch.cat([samples.basis, samples.chromaticity[:, None]], dim=1).double()
+    q, r = torch.linalg.qr(modes)
+    return torch.linalg.lstsq(r.cpu(), (q.T @ phase.double()).cpu()[:, None], driver="gelsd").solution[:-1, 0].to(q)

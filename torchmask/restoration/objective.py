@@ -1,0 +1,230 @@
+"""What a restoration minimises: the cost of an object and of the aberrations of every frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import Flag, auto
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torchmask.restoration.adjoint import data_fidelity
+from torchmask.restoration.forward import ExposureModel
+from torchmask.restoration.parallel import Map
+from torchmask.restoration.priors import ObjectPrior
+from torchmask.restoration.state import Calibration
+
+
+class Free(Flag):
+    """What of an objective may change; the rest is known."""
+
+    OBJECT = auto()
+    ABERRATIONS = auto()
+    """Those of each frame."""
+    COMMON = auto()
+    """Those common to all frames."""
+
+
+class CostAndGradients(NamedTuple):
+    """The cost, a scalar, and its gradients (H', W') and (T, K): zero where nothing is free."""
+
+    value: Tensor
+    object_gradient: Tensor
+    aberration_gradient: Tensor
+
+
+class MyopicObjective(nn.Module):
+    """1/2 sum precision / inflation (transmission * model - frames)^2 + prior(image) + weight/2 |z - centre|^2.
+
+    `forward(image, z)` returns it as a scalar that autograd differentiates in the image, in z and in the centres of
+    the model's aperture, as often as wanted: the mask may move or train while the matrix of the aberration basis stays
+    what it was made as. `value_and_gradients` are the same value and first gradients in image and z at a fraction of
+    the time and memory, by the adjoint.
+
+    Parameters
+    ----------
+    model : ExposureModel
+    frames : (T, H, W) tensor
+        In units of their mean.
+    precision : tensor that broadcasts to the frames' shape, with its first axis of length T or 1
+        Inverse noise variance of each pixel in those units, 0 where it is not valid.
+    prior : ObjectPrior
+    centre : (T, K) tensor, optional
+        Expected aberrations. None: zero.
+    free : Free
+    prior_copies : int
+        How many times the object's prior counts, where the same frame stands in `frames` so many times.
+    parallel : callable
+        How to go over the frames, as `map` does.
+
+    Examples
+    --------
+    >>> from torchmask.grid import Grid
+    >>> from torchmask.optics.aperture import SparseAperture
+    >>> from torchmask.restoration.priors import TotalVariation
+    >>> mask = SparseAperture([[0.0, 0.3], [-0.3, -0.2], [0.3, -0.2]], 0.2, 1.0)
+    >>> model = ExposureModel(mask, Grid.nyquist(1.0, 550e-9, 32), 3)
+    >>> frames = torch.rand(4, 32, 32, dtype=torch.float64)
+    >>> objective = MyopicObjective(model, frames, torch.tensor([[[1e4]]]).double(), TotalVariation())
+    >>> image = torch.rand(model.window.field.shape, dtype=torch.float64, requires_grad=True)
+    >>> z = torch.zeros(4, 9, dtype=torch.float64, requires_grad=True)
+    >>> objective(image, z).backward()
+    >>> torch.allclose(image.grad, objective.value_and_gradients(image.detach(), z.detach()).object_gradient)
+    True
+    """
+
+    frames: Tensor
+    precision: Tensor
+    centre: Tensor
+
+    def __init__(
+        self,
+        model: ExposureModel,
+        frames: Tensor,
+        precision: Tensor,
+        prior: ObjectPrior,
+        *,
+        centre: Tensor | None = None,
+        free: Free = Free.OBJECT | Free.ABERRATIONS | Free.COMMON,
+        prior_copies: int = 1,
+        parallel: Map = map,
+    ) -> None:
+        super().__init__()
+        if centre is None:
+            shape = (len(frames), model.aberrations.n_parameters)
+            centre = torch.zeros(shape, dtype=torch.float64, device=frames.device)
+        self.model: ExposureModel = model
+        self.prior: ObjectPrior = prior
+        self.register_buffer("frames", frames, persistent=False)
+        self.register_buffer("precision", precision, persistent=False)
+        self.register_buffer("centre", centre, persistent=False)
+        self.free: Free = free
+        self.prior_copies: int = prior_copies
+        self.parallel: Map = parallel
+
+    def with_changes(
+        self, *, model: ExposureModel | None = None, centre: Tensor | None = None, free: Free | None = None
+    ) -> MyopicObjective:
+        """The objective with another model, other expected aberrations or something else free."""
+        return MyopicObjective(
+            model or self.model,
+            self.frames,
+            self.precision,
+            self.prior,
+            centre=self.centre if centre is None else centre,
+            free=self.free if free is None else free,
+            prior_copies=self.prior_copies,
+            parallel=self.parallel,
+        )
+
+    def of_frames(self, part: slice | Tensor, *, free: Free | None = None, prior_copies: int = 1) -> MyopicObjective:
+        """The objective of some of the frames, any of them several times."""
+        return MyopicObjective(
+            self.model,
+            self.frames[part],
+            self.precision[part] if len(self.precision) > 1 else self.precision,
+            self.prior,
+            centre=self.centre[part],
+            free=self.free if free is None else free,
+            prior_copies=prior_copies,
+            parallel=self.parallel,
+        )
+
+    def neutral_calibration(self) -> Calibration:
+        """Frames as bright as they are, noise as it is said to be, aberrations as strong as their prior says."""
+        transmission = self.frames.mean((1, 2)).double()
+        return Calibration(transmission / transmission.mean(), torch.ones_like(transmission), 1.0)
+
+    def forward(self, image: Tensor, z: Tensor, calibration: Calibration | None = None) -> Tensor:
+        calibration = calibration or self.neutral_calibration()
+        frames, precision = self.scaled_data(calibration)
+        residual = self.model(image, z) - frames
+        misfit = 0.5 * (precision * residual**2).sum().to(image.dtype)
+        away = z - self.centre
+        hold = 0.5 * (self.aberration_weight(calibration, z) * away**2).sum()
+        return misfit + self.prior_copies * self.prior(image) + hold
+
+    def value_and_gradients(self, image: Tensor, z: Tensor, calibration: Calibration | None = None) -> CostAndGradients:
+        """The cost and its gradients in `image` (H', W') and `z` (T, K), by the adjoint."""
+        return self.evaluator(calibration or self.neutral_calibration())(image, z)
+
+    def evaluator(self, calibration: Calibration) -> Callable[[Tensor, Tensor], CostAndGradients]:
+        """`value_and_gradients` for one calibration, whose frames are scaled once."""
+        frames, precision = self.scaled_data(calibration)
+        by_object = Free.OBJECT in self.free
+        by_aberrations = bool(self.free & (Free.ABERRATIONS | Free.COMMON))
+
+        @torch.no_grad()
+        def evaluate(image: Tensor, z: Tensor) -> CostAndGradients:
+            misfit = data_fidelity(
+                self.model,
+                image,
+                z,
+                frames,
+                precision,
+                want_object=by_object,
+                want_aberrations=by_aberrations,
+                parallel=self.parallel,
+            )
+            penalty, slope = self.prior.value_and_gradient(image)
+            weight, away = self.aberration_weight(calibration, z), z - self.centre
+            value = misfit.value.sum() + self.prior_copies * penalty + 0.5 * (weight * away**2).sum()
+            image_gradient, z_gradient = torch.zeros_like(image), torch.zeros_like(z)
+            if misfit.object_gradient is not None:
+                image_gradient = misfit.object_gradient + self.prior_copies * slope
+            if misfit.aberration_gradient is not None:
+                z_gradient = self._within_free(misfit.aberration_gradient + weight * away)
+            return CostAndGradients(value, image_gradient, z_gradient)
+
+        return evaluate
+
+    def _within_free(self, gradient: Tensor) -> Tensor:
+        """The gradient (T, K) of a function of the common aberrations' mean, which keeps equal what is equal."""
+        basis = self.model.aberrations
+        if Free.ABERRATIONS not in self.free:
+            gradient = basis.with_common_of(torch.zeros_like(gradient), gradient)
+        if not basis.n_common:
+            return gradient
+        if Free.COMMON in self.free:
+            return basis.mean_common(gradient)
+        return basis.with_common_of(gradient, torch.zeros_like(gradient[:1]))
+
+    def scaled_data(self, calibration: Calibration) -> tuple[Tensor, Tensor]:
+        """Frames and precision with the transmission g taken to the data: (frames / g, precision g^2 / inflation)."""
+        transmission = calibration.transmission[:, None, None].to(self.frames)
+        inflation = calibration.noise_inflation[:, None, None].to(transmission)
+        return self.frames / transmission, self.precision * (transmission**2 / inflation)
+
+    def aberration_weight(self, calibration: Calibration, z: Tensor) -> float | Tensor:
+        """Weight of a frame's (z - centre)^2 / 2: common aberrations do not follow the turbulence, and count once."""
+        n_common, value = self.model.aberrations.n_common, calibration.aberration_weight
+        if not n_common:
+            return value
+        weight = torch.full_like(z[0], value)
+        weight[-n_common:] = 1 / len(z) if value else 0.0
+        return weight
+
+    def frame_costs(self, image: Tensor, z: Tensor, calibration: Calibration) -> Tensor:
+        """Misfit of each frame and prior of its aberrations, (T,)."""
+        frames, precision = self.scaled_data(calibration)
+        misfit = data_fidelity(self.model, image, z, frames, precision, want_object=False, want_aberrations=False)
+        return misfit.value.to(z) + 0.5 * (self.aberration_weight(calibration, z) * (z - self.centre) ** 2).sum(1)
+
+    @torch.no_grad()
+    def object_quadratic(self, image: Tensor, z: Tensor, calibration: Calibration) -> tuple[Tensor, Tensor]:
+        """The misfit as a quadratic function of the object: gradient (H', W') and Hessian over frequencies.
+
+        The gradient is exact, the Hessian (H', W'/2 + 1) that of a full field, which is diagonal in frequency.
+        """
+        frames, precision = self.scaled_data(calibration)
+        slope = data_fidelity(
+            self.model, image, z, frames, precision, want_aberrations=False, parallel=self.parallel
+        ).object_gradient
+        assert slope is not None
+        power = torch.zeros_like(torch.fft.rfft2(image).real)
+        for part in self.model.chunks(len(z)):
+            transfer = torch.fft.rfft2(self.model.psf(z[part]))
+            weight = precision[part].mean((1, 2), keepdim=True)
+            power += ((transfer.real**2 + transfer.imag**2) * weight).sum(0).to(power)
+        return slope, power

@@ -1,0 +1,129 @@
+"""The open samples of a pupil: how a phase in few parameters becomes a complex field at every wavelength."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torchmask.grid import Grid
+from torchmask.optics.aperture import Aperture
+from torchmask.optics.band import Band
+from torchmask.optics.zernike import zernike_basis
+from torchmask.restoration.aberrations import AberrationBasis
+
+
+class OpenSamples(NamedTuple):
+    """The P open samples of a pupil, those of all wavelengths in one row.
+
+    weights : (P,) amplitude, scaled such that every PSF has unit sum
+    index : (P,) place in the flattened rasters of all wavelengths
+    basis : (P, K) phase [rad] of one unit of each aberration parameter
+    positions : (P, 2) place (x, y) in the pupil as a frequency [cycles/pixel]
+    chromaticity : (P,) phase of a path difference that makes 1 rad at the wavelength of the grid
+    """
+
+    weights: Tensor
+    index: Tensor
+    basis: Tensor
+    positions: Tensor
+    chromaticity: Tensor
+
+    def phase(self, z: Tensor) -> Tensor:
+        """Phase (T, P) [rad] of the parameters z (T, K)."""
+        return z.to(self.basis.dtype) @ self.basis.T
+
+    def field(self, phase: Tensor) -> Tensor:
+        """Complex field (T, P) of a phase (T, P)."""
+        return torch.complex(self.weights * phase.cos(), self.weights * phase.sin())  # faster than torch.polar
+
+
+class SampledPupil(nn.Module):
+    """An aperture laid on the rasters that an FFT takes to the image, one raster for each wavelength of a band.
+
+    `samples()` follows the aperture: while its centres train they are differentiable in them, and once it has moved
+    they are evaluated anew. The matrix of the aberration basis stays what it was made as.
+
+    Parameters
+    ----------
+    aperture : Aperture
+        One aperture, centres (N, 2).
+    field : Grid
+        On which images are made.
+    band : Band
+    aberrations : AberrationBasis
+
+    Raises
+    ------
+    ValueError
+        If the shortest wavelength undersamples the image, or a sub-aperture is narrower than two samples.
+    """
+
+    weights: Tensor
+    index: Tensor
+    basis: Tensor
+    positions: Tensor
+    chromaticity: Tensor
+    centers: Tensor
+
+    def __init__(
+        self,
+        aperture: Aperture,
+        field: Grid,
+        band: Band,
+        aberrations: AberrationBasis,
+        *,
+        dtype: torch.dtype | None = None,
+        device: torch.device | str | None = None,
+    ) -> None:
+        super().__init__()
+        self.aperture: Aperture = aperture
+        self.grid: Grid = field
+        self.band: Band = band
+        self.aberrations: AberrationBasis = aberrations
+        kwargs = {"dtype": dtype or aperture.centers.dtype, "device": device}
+        with torch.no_grad():
+            for name, values in self._sample()._asdict().items():
+                values = values.to(device) if name == "index" else values.to(**kwargs)
+                self.register_buffer(name, values, persistent=False)
+        self.register_buffer("centers", aperture.centers.detach().clone(), persistent=False)
+
+    def samples(self) -> OpenSamples:
+        """The open samples of the aperture where it lies now."""
+        centers = self.aperture.centers
+        if centers.requires_grad and torch.is_grad_enabled():
+            sampled = self._sample()
+            return OpenSamples(*(v if name == "index" else v.to(self.basis) for name, v in sampled._asdict().items()))
+        if not torch.equal(centers, self.centers):
+            with torch.no_grad():
+                for name, values in self._sample()._asdict().items():
+                    setattr(self, name, values.to(self.index if name == "index" else self.basis))
+            self.centers = centers.detach().clone()
+        return OpenSamples(self.weights, self.index, self.basis, self.positions, self.chromaticity)
+
+    def _sample(self) -> OpenSamples:
+        pixels = math.prod(self.grid.shape)
+        parts = []
+        for number, (wavelength, share) in enumerate(zip(self.band.wavelengths, self.band.shares, strict=True)):
+            part = self._sample_at(wavelength)
+            weights = math.sqrt(share) * part.weights
+            parts.append(part._replace(weights=weights, index=part.index + number * pixels))
+        return OpenSamples(*(torch.cat(values) for values in zip(*parts, strict=True)))
+
+    def _sample_at(self, wavelength: float) -> OpenSamples:
+        aperture, grid = self.aperture, replace(self.grid, wavelength=wavelength)
+        samples = aperture.samples(grid)
+        modes = zernike_basis(samples, aperture, self.aberrations.n_modes)  # (N, P, J)
+        is_open = samples.weights > 0
+        mixing = self.aberrations.mixing.to(modes).unflatten(0, (len(modes), self.aberrations.n_modes))
+        mixed = torch.einsum("npj,njk->npk", modes, mixing)[is_open]
+        weights = samples.weights[is_open]
+        # Parseval: this makes the sum of every PSF 1, whatever the phase, as long as holes share no cell.
+        scale = weights.norm() * math.prod(grid.shape) ** 0.5
+        positions = (samples.offsets + aperture.centers[:, None])[is_open] / grid.period
+        ratio = self.grid.wavelength / wavelength
+        chromaticity = weights.new_full((len(weights),), ratio)
+        return OpenSamples(weights / scale, samples.index[is_open], mixed * ratio, positions, chromaticity)

@@ -1,0 +1,68 @@
+"""When a restoration does what: every number that decides it, in one place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """The course of a restoration, in iterations of its descents. All values were measured: docs/restoration.md.
+
+    segment : iterations between two recalibrations of scales, transmissions, noise and turbulence
+    start_iterations : of one start, at most
+    sharp_after : iterations after which the object is sharp enough to look for its place and for lost frames
+    escapes : how often that is done in one start, at most
+    first_inflation : the first noise variance is what the mean frame leaves unexplained over this
+    start_rms : of the first whitened aberrations of a full pupil, and of further starts
+    start_rms_unwhitened : the same in rad, where the aberrations have no prior
+    candidates : stages of a full pupil's tournament, as (candidates for each frame, iterations); each stage keeps
+        half of them, the last one the best
+    missed : share of the change from frame to frame that a fit may leave unexplained: with more, the object is
+        another one
+    chance : standard deviations of the stack's chi-square that are left to noise
+    starts : how many there are, at most, for objects that were missed
+    alike : relative difference of what two starts leave unexplained, below which they have found the same
+    outlying : a frame is lost if its residual variance is so many times that of the frames that fit well
+    restarts, restart_rounds, restart_iterations : random aberrations that a lost frame is started from, rounds of
+        falling noise, iterations of a round
+    pixel_steps : by which the object is moved along each axis to find its place between the pixels
+    pixel_iterations : that settle the object at such a place, at most
+    """
+
+    segment: int = 100
+    start_iterations: int = 1000
+    sharp_after: int = 300
+    escapes: int = 7
+    first_inflation: float = 30.0
+    start_rms: float = 0.7
+    start_rms_unwhitened: float = 0.1
+    candidates: tuple[tuple[int, int], ...] = ((16, 30), (8, 70), (4, 100), (2, 100))
+    missed: float = 0.0013
+    chance: float = 2.0
+    starts: int = 4
+    alike: float = 0.03
+    outlying: float = 1.25
+    restarts: int = 6
+    restart_rounds: int = 3
+    restart_iterations: int = 30
+    pixel_steps: tuple[float, ...] = (0.4, 0.2)
+    pixel_iterations: int = 60
+
+    def __post_init__(self) -> None:
+        stages = [number for number, _ in self.candidates] + [1]
+        if any(later * 2 != earlier for earlier, later in pairwise(stages)):
+            raise ValueError(f"candidates is {self.candidates}: each stage must have half as many as the one before it")
+        for name in ("segment", "start_iterations", "starts"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}: it must be at least 1")
+
+    @property
+    def n_candidates(self) -> int:
+        """How many candidates a tournament begins with; 1 without one."""
+        return self.candidates[0][0] if self.candidates else 1
+
+    def stage_iterations(self, n_candidates: int) -> int:
+        """The iterations of the stage with so many candidates."""
+        return dict(self.candidates)[n_candidates]

@@ -1,0 +1,164 @@
+"""Where a restoration begins: the mean frame and no aberrations, what is known, random draws, an earlier result."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchmask.restoration.calibration import calibrate, share_noise_inflation
+from torchmask.restoration.candidates import Candidates, play_stage, several
+from torchmask.restoration.descent import Variables, descend
+from torchmask.restoration.objective import Free, MyopicObjective
+from torchmask.restoration.projected_lbfgs import Minimizer
+from torchmask.restoration.result import RestorationResult
+from torchmask.restoration.schedule import Schedule
+from torchmask.restoration.state import Calibration, State
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known before a restoration begins, each None where it is not.
+
+    coefficients : (T, N, J) aberrations [rad rms]
+    covariance : (N J, N J) [rad^2] of their errors; None: they are exact
+    object : (H, W), up to its flux
+    """
+
+    coefficients: Tensor | None = None
+    covariance: Tensor | None = None
+    object: Tensor | None = None
+
+    def check(self) -> None:
+        """Raise ValueError unless something is left to restore and nothing hangs in the air."""
+        if self.covariance is not None and self.coefficients is None:
+            raise ValueError("covariance is given without coefficients: it is that of their errors, give both")
+        if self.coefficients is not None and self.object is not None and self.covariance is None:
+            raise ValueError("coefficients and known_object are both given: nothing is left to restore")
+
+    @property
+    def nothing(self) -> bool:
+        """Whether all of it is open."""
+        return self.coefficients is None and self.object is None
+
+    @property
+    def free(self) -> Free:
+        """What a restoration may change."""
+        free = Free.OBJECT | Free.ABERRATIONS | Free.COMMON
+        if self.object is not None:
+            free &= ~Free.OBJECT
+        if self.coefficients is not None and self.covariance is None:
+            free &= ~(Free.ABERRATIONS | Free.COMMON)
+        return free
+
+
+def expected_parameters(objective: MyopicObjective, coefficients: Tensor | None) -> Tensor:
+    """The parameters (T, K) of known coefficients (T, N, J), or zero.
+
+    Raises ValueError if the coefficients have another shape or are not finite.
+    """
+    basis = objective.model.aberrations
+    if coefficients is None:
+        return torch.zeros_like(objective.centre)
+    expected = (len(objective.frames), basis.n_subapertures, basis.n_modes)
+    if tuple(coefficients.shape) != expected:
+        raise ValueError(f"coefficients has shape {tuple(coefficients.shape)}: it must be {expected}")
+    if not bool(torch.isfinite(coefficients).all()):
+        raise ValueError("coefficients hold values that are not finite")
+    return basis.parameters_of(coefficients)
+
+
+def first_state(
+    objective: MyopicObjective, z: Tensor, known_object: Tensor | None, first_inflation: float, aberration_weight: float
+) -> State:
+    """The clipped mean frame, or the object that is known, with the aberrations z (T, K).
+
+    Raises ValueError if the known object has another shape than the frames, is not finite or holds no light.
+    """
+    window, model = objective.model.window, objective.model
+    neutral = objective.neutral_calibration()
+    image = window.embed(objective.frames.mean(0).clamp(min=0)).double()
+    if known_object is not None:
+        if tuple(known_object.shape) != window.grid.shape:
+            raise ValueError(f"known_object has shape {tuple(known_object.shape)}: it must be {window.grid.shape}")
+        image = window.embed(known_object.to(image).clamp(min=0))
+        if not 0 < float(image.sum()) < math.inf:
+            raise ValueError("known_object holds values that are not finite, or no light")
+        with torch.no_grad():
+            image = image / float(model(image, z).mean())
+    inflation = torch.full_like(neutral.transmission, first_inflation)
+    return State(image, z, Calibration(neutral.transmission, inflation, aberration_weight))
+
+
+def random_candidates(objective: MyopicObjective, state: State, n_each: int, rms: float, seed: int) -> Candidates:
+    """So many candidates with random aberrations for each frame of `state`."""
+    candidates = several(state, n_each)
+    z = objective.model.aberrations.draw(candidates.state.z, rms, torch.Generator().manual_seed(seed))
+    return Candidates(replace(candidates.state, z=z), n_each)
+
+
+def start_from_result(
+    objective: MyopicObjective, state: State, start: RestorationResult, unit: float
+) -> tuple[State, int]:
+    """`state` with the object and the aberrations of an earlier restoration, and how many frames that knew.
+
+    The frames that it did not know keep the aberrations of `state`. Raises ValueError if the earlier restoration is one
+    of more frames, another mask or another field.
+    """
+    basis, field_shape = objective.model.aberrations, tuple(state.image.shape)
+    known, expected = len(start.coefficients), (basis.n_subapertures, basis.n_modes)
+    fits = tuple(start.extended_object.shape) == field_shape and tuple(start.coefficients.shape[1:]) == expected
+    if known > len(state.z) or not fits:
+        raise ValueError(
+            f"start has coefficients {tuple(start.coefficients.shape)} and an object on "
+            f"{tuple(start.extended_object.shape)} pixels: (at most {len(state.z)}, *{expected}) and {field_shape} "
+            "are needed"
+        )
+    image, z = state.image, state.z.clone()
+    if Free.OBJECT in objective.free:
+        image = start.extended_object.to(image) / unit
+    if Free.ABERRATIONS in objective.free:
+        z[:known] = basis.parameters_of(start.coefficients)
+        z[known:] = basis.with_common_of(z[known:], z[:1])
+    return replace(state, image=image, z=z), known
+
+
+def fit_new_frames(
+    objective: MyopicObjective,
+    state: State,
+    n_known: int,
+    rms: float | None,
+    schedule: Schedule,
+    minimizer: Minimizer,
+    seed: int,
+) -> tuple[State, int]:
+    """The aberrations of the frames from `n_known` on fitted to the object of `state`, and the evaluations it took.
+
+    `rms` is that of random first candidates; None: one start from the aberrations they have.
+    """
+    n_frames, spent = len(state.z), 0
+
+    def count(cost: float, evaluations: int, variables: Variables) -> None:
+        nonlocal spent
+        spent += evaluations * candidates.n_each * (n_frames - n_known)
+
+    new = slice(n_known, None)
+    fresh, begin = objective.of_frames(new, free=Free.ABERRATIONS), state.of_frames(new)
+    candidates = Candidates(begin, 1)
+    if rms is not None:
+        candidates = random_candidates(fresh, begin, schedule.n_candidates, rms, seed)
+        kept = objective.model.aberrations.with_common_of(candidates.state.z, state.z[:1])
+        candidates = Candidates(replace(candidates.state, z=kept), candidates.n_each)
+    while candidates.n_each > 1:
+        n_iterations = schedule.stage_iterations(candidates.n_each)
+        candidates = play_stage(
+            fresh,
+            candidates,
+            candidates.n_each // 2,
+            lambda crowded, now, n=n_iterations: descend(crowded, now, n, minimizer, count),
+            lambda crowded, now: share_noise_inflation(calibrate(crowded, now)),
+        )
+    fitted = descend(fresh, candidates.state, schedule.segment, minimizer, count)
+    return replace(state, z=torch.cat([state.z[:n_known], fitted.z])), spent // n_frames
