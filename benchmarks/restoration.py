@@ -18,9 +18,10 @@ from torchmask.grid import Grid
 from torchmask.metrics import relative_error
 from torchmask.observation import Observation
 from torchmask.optics.aperture import Aperture, FullAperture, SparseAperture
-from torchmask.restoration.model import ExposureModel
+from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.myopic import MyopicDeconvolution
-from torchmask.restoration.priors import total_variation
+from torchmask.restoration.objective import MyopicObjective
+from torchmask.restoration.priors import TotalVariation
 
 
 def seconds(function: Callable[[], object], device: str, repeats: int) -> float:
@@ -39,7 +40,7 @@ def seconds(function: Callable[[], object], device: str, repeats: int) -> float:
 
 def bare_ffts(model: ExposureModel, n_frames: int) -> Callable[[], None]:
     """Two complex and two real FFTs for every frame."""
-    example = model.psf(torch.zeros(1, model.n_parameters, dtype=model.basis.dtype, device=model.basis.device))
+    example = model.psf(torch.zeros(1, model.aberrations.n_parameters, dtype=model.dtype, device=model.device))
     parts = [part.stop - part.start for part in model.chunks(n_frames)]
     image = example.expand(max(parts), *example.shape[1:]).clone()
     pupil = torch.complex(image, image)
@@ -50,7 +51,7 @@ def bare_ffts(model: ExposureModel, n_frames: int) -> Callable[[], None]:
             torch.fft.fft2(pupil[:size])
             torch.fft.ifft2(pupil[:size])
             torch.fft.rfft2(image[:size])
-            torch.fft.irfft2(half[:size], s=model.field.shape)
+            torch.fft.irfft2(half[:size], s=model.window.field.shape)
 
     return run
 
@@ -61,19 +62,21 @@ def compare(name: str, aperture: Aperture, n_modes: int, n_pixels: int, dtype: t
     model = ExposureModel(
         aperture.to(args.device), Grid.nyquist(1.0, 550e-9, n_pixels), n_modes, dtype=dtype, device=args.device
     )
-    image = torch.rand(model.field.shape, dtype=torch.float64, device=args.device)
-    z = torch.randn(n_frames, model.n_parameters, dtype=torch.float64, device=args.device)
+    image = torch.rand(model.window.field.shape, dtype=torch.float64, device=args.device)
+    z = torch.randn(n_frames, model.aberrations.n_parameters, dtype=torch.float64, device=args.device)
     frames = torch.rand(n_frames, n_pixels, n_pixels, dtype=dtype, device=args.device)
     precision = torch.ones(1, 1, 1, dtype=dtype, device=args.device)
 
+    objective = MyopicObjective(model, frames, precision, TotalVariation())
+    evaluator = objective.evaluator(objective.neutral_calibration())
+
     def evaluate() -> None:
-        model.misfit(image, z, frames, precision)
-        total_variation(image)
+        evaluator(image, z)
 
     ours = seconds(evaluate, args.device, args.repeats)
     bare = seconds(bare_ffts(model, n_frames), args.device, args.repeats)
     print(
-        f"{name:5s} {n_modes:4d} modes {n_frames:3d} x {n_pixels:3d}^2 on {model.field.shape[0]}^2 "
+        f"{name:5s} {n_modes:4d} modes {n_frames:3d} x {n_pixels:3d}^2 on {model.window.field.shape[0]}^2 "
         f"{str(dtype)[6:]:8s} bare {1e3 * bare:7.2f} ms   cost and gradient {1e3 * ours:7.2f} ms   "
         f"ratio {ours / bare:5.2f}"
     )

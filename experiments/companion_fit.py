@@ -18,8 +18,9 @@ from torch.func import jacfwd
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture
+from torchmask.optics.band import Band
 from torchmask.record import Callback, Record
-from torchmask.restoration.model import ExposureModel
+from torchmask.restoration.forward import ExposureModel
 
 STATIC_RMS, OWN_RMS = 0.3, 0.02  # [rad] expected sizes of the common aberrations, and of those of one exposure
 OWN_MODES = 3  # piston, tip and tilt of every hole
@@ -114,8 +115,8 @@ class CompanionModel:
     ) -> None:
         self.grid, self.radius, self.flux_error = grid, radius, flux_error
         self.n_sub, self.n_modes = aperture.n_subapertures, n_modes
-        self.optics = ExposureModel(aperture, grid, n_modes, margin=_MARGIN, wavelengths=wavelengths, weights=weights)
-        rows, columns = self.optics.field.shape
+        self.optics = ExposureModel(aperture, grid, n_modes, Band.of(wavelengths, weights), _MARGIN)
+        rows, columns = self.optics.window.field.shape
         self._nu_y = torch.fft.fftfreq(rows, dtype=torch.float64)[:, None]
         self._nu_x = torch.fft.rfftfreq(columns, dtype=torch.float64)
         self._pixel = torch.sinc(self._nu_y) * torch.sinc(self._nu_x)
@@ -133,7 +134,7 @@ class CompanionModel:
         spread = torch.exp(-2 * math.pi**2 * (blur[0] * self._nu_y**2 + blur[1] * self._nu_x**2))
         transfer = torch.fft.rfft2(self.optics.psf(aberrations[None])[0] * self._cells) * (flux * spread * self._pixel)
         sky = self._shift(y, x) * (1 + contrast * self._shift(offset[0], offset[1]))
-        image = torch.fft.irfft2(transfer * sky, s=self.optics.field.shape)
+        image = torch.fft.irfft2(transfer * sky, s=self.optics.window.field.shape)
         return image[: self.grid.shape[0], : self.grid.shape[1]] + background
 
     def fit(
@@ -193,9 +194,11 @@ class CompanionModel:
         crossed = torch.zeros(len(vector), len(offsets), dtype=torch.float64)
         for t in range(len(exposures.frames)):
             residual, jacobian = self._linear(exposures, t, star.shared, star.own[t], star.companion, False, weight[t])
-            transfer = torch.fft.rfft2(star.images[t] - star.own[t, 1], s=self.optics.field.shape)
+            transfer = torch.fft.rfft2(star.images[t] - star.own[t, 1], s=self.optics.window.field.shape)
             moved = (offsets @ exposures.to_pixels[t].T)[:, :, None, None]
-            shifted = torch.fft.irfft2(transfer * self._shift(moved[:, 0], moved[:, 1]), s=self.optics.field.shape)
+            shifted = torch.fft.irfft2(
+                transfer * self._shift(moved[:, 0], moved[:, 1]), s=self.optics.window.field.shape
+            )
             window = shifted[:, : self.grid.shape[0], : self.grid.shape[1]]
             template = (window * weight[t])[:, self._near]  # (M, pixels)
             aligned += template @ residual

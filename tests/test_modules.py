@@ -22,8 +22,7 @@ from torchmask.optics.detector import Detector
 from torchmask.optics.otf import OTF
 from torchmask.optics.psf import PSF
 from torchmask.optics.zernike import ZernikePhase
-from torchmask.restoration.model import ExposureModel
-from torchmask.restoration.myopic import MyopicDeconvolution
+from torchmask.restoration.forward import ExposureModel
 from torchmask.spectra import NoisePSD, PowerLawPSD
 
 GRID = Grid.nyquist(1.0, 550e-9, 32)
@@ -52,13 +51,6 @@ def random(*shape, dtype):
     return torch.rand(*shape, generator=seeded(), dtype=torch.float64, device="cpu").to(dtype)
 
 
-def restored(module: MyopicDeconvolution, dtype: torch.dtype) -> Tensor:
-    frames = torch.zeros(2, 32, 32, dtype=dtype, device="cpu")
-    frames[:, 10:22, 10:22] = torch.ceil(1e4 * random(2, 12, 12, dtype=dtype))
-    result = module.restore(frames)
-    return torch.cat([result.object.flatten(), result.coefficients.flatten()])
-
-
 @dataclass(frozen=True)
 class Entry:
     """How to make a module, the same with another state (or None: it has none), and how to call it."""
@@ -83,7 +75,9 @@ def turbulent(module: TurbulencePhase, dtype: torch.dtype) -> Tensor:
 
 
 def exposed(module: ExposureModel, dtype: torch.dtype) -> Tensor:
-    return module(random(*module.field.shape, dtype=dtype), random(2, module.n_parameters, dtype=dtype))
+    return module(
+        random(*module.window.field.shape, dtype=dtype), random(2, module.aberrations.n_parameters, dtype=dtype)
+    )
 
 
 MODULES: dict[str, Entry] = {
@@ -109,12 +103,6 @@ MODULES: dict[str, Entry] = {
         lambda module, dtype: module(1e3 * random(8, 8, dtype=dtype), seeded()),
     ),
     "exposure model": Entry(lambda: ExposureModel(mask(), GRID, 4), exposed, lambda: ExposureModel(moved(), GRID, 4)),
-    "myopic deconvolution": Entry(
-        lambda: MyopicDeconvolution(mask(), GRID, 3, max_iterations=3),
-        restored,
-        lambda: MyopicDeconvolution(moved(), GRID, 3, max_iterations=3),
-        result=torch.float64,
-    ),
 }
 each_module = pytest.mark.parametrize("entry", MODULES.values(), ids=MODULES)
 
@@ -196,9 +184,9 @@ def test_a_module_moves_to_a_gpu(entry):
         lambda aperture: ZernikePhase(aperture, GRID, 3),
         lambda aperture: PSF(aperture, GRID),
         lambda aperture: OTF(aperture, GRID),
-        lambda aperture: MyopicDeconvolution(aperture, GRID, 3),
+        lambda aperture: ExposureModel(aperture, GRID, 3),
     ],
-    ids=["mask", "Zernike phase", "PSF", "OTF", "myopic deconvolution"],
+    ids=["mask", "Zernike phase", "PSF", "OTF", "exposure model"],
 )
 def test_a_parameter_stays_that_very_object(make):
     centers = nn.Parameter(CENTERS.clone())

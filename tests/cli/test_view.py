@@ -116,8 +116,8 @@ def test_a_stack_is_summed_up(tmp_path, capsys):
 def result():
     frames = torch.ones(3, 16, 16, dtype=torch.float64)
     values = {"object": frames[0], "extended_object": frames[0], "coefficients": torch.zeros(3, 6, 3)}
-    values |= {"gains": torch.ones(3), "model": frames, "residuals": frames, "chi_square": torch.ones(3)}
-    numbers = {"tv_weight": 1.0, "r0": 0.1, "noise": 1.0, "cost": torch.ones(7), "converged": True}
+    values |= {"transmission": torch.ones(3), "model": frames, "residuals": frames, "chi_square": torch.ones(3)}
+    numbers = {"prior": "TotalVariation()", "r0": 0.1, "noise": 1.0, "cost": torch.ones(7), "converged": True}
     return RestorationResult(**values, **numbers, message="converged", n_evaluations=9, seconds=2.0)
 
 

@@ -77,11 +77,11 @@ def result_for(observation):
         "coefficients": torch.zeros(n, observation.aperture.n_subapertures, 6),
         "chi_square": torch.linspace(0.9, 1.3, n),
     }
-    rest = {name: torch.ones(n) for name in ("gains", "model", "residuals", "cost")}
+    rest = {name: torch.ones(n) for name in ("transmission", "model", "residuals", "cost")}
     return RestorationResult(
         **values,
         **rest,
-        tv_weight=1.0,
+        prior="TotalVariation()",
         r0=math.nan,
         noise=2.5,
         converged=True,

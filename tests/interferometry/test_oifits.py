@@ -100,13 +100,13 @@ def dimming(shift, cutoff):
 
 
 def result_of(scene, mask, n_frames=1, noise=1.0, n_modes=3):
-    ones = dict.fromkeys(("gains", "model", "residuals", "chi_square", "cost"), torch.ones(n_frames))
+    ones = dict.fromkeys(("transmission", "model", "residuals", "chi_square", "cost"), torch.ones(n_frames))
     return RestorationResult(
         object=scene,
         extended_object=scene,
         coefficients=torch.zeros(n_frames, mask.n_subapertures, n_modes, dtype=torch.float64),
         **ones,
-        tv_weight=1.0,
+        prior="TotalVariation()",
         r0=1.0,
         noise=noise,
         converged=True,

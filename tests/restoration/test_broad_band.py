@@ -4,13 +4,13 @@ import math
 
 import pytest
 import torch
+from torchmask.restoration.model import ExposureModel, weighted_misfit
+from torchmask.restoration.problem import JointProblem, State
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.zernike import ZernikePhase
-from torchmask.restoration.model import ExposureModel, weighted_misfit
 from torchmask.restoration.myopic import MyopicDeconvolution
-from torchmask.restoration.problem import JointProblem, State
 
 GRID = Grid((12, 15), 2.3e-7, 550e-9)
 BAND = {"wavelengths": (500e-9, 550e-9, 610e-9), "weights": (1.0, 2.0, 3.0)}

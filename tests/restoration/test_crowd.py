@@ -6,6 +6,10 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from torchmask.restoration.crowd import ITERATIONS, N_CANDIDATES, crowd, select
+from torchmask.restoration.model import ExposureModel
+from torchmask.restoration.problem import JointProblem, State
+from torchmask.restoration.run import Restoration
 
 from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.grid import Grid
@@ -13,11 +17,7 @@ from torchmask.metrics import relative_error
 from torchmask.optics.aperture import FullAperture
 from torchmask.optics.detector import Detector
 from torchmask.record import Record
-from torchmask.restoration.crowd import ITERATIONS, N_CANDIDATES, crowd, select
-from torchmask.restoration.model import ExposureModel
 from torchmask.restoration.myopic import MyopicDeconvolution
-from torchmask.restoration.problem import JointProblem, State
-from torchmask.restoration.run import Restoration
 from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
 

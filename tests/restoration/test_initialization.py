@@ -4,9 +4,6 @@ import math
 
 import pytest
 import torch
-
-from torchmask.grid import Grid
-from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.restoration.initialization import (
     border_brightness,
     check_frames,
@@ -15,6 +12,9 @@ from torchmask.restoration.initialization import (
     noise_variance,
     turbulence_strength,
 )
+
+from torchmask.grid import Grid
+from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.restoration.priors import whitening
 
 GRID = Grid.nyquist(1.0, 550e-9, 32)

@@ -9,10 +9,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import Bounds, minimize
+from torchmask.restoration.lbfgsb import Corrections, minimize_bounded
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import SparseAperture
-from torchmask.restoration.lbfgsb import Corrections, minimize_bounded
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.priors import total_variation
 

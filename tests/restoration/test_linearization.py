@@ -4,11 +4,11 @@ import math
 
 import pytest
 import torch
+from torchmask.restoration.model import ExposureModel
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import SparseAperture
 from torchmask.restoration.linearization import Linearization
-from torchmask.restoration.model import ExposureModel
 
 GRID = Grid.nyquist(1.0, 550e-9, (20, 24))
 

@@ -4,12 +4,12 @@ import math
 
 import pytest
 import torch
+from torchmask.restoration.model import ExposureModel, fast_size, weighted_misfit
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.psf import psf_from_samples
 from torchmask.optics.zernike import ZernikePhase
-from torchmask.restoration.model import ExposureModel, fast_size, weighted_misfit
 
 GRID = Grid((12, 15), 2.75e-7, 550e-9)
 

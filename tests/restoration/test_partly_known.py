@@ -4,11 +4,11 @@ import math
 
 import pytest
 import torch
+from torchmask.restoration.model import ExposureModel
 
 from torchmask.grid import Grid
 from torchmask.metrics import relative_error
 from torchmask.optics.aperture import SparseAperture
-from torchmask.restoration.model import ExposureModel
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.priors import root, whitening
 

@@ -4,6 +4,8 @@ import math
 
 import pytest
 import torch
+from torchmask.restoration.model import ExposureModel
+from torchmask.restoration.problem import JointProblem, State
 
 from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.grid import Grid
@@ -11,7 +13,6 @@ from torchmask.metrics import align, lowpass
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.detector import Detector
 from torchmask.restoration.conjugate import conjugate_gradients
-from torchmask.restoration.model import ExposureModel
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.posterior import (
     _bias,
@@ -22,7 +23,6 @@ from torchmask.restoration.posterior import (
     smooth,
 )
 from torchmask.restoration.priors import divergence, gradient, whitening
-from torchmask.restoration.problem import JointProblem, State
 from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
 

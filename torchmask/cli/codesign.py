@@ -68,8 +68,8 @@ class RestorationOptions:
     """Noll modes, from piston, per sub-aperture (or over the full pupil); None: the library's choice for each."""
     prior: bool = True
     """Weigh aberrations by their von Karman statistics."""
-    max_iterations: int = 700
-    """Upper limit of iterations."""
+    max_iterations: int = 2800
+    """Upper limit of iterations, of all starts together; one start takes 1000 at most."""
 
 
 @dataclass(frozen=True)

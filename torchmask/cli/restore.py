@@ -22,6 +22,7 @@ from torchmask.io import write_json
 from torchmask.metrics import relative_error, ssim
 from torchmask.observation import Observation
 from torchmask.restoration.myopic import MyopicDeconvolution
+from torchmask.restoration.priors import TotalVariation
 from torchmask.restoration.result import RestorationResult
 from torchmask.viz import figures as viz
 
@@ -87,8 +88,8 @@ class Options(MaskOptions, FITSOptions, RunOptions):
     """Weigh aberrations by their von Karman statistics."""
     tv_weight: float = 1.0
     """Of the total variation of the object, without unit: more is smoother."""
-    max_iterations: int = 1000
-    """Upper limit of iterations."""
+    max_iterations: int = 4000
+    """Upper limit of iterations, of all starts together; one start takes 1000 at most."""
     tolerance: float = 1e-4
     """Converged when 100 iterations lower the cost by less than this fraction."""
     n_samples: int = 0
@@ -113,7 +114,7 @@ def run(options: Options) -> None:
         wavelengths=options.wavelengths or None,
         weights=options.weights or None,
         static_modes=options.static_modes,
-        tv_weight=options.tv_weight,
+        prior=TotalVariation(options.tv_weight),
         aberration_prior=options.prior,
         max_iterations=options.max_iterations,
         tolerance=options.tolerance,

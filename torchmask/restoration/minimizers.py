@@ -37,8 +37,8 @@ class TorchMinimizer:
     >>> from functools import partial
     >>> target = torch.tensor([1.0, -2.0], dtype=torch.float64)
     >>> def cost(x): return float(((x - target) ** 2).sum()), 2 * (x - target)
-    >>> minimizer = TorchMinimizer(partial(torch.optim.SGD, lr=0.25))
-    >>> minimizer(cost, torch.zeros(2).double(), torch.zeros(2).double(), max_iterations=60).x
+    >>> minimizer = TorchMinimizer(partial(torch.optim.SGD, lr=0.5))
+    >>> minimizer(cost, torch.zeros(2).double(), torch.zeros(2).double(), max_iterations=3).x
     tensor([1., 0.], dtype=torch.float64)
     """
 

@@ -123,7 +123,7 @@ class EdgePreserving(ObjectPrior):
     Examples
     --------
     >>> image = torch.zeros(4, 4, dtype=torch.float64); image[1, 1] = 1e-3
-    >>> round(float(EdgePreserving()(image)) / (0.5 * 4e-6), 2)  # half the squares of four small slopes
+    >>> round(float(EdgePreserving(weight=1.0)(image)) / (0.5 * 4e-6), 2)  # half the squares of four small slopes
     1.0
     """
 

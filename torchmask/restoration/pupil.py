@@ -90,6 +90,7 @@ class SampledPupil(nn.Module):
                 values = values.to(device) if name == "index" else values.to(**kwargs)
                 self.register_buffer(name, values, persistent=False)
         self.register_buffer("centers", aperture.centers.detach().clone(), persistent=False)
+        self.register_load_state_dict_post_hook(_forget)
 
     def samples(self) -> OpenSamples:
         """The open samples of the aperture where it lies now."""
@@ -127,3 +128,8 @@ class SampledPupil(nn.Module):
         ratio = self.grid.wavelength / wavelength
         chromaticity = weights.new_full((len(weights),), ratio)
         return OpenSamples(weights / scale, samples.index[is_open], mixed * ratio, positions, chromaticity)
+
+
+def _forget(pupil: SampledPupil, keys: object) -> None:
+    """Have the samples evaluated anew: another aberration basis may have been loaded."""
+    pupil.centers.fill_(math.nan)
