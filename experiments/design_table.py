@@ -12,51 +12,49 @@ positions). The same folder again goes on where a run was stopped, and wider axe
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal
 
 import tyro
 
+from torchmask.cli.options import DebugOptions, WorkerOptions
+from torchmask.cli.program import run_script
 from torchmask.design.space import DesignSpace
 from torchmask.design.table import design_table
 from torchmask.progress import Progress
 
 
-@dataclass(frozen=True)
-class Config:
-    """Everything a run depends on."""
+@dataclass(frozen=True, kw_only=True)
+class Options(WorkerOptions, DebugOptions):
+    """What the table depends on."""
 
-    folder: Annotated[Path, tyro.conf.Positional]
+    folder: tyro.conf.Positional[Path]
     """Of the tasks and the table."""
     space: DesignSpace = field(default_factory=DesignSpace)
     """What is varied and what is held fixed: see `torchmask.design.space.DesignSpace`."""
-    workers: int | None = None
-    """Tasks at a time; None: one per core."""
-    backend: Literal["loky", "ray"] = "loky"
-    """This machine or a Ray cluster."""
     smoke: bool = False
     """Everything tiny, to see that it runs."""
 
 
-def main(config: Config) -> int:
+def run(options: Options) -> None:
     """Fill the table, or go on with it."""
-    space = config.space
-    if config.smoke:
+    space = options.space
+    if options.smoke:
         space = replace(space, n_subapertures=(3, 5), n_pixels=32, n_frames=(2,), n_draws=2, budget=64)
     try:
         with Progress() as progress:
-            options = {"backend": config.backend, "n_workers": config.workers}
-            table = design_table(space, config.folder, callback=progress, **options)
+            table = design_table(space, options.folder, **options.keywords(progress))
     except KeyboardInterrupt:
-        print(f"\ninterrupted: call again with {config.folder} to go on", file=sys.stderr)
-        return 130
-    except ValueError as problem:
-        print(f"design_table: {problem}", file=sys.stderr)
-        return 2
-    print(table, f"\nwritten to {config.folder}", sep="\n")
-    return 0
+        print(f"\ncall again with {options.folder} to go on", file=sys.stderr)
+        raise
+    print(table, f"\nwritten to {options.folder}", sep="\n")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The exit status."""
+    return run_script("design_table", run, Options, __doc__, argv)
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Config, description=__doc__)))
+    sys.exit(main())

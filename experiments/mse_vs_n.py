@@ -5,7 +5,7 @@
     python experiments/mse_vs_n.py --smoke                           # everything, tiny, in seconds
 
 MSE_a, of several searches each, and beside it the mean Wiener MSE of the same masks under full von Karman screens. The
-picture, the numbers and what they say go to a new folder, runs/<name>/; searches and draws are kept in --sweep, one
+picture, the numbers and what they say go to a new folder; searches and draws are kept in --sweep, one
 file each, so that a run that was stopped goes on, and experiments/optimal_masks.py shares them.
 """
 
@@ -17,16 +17,13 @@ import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import datetime
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
-import tyro
+from searched_masks import SearchedMaskOptions, design_space, error
 
-from torchmask.design.space import Design, DesignSpace
+from torchmask.cli.program import run_script
+from torchmask.cli.run import new_run
 from torchmask.design.table import DesignTable, design_table
-from torchmask.io import atomic_write, write_json
-from torchmask.progress import Progress
 from torchmask.viz.style import COLORS, FAINT, INK, PALE, new_figure, styled
 
 if TYPE_CHECKING:
@@ -36,75 +33,27 @@ _FLAT = (0.85, 0.97)  # shares of the whole drop between which the curve is said
 _TOUCHING = 6.0121  # piston structure function of two touching holes [(d/r0)^(5/3)], Kolmogorov, by integration
 
 
-@dataclass(frozen=True)
-class Config:
-    """Everything a run depends on."""
+@dataclass(frozen=True, kw_only=True)
+class Options(SearchedMaskOptions):
+    """What the curve depends on."""
 
-    n_subapertures: tuple[int, ...] = tuple(range(3, 21))
-    """Numbers of holes, N."""
-    fill_factor: float = 0.15
-    """Collecting area N d^2 / D^2."""
-    n_photons: float = 1e7
-    """Per exposure."""
-    n_frames: int = 20
-    """Exposures, K."""
-    exponent: float = 1.5
-    """Of the power-law power spectrum of the object."""
     d_over_r0: float = 7.0
     """Strength of the turbulence, D / r0."""
     max_hole_over_r0: float = 1.5
     """Largest holes that are tried in that turbulence, d / r0."""
     n_draws: int = 4
     """Stacks of K exposures drawn through each mask."""
-    n_pixels: int = 256
-    """Frequency grid, per side."""
-    seed: tuple[int, ...] = (0, 1)
-    """Of the searches; their scatter is that of the curve."""
-    budget: int = 10_000
-    """Evaluations of each search."""
-    workers: int | None = None
-    """Processes at a time; None: one per core."""
-    backend: Literal["loky", "ray"] = "loky"
-    """This machine or a Ray cluster."""
-    smoke: bool = False
-    """Everything tiny, to see that it runs."""
-    name: str | None = None
-    """Folder of the run below `runs`; None: date and time."""
-    runs: Path = Path("runs")
-    """Where run folders are made."""
-    sweep: Path = Path("runs/sweep")
-    """Where searches and draws are kept, to go on after an interruption."""
 
 
-def space(config: Config, turbulence: bool) -> DesignSpace:
-    """One search for each N and seed; under turbulence without the holes that are too large for it."""
-    return DesignSpace(
-        n_subapertures=config.n_subapertures,
-        fill_factor=(config.fill_factor,),
-        n_photons=(config.n_photons,),
-        reference_fill_factor=config.fill_factor,
-        n_frames=(config.n_frames,),
-        diameter_over_r0=(config.d_over_r0,) if turbulence else (),
-        max_hole_over_r0=config.max_hole_over_r0,
-        seed=config.seed,
-        n_pixels=config.n_pixels,
-        exponent=config.exponent,
-        n_draws=config.n_draws,
-        budget=config.budget,
-    )
-
-
-def curve(config: Config, still: DesignTable, turbulent: DesignTable) -> list[dict[str, Any]]:
+def curve(options: Options, still: DesignTable, turbulent: DesignTable) -> list[dict[str, Any]]:
     """A row for each N: the best of the searches, their scatter, and the turbulence at the best."""
     rows = []
-    for n in config.n_subapertures:
+    for n in options.n_subapertures:
         found = [row for row in still.rows if row.n_subapertures == n]
-        if any(row.infeasible for row in found):
-            raise ValueError(f"no mask of {n} holes: {found[0].infeasible}")
         errors = [error(row) for row in found]
         best = found[errors.index(min(errors))]
         (measured,) = (row for row in turbulent.rows if (row.n_subapertures, row.seed) == (n, best.seed))
-        hole = best.subaperture_diameter / still.space.mask_diameter * config.d_over_r0
+        hole = best.subaperture_diameter / still.space.mask_diameter * options.d_over_r0
         rows.append(
             {
                 "n_subapertures": n,
@@ -120,12 +69,6 @@ def curve(config: Config, still: DesignTable, turbulent: DesignTable) -> list[di
             }
         )
     return rows
-
-
-def error(row: Design) -> float:
-    """Relative MSE_a of a row that has a mask."""
-    assert row.relative_mse is not None
-    return row.relative_mse
 
 
 def rises(rows: Sequence[dict[str, Any]]) -> list[tuple[int, int, float, float]]:
@@ -146,7 +89,7 @@ def reached(rows: Sequence[dict[str, Any]], share: float) -> int:
     return next(row["n_subapertures"] for row, value in zip(rows, errors, strict=True) if value <= goal)
 
 
-def findings(config: Config, rows: Sequence[dict[str, Any]]) -> list[str]:
+def findings(options: Options, rows: Sequence[dict[str, Any]]) -> list[str]:
     """What the numbers say, in sentences."""
     first, last = rows[0], rows[-1]
     begin, end = (reached(rows, share) for share in _FLAT)
@@ -160,7 +103,7 @@ def findings(config: Config, rows: Sequence[dict[str, Any]]) -> list[str]:
         for a, b in itertools.pairwise(rows)
     ]
     lines.append(f"What each further hole gains: {'; '.join(steps)}.")
-    lines.append(f"Scatter of {len(config.seed)} searches: at most {100 * max(r['scatter'] for r in rows):.2f} %.")
+    lines.append(f"Scatter of {len(options.seed)} searches: at most {100 * max(r['scatter'] for r in rows):.2f} %.")
     up = rises(rows)
     if up:
         worse = "; ".join(f"{a} to {b} by {100 * r:.2f} % (scatter {100 * s:.2f} %)" for a, b, r, s in up)
@@ -169,12 +112,12 @@ def findings(config: Config, rows: Sequence[dict[str, Any]]) -> list[str]:
     else:
         lines.append("The curve never goes up.")
     if any(row["n_subapertures"] == 11 for row in rows[:-1]):
-        lines.append(judge_eleven(config, rows, begin, end))
+        lines.append(judge_eleven(options, rows, begin, end))
     tried = [row for row in rows if row["wiener_mse"] is not None]
     ratios = [row["wiener_mse"] / row["relative_mse"] - 1 for row in tried]
     lines.append(
-        f"Under von Karman screens of D/r0 = {config.d_over_r0:g} the Wiener MSE of {config.n_frames} exposures, with "
-        f"every OTF known, differs from MSE_a by {100 * min(ratios):+.2f} to {100 * max(ratios):+.2f} %."
+        f"Under von Karman screens of D/r0 = {options.d_over_r0:g} the Wiener MSE of {options.n_frames} exposures, "
+        f"with every OTF known, differs from MSE_a by {100 * min(ratios):+.2f} to {100 * max(ratios):+.2f} %."
     )
     lines += [
         f"N = {row['n_subapertures']} is not tried in turbulence: {row['not_tried_in_turbulence']}."
@@ -184,7 +127,7 @@ def findings(config: Config, rows: Sequence[dict[str, Any]]) -> list[str]:
     return lines
 
 
-def judge_eleven(config: Config, rows: Sequence[dict[str, Any]], begin: int, end: int) -> str:
+def judge_eleven(options: Options, rows: Sequence[dict[str, Any]], begin: int, end: int) -> str:
     """What N = 11 gives up, and what it spares."""
     first, last = rows[0], rows[-1]
     own = next(row for row in rows if row["n_subapertures"] == 11)
@@ -195,23 +138,23 @@ def judge_eleven(config: Config, rows: Sequence[dict[str, Any]], begin: int, end
     return (
         f"By this measure N = 11 {verdict}: it has made {100 * share:.0f} % of the drop, and all {more - 11} further "
         f"holes together lower the MSE by {rest:.0f} %. Each hole adds its aberrations to what the restoration must "
-        f"find, and holes shrink: at D/r0 = {config.d_over_r0:g} those of N = 11 are {own['hole_over_r0']:.2f} r0 wide "
-        f"and touching ones keep a coherence of {own['coherence_of_touching_holes']:.2f}; at N = {more} it is "
+        f"find, and holes shrink: at D/r0 = {options.d_over_r0:g} those of N = 11 are {own['hole_over_r0']:.2f} r0 "
+        f"wide and touching ones keep a coherence of {own['coherence_of_touching_holes']:.2f}; at N = {more} it is "
         f"{last['hole_over_r0']:.2f} r0 and {last['coherence_of_touching_holes']:.2f}, so that independent pistons, on "
         "which MSE_a rests, hold less."
     )
 
 
-def markdown(config: Config, rows: Sequence[dict[str, Any]]) -> str:
+def markdown(options: Options, rows: Sequence[dict[str, Any]]) -> str:
     """The numbers, for readers."""
     lines = [
         "# Relative MSE against the number of holes",
         "",
-        f"D = 1 m, N d^2 / D^2 = {config.fill_factor:g}, p = {config.exponent:g}, {config.n_photons:g} photons, "
-        f"K = {config.n_frames}, {config.n_pixels} frequencies a side; {len(config.seed)} searches of {config.budget} "
-        f"evaluations. ± is one standard error of {config.n_draws} stacks of exposures.",
+        f"D = 1 m, N d^2 / D^2 = {options.fill_factor:g}, p = {options.exponent:g}, {options.n_photons:g} photons, "
+        f"K = {options.n_frames}, {options.n_pixels} frequencies a side; {len(options.seed)} searches of "
+        f"{options.budget} evaluations. ± is one standard error of {options.n_draws} stacks of exposures.",
         "",
-        *(f"- {line}" for line in findings(config, rows)),
+        *(f"- {line}" for line in findings(options, rows)),
         "",
         "| N | relative MSE | above the floor | scatter | Wiener MSE in turbulence | d/r0 | coherence of neighbours |",
         "|---|---|---|---|---|---|---|",
@@ -229,7 +172,7 @@ def markdown(config: Config, rows: Sequence[dict[str, Any]]) -> str:
 
 
 @styled
-def figure(config: Config, rows: Sequence[dict[str, Any]]) -> Figure:
+def figure(options: Options, rows: Sequence[dict[str, Any]]) -> Figure:
     """The curve, all searches, the floor and the turbulence; below, what each further hole gains."""
     sheet = new_figure(6.4, 5.4)
     top, bottom = sheet.subplots(2, 1, sharex=True, height_ratios=[2.2, 1])
@@ -250,7 +193,7 @@ def figure(config: Config, rows: Sequence[dict[str, Any]]) -> Figure:
         markerfacecolor="none",
         linestyle="none",
         capsize=2,
-        label=f"Wiener MSE, D/r$_0$ = {config.d_over_r0:g}",
+        label=f"Wiener MSE, D/r$_0$ = {options.d_over_r0:g}",
     )
     top.axhline(floor, color=FAINT, linestyle="--", linewidth=0.9)
     top.text(n[-1], 0.96 * floor, "no mask can change this", color=INK, va="top", ha="right", fontsize=8)
@@ -267,34 +210,25 @@ def figure(config: Config, rows: Sequence[dict[str, Any]]) -> Figure:
     return sheet
 
 
-def main(config: Config) -> int:
-    """Run in a new folder."""
-    directory = config.runs / (config.name or datetime.now().strftime("mse_vs_n-%Y%m%d-%H%M%S"))
-    if config.smoke:
-        config = dataclasses.replace(config, n_subapertures=(3, 4, 5), n_pixels=64, n_frames=2, n_draws=2, budget=200)
-    try:
-        if directory.exists():
-            raise ValueError(f"{directory} exists and is not overwritten: choose another --name")
-        with Progress() as progress:
-            options: dict[str, Any] = {"backend": config.backend, "n_workers": config.workers, "callback": progress}
-            still = design_table(space(config, turbulence=False), config.sweep, **options)
-            turbulent = design_table(space(config, turbulence=True), config.sweep, **options)
-        rows = curve(config, still, turbulent)
-        directory.mkdir(parents=True)
-        write_json(directory / "mse_vs_n.json", {"config": config, "rows": rows})
-        with atomic_write(directory / "mse_vs_n.md") as file:
-            file.write(markdown(config, rows).encode())
-        with atomic_write(directory / "mse_vs_n.png") as file:
-            figure(config, rows).savefig(file, format="png")
-    except KeyboardInterrupt:
-        print(f"\ninterrupted: call again with --sweep {config.sweep} to go on", file=sys.stderr)
-        return 130
-    except ValueError as problem:
-        print(f"mse_vs_n: {problem}", file=sys.stderr)
-        return 2
-    print(*findings(config, rows), f"written to {directory}", sep="\n")
-    return 0
+def run(options: Options) -> None:
+    """Search, expose, and draw the curve in a new folder."""
+    if options.smoke:
+        tiny = {"n_subapertures": (3, 4, 5), "n_pixels": 64, "n_frames": 2, "n_draws": 2, "budget": 200}
+        options = dataclasses.replace(options, **tiny)
+    # Under turbulence without the holes that are too large for it.
+    turbulence = {"diameter_over_r0": (options.d_over_r0,), "max_hole_over_r0": options.max_hole_over_r0}
+    spaces = [design_space(options), design_space(options, n_draws=options.n_draws, **turbulence)]
+    with new_run("mse_vs_n", options) as output:
+        keywords = options.keywords(output.callback)
+        rows = curve(options, *(design_table(space, options.sweep, **keywords) for space in spaces))
+        output.report("mse_vs_n", {"rows": rows}, markdown(options, rows), figure(options, rows))
+        output.summary.extend(findings(options, rows))
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The exit status."""
+    return run_script("mse_vs_n", run, Options, __doc__, argv)
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Config, description=__doc__)))
+    sys.exit(main())

@@ -49,10 +49,10 @@ from torchmask.io import save_npz, write_json
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.band import FILTERS
 from torchmask.progress import Progress
-from torchmask.record import Callback, Record
+from torchmask.record import Callback, Record, fan_out
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.result import RestorationResult
-from torchmask.tracking import RunLogger, fan_out
+from torchmask.tracking import RunLogger
 
 MASK, FILTER = "jwst_niriss_ami_7", FILTERS[("NIRISS", "F480M")]  # (wavelength, width) [m], its source beside it
 GAIN = 1.61  # electrons per DN: NIRISS detector performance, JWST user documentation

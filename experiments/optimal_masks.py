@@ -5,7 +5,7 @@
     python experiments/optimal_masks.py --smoke                           # everything, tiny, in seconds
 
 Case: D = 1 m, 550 nm, Nyquist, photon noise. The picture, the numbers and the masks themselves (JSON, for `load_mask`)
-go to a new folder, runs/<name>/; the searches are kept in --sweep, one file each, so that a run that was stopped goes
+go to a new folder; the searches are kept in --sweep, one file each, so that a run that was stopped goes
 on, and experiments/mse_vs_n.py shares them.
 """
 
@@ -15,20 +15,17 @@ import dataclasses
 import math
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
-from datetime import datetime
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
-import tyro
+from searched_masks import SearchedMaskOptions, design_space, error
 
+from torchmask.cli.program import run_script
+from torchmask.cli.run import new_run
 from torchmask.design.manufacture import save_json
 from torchmask.design.redundancy import analyse_redundancy
-from torchmask.design.space import Design, DesignSpace
+from torchmask.design.space import Design
 from torchmask.design.table import DesignTable, design_table
-from torchmask.io import atomic_write, write_json
 from torchmask.optics.aperture import SparseAperture
-from torchmask.progress import Progress
 from torchmask.viz.style import COLORS, FAINT, INK, PALE, hole, new_figure, styled
 
 if TYPE_CHECKING:
@@ -36,72 +33,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-@dataclass(frozen=True)
-class Config:
-    """Everything a run depends on."""
-
-    n_subapertures: tuple[int, ...] = tuple(range(3, 21))
-    """Numbers of holes, N."""
-    fill_factor: float = 0.15
-    """Collecting area N d^2 / D^2."""
-    n_photons: float = 1e7
-    """Per exposure."""
-    n_frames: int = 20
-    """Exposures, K."""
-    exponent: float = 1.5
-    """Of the power-law power spectrum of the object."""
-    n_pixels: int = 256
-    """Frequency grid of the criterion, per side."""
-    seed: tuple[int, ...] = (0, 1)
-    """Of the searches; the best is shown."""
-    budget: int = 10_000
-    """Evaluations of each search."""
-    workers: int | None = None
-    """Processes at a time; None: one per core."""
-    backend: Literal["loky", "ray"] = "loky"
-    """This machine or a Ray cluster."""
-    smoke: bool = False
-    """Everything tiny, to see that it runs."""
-    name: str | None = None
-    """Folder of the run below `runs`; None: date and time."""
-    runs: Path = Path("runs")
-    """Where run folders are made."""
-    sweep: Path = Path("runs/sweep")
-    """Where searches are kept, to go on after an interruption."""
-
-
-def space(config: Config) -> DesignSpace:
-    """One search for each N and seed."""
-    return DesignSpace(
-        n_subapertures=config.n_subapertures,
-        fill_factor=(config.fill_factor,),
-        n_photons=(config.n_photons,),
-        reference_fill_factor=config.fill_factor,
-        n_frames=(config.n_frames,),
-        diameter_over_r0=(),
-        seed=config.seed,
-        n_pixels=config.n_pixels,
-        exponent=config.exponent,
-        budget=config.budget,
-    )
-
-
 def best_of_seeds(table: DesignTable) -> list[Design]:
     """The best row of each N."""
     best: dict[int, Design] = {}
     for row in table.rows:
-        if row.infeasible is not None:
-            raise ValueError(f"no mask of {row.n_subapertures} holes: {row.infeasible}")
         known = best.get(row.n_subapertures)
         if known is None or error(row) < error(known):
             best[row.n_subapertures] = row
     return list(best.values())
-
-
-def error(row: Design) -> float:
-    """Relative MSE_a of a row that has a mask."""
-    assert row.relative_mse is not None
-    return row.relative_mse
 
 
 def numbers(table: DesignTable) -> list[dict[str, Any]]:
@@ -130,14 +69,14 @@ def numbers(table: DesignTable) -> list[dict[str, Any]]:
     return rows
 
 
-def markdown(config: Config, rows: Sequence[dict[str, Any]]) -> str:
+def markdown(options: SearchedMaskOptions, rows: Sequence[dict[str, Any]]) -> str:
     """The numbers, for readers."""
     lines = [
         "# Optimal masks",
         "",
-        f"D = 1 m, N d^2 / D^2 = {config.fill_factor:g}, p = {config.exponent:g}, {config.n_photons:g} photons, "
-        f"K = {config.n_frames}, {config.n_pixels} frequencies a side; the best of {len(config.seed)} searches of "
-        f"{config.budget} evaluations. `Above the floor` is what a mask can change: frequencies beyond the reach of "
+        f"D = 1 m, N d^2 / D^2 = {options.fill_factor:g}, p = {options.exponent:g}, {options.n_photons:g} photons, "
+        f"K = {options.n_frames}, {options.n_pixels} frequencies a side; the best of {len(options.seed)} searches of "
+        f"{options.budget} evaluations. `Above the floor` is what a mask can change: frequencies beyond the reach of "
         f"any mask add {rows[0]['relative_mse'] - rows[0]['above_floor']:.4f}. `Scatter`: worst over best of the "
         "searches, less 1. u-v filling and gaps: of the disc of a full pupil, and of the disc out to the highest "
         "frequency.",
@@ -204,36 +143,25 @@ def draw_coverage(ax: Axes, mask: SparseAperture) -> None:
     ax.set(xlim=(-half, half), ylim=(-half, half), aspect="equal")
 
 
-def main(config: Config) -> int:
-    """Run in a new folder."""
-    directory = config.runs / (config.name or datetime.now().strftime("optimal_masks-%Y%m%d-%H%M%S"))
-    if config.smoke:
-        config = dataclasses.replace(config, n_subapertures=(3, 4, 5), n_pixels=64, budget=200)
-    try:
-        if directory.exists():
-            raise ValueError(f"{directory} exists and is not overwritten: choose another --name")
-        with Progress() as progress:
-            options: dict[str, Any] = {"backend": config.backend, "n_workers": config.workers, "callback": progress}
-            table = design_table(space(config), config.sweep, **options)
+def run(options: SearchedMaskOptions) -> None:
+    """Search, and draw the gallery in a new folder."""
+    if options.smoke:
+        options = dataclasses.replace(options, n_subapertures=(3, 4, 5), n_pixels=64, budget=200)
+    with new_run("optimal_masks", options) as output:
+        table = design_table(design_space(options), options.sweep, **options.keywords(output.callback))
         rows = numbers(table)
         masks = [table.aperture(row) for row in best_of_seeds(table)]
-        directory.mkdir(parents=True)
         for row, mask in zip(rows, masks, strict=True):
-            save_json(directory / f"optimal_{row['n_subapertures']}.json", mask)
-        write_json(directory / "optimal_masks.json", {"config": config, "rows": rows})
-        with atomic_write(directory / "optimal_masks.md") as file:
-            file.write(markdown(config, rows).encode())
-        with atomic_write(directory / "optimal_masks.png") as file:
-            gallery(rows, masks).savefig(file, format="png")
-    except KeyboardInterrupt:
-        print(f"\ninterrupted: call again with --sweep {config.sweep} to go on", file=sys.stderr)
-        return 130
-    except ValueError as problem:
-        print(f"optimal_masks: {problem}", file=sys.stderr)
-        return 2
-    print(markdown(config, rows), f"written to {directory}", sep="\n")
-    return 0
+            save_json(output.directory / f"optimal_{row['n_subapertures']}.json", mask)
+        text = markdown(options, rows)
+        output.report("optimal_masks", {"rows": rows}, text, gallery(rows, masks))
+        output.summary.append(text)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The exit status."""
+    return run_script("optimal_masks", run, SearchedMaskOptions, __doc__, argv)
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Config, description=__doc__)))
+    sys.exit(main())

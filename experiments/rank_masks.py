@@ -7,8 +7,8 @@
 Every pattern is laid afresh in a disc of 1 m: its smallest enclosing circle centred, its outermost holes touching the
 rim, its holes of one size such that all masks collect the same light. Hexagonal holes stay hexagons of the same area as
 the discs. A pattern whose holes would overlap at this area is not ranked, and the largest area it can carry is given.
-Case: 550 nm, Nyquist, p = 1.5, 1e7 photons, K = 20. The table, as CSV, markdown and JSON, and its picture go to a new
-folder, runs/<name>/.
+Case: 550 nm, Nyquist, p = 1.5, 1e7 photons, K = 20. The table, as CSV, markdown and JSON, its picture and
+our own masks go to a new folder.
 """
 
 from __future__ import annotations
@@ -20,23 +20,24 @@ import math
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import tyro
 from rich.console import Console
 from rich.table import Table
 
+from torchmask.cli.options import ExperimentOptions
+from torchmask.cli.program import run_script
+from torchmask.cli.run import Run, new_run
 from torchmask.design.criterion import AsymptoticMSE
 from torchmask.design.manufacture import save_json
 from torchmask.design.redundancy import analyse_redundancy
 from torchmask.design.search import search_mask
 from torchmask.grid import Grid
-from torchmask.io import atomic_write, write_json
+from torchmask.io import atomic_write
 from torchmask.optics import catalog
 from torchmask.optics.aperture import SparseAperture
+from torchmask.record import Callback, label_stage
 from torchmask.spectra import NoisePSD, PowerLawPSD
 from torchmask.viz.style import COLORS, FAINT, new_figure, styled
 
@@ -62,9 +63,9 @@ HEADINGS = {
 ON_TERMINAL = ("rank", "mask", "n_subapertures", "relative_mse", "above_floor", "excess_percent")  # 80 columns wide
 
 
-@dataclass(frozen=True)
-class Config:
-    """Everything the ranking depends on."""
+@dataclass(frozen=True, kw_only=True)
+class Options(ExperimentOptions):
+    """What the ranking depends on."""
 
     fill_factor: float = 0.15
     """Collecting area N d^2 / D^2 of round holes; hexagons get the same area."""
@@ -78,19 +79,13 @@ class Config:
     """Evaluations of each search."""
     seed: int = 0
     """Of the searches."""
-    smoke: bool = False
-    """Everything tiny, to see that it runs."""
-    name: str | None = None
-    """Folder of the run below `runs`; None: date and time."""
-    runs: Path = Path("runs")
-    """Where run folders are made."""
 
 
-def make_criterion(config: Config) -> AsymptoticMSE:
+def make_criterion(options: Options) -> AsymptoticMSE:
     """The reference case."""
     return AsymptoticMSE(
-        Grid.nyquist(DIAMETER, WAVELENGTH, config.n_frequencies),
-        PowerLawPSD(config.exponent, N_PHOTONS),
+        Grid.nyquist(DIAMETER, WAVELENGTH, options.n_frequencies),
+        PowerLawPSD(options.exponent, N_PHOTONS),
         NoisePSD(N_PHOTONS),
         n_frames=N_FRAMES,
     )
@@ -116,26 +111,33 @@ def largest_fill_factor(entry: catalog.CatalogEntry) -> float:
     return float(len(centers) * relative**2 * SHAPE_AREA[entry.shape] / SHAPE_AREA["disc"])
 
 
-def lay_out(config: Config) -> tuple[dict[str, SparseAperture], dict[str, float]]:
+def lay_out(options: Options) -> tuple[dict[str, SparseAperture], dict[str, float]]:
     """The catalogue's masks at the common area, and those that cannot carry it with what they can."""
     masks, crowded = {}, {}
     for name in catalog.names():
         entry = catalog.entry(name)
         limit = largest_fill_factor(entry)
-        if limit < config.fill_factor:
+        if limit < options.fill_factor:
             crowded[name] = limit
             continue
-        fill = config.fill_factor * SHAPE_AREA["disc"] / SHAPE_AREA[entry.shape]
+        fill = options.fill_factor * SHAPE_AREA["disc"] / SHAPE_AREA[entry.shape]
         masks[name] = SparseAperture.from_catalog(name, DIAMETER, fill)
     return masks, crowded
 
 
-def search_own(config: Config, criterion: AsymptoticMSE, console: Console) -> dict[str, SparseAperture]:
+def search_own(options: Options, criterion: AsymptoticMSE, callback: Callback) -> dict[str, SparseAperture]:
     """This library's masks."""
     masks = {}
-    for n in config.own:
-        with console.status(f"searching a mask of {n} holes"):
-            result = search_mask(criterion, n, DIAMETER, config.fill_factor, seed=config.seed, budget=config.budget)
+    for n in options.own:
+        result = search_mask(
+            criterion,
+            n,
+            DIAMETER,
+            options.fill_factor,
+            seed=options.seed,
+            budget=options.budget,
+            callback=label_stage(callback, f"{n}_holes"),
+        )
         masks[f"torchmask_{n}"] = result.aperture
     return masks
 
@@ -188,13 +190,13 @@ def as_csv(rows: Sequence[Mapping[str, Any]]) -> str:
     return text.getvalue()
 
 
-def as_markdown(config: Config, rows: Sequence[Mapping[str, Any]], crowded: Mapping[str, float]) -> str:
+def as_markdown(options: Options, rows: Sequence[Mapping[str, Any]], crowded: Mapping[str, float]) -> str:
     """The table and what stands beside it, for readers."""
     lines = [
-        f"# Masks ranked by MSE_a at a fill factor of {config.fill_factor:g}",
+        f"# Masks ranked by MSE_a at a fill factor of {options.fill_factor:g}",
         "",
-        f"D = {DIAMETER:g} m, {1e9 * WAVELENGTH:g} nm, Nyquist, {config.n_frequencies} frequencies a side, "
-        f"p = {config.exponent:g}, {N_PHOTONS:g} photons, K = {N_FRAMES}. The floor is the part no mask can change; "
+        f"D = {DIAMETER:g} m, {1e9 * WAVELENGTH:g} nm, Nyquist, {options.n_frequencies} frequencies a side, "
+        f"p = {options.exponent:g}, {N_PHOTONS:g} photons, K = {N_FRAMES}. The floor is the part no mask can change; "
         "torchmask_N are this library's own masks, and `over our best` compares masks of the same N with them.",
         "",
         "| " + " | ".join(HEADINGS.values()) + " |",
@@ -208,7 +210,7 @@ def as_markdown(config: Config, rows: Sequence[Mapping[str, Any]], crowded: Mapp
 
 
 @styled
-def draw(config: Config, rows: Sequence[Mapping[str, Any]]) -> Figure:
+def draw(options: Options, rows: Sequence[Mapping[str, Any]]) -> Figure:
     """The ranking as a list, and against the number of holes."""
     figure = new_figure(11, 2.2 + 0.17 * len(rows))
     ranking, against = figure.subplots(1, 2, width_ratios=[1, 1.1])
@@ -223,7 +225,7 @@ def draw(config: Config, rows: Sequence[Mapping[str, Any]]) -> Figure:
     floor = rows[0]["relative_mse"] - rows[0]["above_floor"]
     ranking.axvline(floor, color=FAINT, linestyle="--", linewidth=1)
     ranking.set_xlabel("relative MSE (dashed: what no mask can change)")
-    ranking.set_title(f"The same collecting area, N d²/D² = {config.fill_factor:g}")
+    ranking.set_title(f"The same collecting area, N d²/D² = {options.fill_factor:g}")
     for own, label in ((False, "catalogue"), (True, "this library")):
         chosen = [row for row, is_own in zip(rows, ours, strict=True) if is_own == own]
         chosen.sort(key=lambda row: row["n_subapertures"])
@@ -238,9 +240,10 @@ def draw(config: Config, rows: Sequence[Mapping[str, Any]]) -> Figure:
     return figure
 
 
-def show(console: Console, config: Config, rows: Sequence[Mapping[str, Any]], crowded: Mapping[str, float]) -> None:
+def show(options: Options, rows: Sequence[Mapping[str, Any]], crowded: Mapping[str, float]) -> None:
     """The table on the terminal."""
-    table = Table(title=f"MSE_a at a fill factor of {config.fill_factor:g}")
+    console = Console()
+    table = Table(title=f"MSE_a at a fill factor of {options.fill_factor:g}")
     for key in ON_TERMINAL:
         table.add_column(HEADINGS[key], justify="left" if key == "mask" else "right", no_wrap=key == "mask")
     for row in rows:
@@ -252,43 +255,34 @@ def show(console: Console, config: Config, rows: Sequence[Mapping[str, Any]], cr
         console.print(f"not ranked, holes overlap above the fill factor in brackets: {names}")
 
 
-def run(config: Config, directory: Path, console: Console) -> list[dict[str, Any]]:
-    """Rank, and write everything to `directory`."""
-    criterion = make_criterion(config)
-    known, crowded = lay_out(config)
-    own = search_own(config, criterion, console)
+def ranking(options: Options, output: Run) -> tuple[list[dict[str, Any]], dict[str, float]]:
+    """The rows, and the patterns that are not ranked; everything is written to the folder of the run."""
+    criterion = make_criterion(options)
+    known, crowded = lay_out(options)
+    own = search_own(options, criterion, output.callback)
     rows = rank(criterion, known, own)
-    directory.mkdir(parents=True)
     for name, mask in own.items():
-        save_json(directory / f"{name}.json", mask)
-    write_json(directory / "config.json", dataclasses.asdict(config))
-    write_json(directory / "ranking.json", {"rows": rows, "not_ranked_largest_fill_factor": crowded})
-    for suffix, text in ((".csv", as_csv(rows)), (".md", as_markdown(config, rows, crowded))):
-        with atomic_write(directory / f"ranking{suffix}") as file:
-            file.write(text.encode())
-    with atomic_write(directory / "ranking.png") as file:
-        draw(config, rows).savefig(file, format="png", dpi=150)
-    show(console, config, rows, crowded)
-    return rows
+        save_json(output.directory / f"{name}.json", mask)
+    with atomic_write(output.directory / "ranking.csv") as file:
+        file.write(as_csv(rows).encode())
+    numbers = {"rows": rows, "not_ranked_largest_fill_factor": crowded}
+    output.report("ranking", numbers, as_markdown(options, rows, crowded), draw(options, rows))
+    return rows, crowded
 
 
-def main(config: Config) -> int:
-    """Run in a new folder."""
-    directory = config.runs / (config.name or datetime.now().strftime("rank_masks-%Y%m%d-%H%M%S"))
-    if config.smoke:
-        config = dataclasses.replace(config, own=(3, 6), budget=200, n_frequencies=64)
-    if directory.exists():
-        print(f"rank_masks: {directory} exists and is not overwritten: choose another --name", file=sys.stderr)
-        return 2
-    console = Console()
-    try:
-        run(config, directory, console)
-    except ValueError as error:
-        print(f"rank_masks: {error}", file=sys.stderr)
-        return 2
-    console.print(f"written to {directory}")
-    return 0
+def run(options: Options) -> None:
+    """Rank in a new folder."""
+    if options.smoke:
+        options = dataclasses.replace(options, own=(3, 6), budget=200, n_frequencies=64)
+    with new_run("rank_masks", options, options.seed) as output:
+        rows, crowded = ranking(options, output)
+    show(options, rows, crowded)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The exit status."""
+    return run_script("rank_masks", run, Options, __doc__, argv)
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Config, description=__doc__)))
+    sys.exit(main())

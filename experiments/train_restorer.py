@@ -6,33 +6,31 @@
 Each stack of a `StackDataset` (the satellite in a random pose, sunlight, flux and turbulence) becomes its multi-frame
 Wiener estimate with the true PSFs and the mean power spectrum of the training objects. A few convolutions learn what
 to add to it. Scores on stacks that were never trained on: relative error up to the diffraction limit, 0 is perfect.
-Log, figure, network and scores go to a new folder, runs/<name>/.
+Log, figure, network and scores go to a new folder.
 """
 
 from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import datetime
 from itertools import pairwise
-from pathlib import Path
 
 import torch
-import tyro
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
+from torchmask.cli.options import ExperimentOptions
+from torchmask.cli.program import run_script
+from torchmask.cli.run import Run, new_run
 from torchmask.grid import Grid
 from torchmask.io import atomic_write, write_json
 from torchmask.metrics import lowpass, relative_error
 from torchmask.optics.aperture import SparseAperture
-from torchmask.progress import Progress
 from torchmask.record import Callback, Record
 from torchmask.restoration.wiener import multiframe_wiener
 from torchmask.simulation.dataset import StackDataset, StackRanges
-from torchmask.tracking import RunLogger, fan_out
 from torchmask.viz import figures as viz
 
 DIAMETER = 1.0  # of the mask [m]
@@ -40,9 +38,9 @@ WAVELENGTH = 550e-9
 READOUT_NOISE = 1.5  # electrons rms per pixel
 
 
-@dataclass(frozen=True)
-class Config:
-    """Everything a run depends on."""
+@dataclass(frozen=True, kw_only=True)
+class Options(ExperimentOptions):
+    """What the network and its stacks depend on."""
 
     mask: str = "golay9"
     """A Golay array of the catalogue."""
@@ -72,12 +70,6 @@ class Config:
     """Processes that draw stacks."""
     seed: int = 0
     """Of stacks, network and training."""
-    smoke: bool = False
-    """Everything tiny, to see that it runs."""
-    name: str | None = None
-    """Folder of the run below `runs`; None: date and time."""
-    runs: Path = Path("runs")
-    """Where run folders are made."""
 
 
 class Restorer(nn.Module):
@@ -141,18 +133,18 @@ def train(
     network: Restorer,
     training: tuple[Tensor, Tensor],
     held_out: tuple[Tensor, Tensor],
-    config: Config,
+    options: Options,
     callback: Callback,
 ) -> None:
     """Minimise the relative error by Adam; the one-cycle schedule ends at a vanishing learning rate."""
-    generator = torch.Generator().manual_seed(config.seed)
-    per_epoch = math.ceil(len(training[0]) / config.batch_size)
-    n_steps = config.epochs * per_epoch
-    optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, config.learning_rate, total_steps=n_steps)
+    generator = torch.Generator().manual_seed(options.seed)
+    per_epoch = math.ceil(len(training[0]) / options.batch_size)
+    n_steps = options.epochs * per_epoch
+    optimizer = torch.optim.Adam(network.parameters(), lr=options.learning_rate)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, options.learning_rate, total_steps=n_steps)
     for step in range(1, n_steps + 1):
         if step % per_epoch == 1 or per_epoch == 1:
-            order = torch.randperm(len(training[0]), generator=generator).split(config.batch_size)
+            order = torch.randperm(len(training[0]), generator=generator).split(options.batch_size)
         chosen = order[(step - 1) % per_epoch]
         images, targets = turned(training[0][chosen], training[1][chosen], generator)
         loss = power_error(network(images), targets)
@@ -177,7 +169,7 @@ def scores(images: Tensor, targets: Tensor, cutoff: float) -> list[float]:
 def compare(
     restored: Tensor, held_out: tuple[Tensor, Tensor], cutoff: float, log: Callable[[str, float], None]
 ) -> dict[str, float]:
-    """Mean scores on the held-out stacks, and on how many of them the network beats its input."""
+    """Mean scores on the held-out stacks, and the share of them on which the network beats its input."""
     images = {"mean frame": held_out[0][:, 1], "Wiener": held_out[0][:, 0], "network": restored}
     each = {name: scores(values, held_out[1], cutoff) for name, values in images.items()}
     table = {name: sum(values) / len(values) for name, values in each.items()}
@@ -185,63 +177,67 @@ def compare(
     for name, value in table.items():
         log(f"comparison/{name.replace(' ', '_')}/score", value)
     log("comparison/improved", better / len(restored))
-    print(*(f"{name:12s} {value:.4f}" for name, value in table.items()), sep="\n")
-    print(f"The network is better than its input on {better} of {len(restored)} stacks it was not trained on.")
     return table | {"improved": better / len(restored)}
 
 
-def with_smoke(config: Config) -> Config:
-    """The config that runs: `smoke` replaces what takes time."""
-    if not config.smoke:
-        return config
-    return replace(config, n_pixels=32, n_frames=2, n_train=24, n_held_out=4, channels=8, depth=4, epochs=40, workers=0)
-
-
-def run(config: Config, logger: RunLogger, callback: Callback) -> dict[str, float]:
+def restorer(options: Options, output: Run) -> dict[str, float]:
     """Draw, train, score; returns the table."""
-    grid = Grid.nyquist(DIAMETER, WAVELENGTH, config.n_pixels)
-    mask = SparseAperture.from_catalog(config.mask, DIAMETER, config.fill_factor)
+    grid = Grid.nyquist(DIAMETER, WAVELENGTH, options.n_pixels)
+    mask = SparseAperture.from_catalog(options.mask, DIAMETER, options.fill_factor)
     cutoff = grid.cutoff(DIAMETER)
-    count = config.n_train + config.n_held_out
+    count = options.n_train + options.n_held_out
     stacks = StackDataset(
-        mask, grid, count, config.n_frames, config.ranges, readout_noise=READOUT_NOISE, seed=config.seed
+        mask, grid, count, options.n_frames, options.ranges, readout_noise=READOUT_NOISE, seed=options.seed
     )
-    data = draw(stacks, config.workers, callback)
-    images, targets = linear_restorations(data, config.n_train, cutoff)
-    training = images[: config.n_train], targets[: config.n_train]
-    held_out = images[config.n_train :], targets[config.n_train :]
-    torch.manual_seed(config.seed)
-    network = Restorer(config.channels, config.depth)
-    train(network, training, held_out, config, callback)
+    torch.manual_seed(options.seed)
+    network = Restorer(options.channels, options.depth)
+    data = draw(stacks, options.workers, output.callback)
+    images, targets = linear_restorations(data, options.n_train, cutoff)
+    training = images[: options.n_train], targets[: options.n_train]
+    held_out = images[options.n_train :], targets[options.n_train :]
+    train(network, training, held_out, options, output.callback)
     with torch.no_grad():
         restored = network(held_out[0])[:, 0]
-    with atomic_write(logger.directory / "network.pt") as file:
+    with atomic_write(output.directory / "network.pt") as file:
         torch.save(network.state_dict(), file)
-    exposure, truth = data["frames"][config.n_train, 0], data["object"][config.n_train]
+    exposure, truth = data["frames"][options.n_train, 0], data["object"][options.n_train]
     pictures = {"Wiener": (exposure, held_out[0][0, 0]), "network": (exposure, restored[0])}
-    logger.figure("comparison", viz.comparison_figure(truth, pictures, cutoff, grid.pixel_scale))
-    table = compare(restored, held_out, cutoff, logger.scalar)
-    write_json(logger.directory / "scores.json", table)
+    output.logger.figure("comparison", viz.comparison_figure(truth, pictures, cutoff, grid.pixel_scale))
+    table = compare(restored, held_out, cutoff, output.logger.scalar)
+    write_json(output.directory / "scores.json", table)
     return table
 
 
-def main(config: Config) -> int:
-    """Run in a new folder; an interrupted run leaves there what it reached."""
-    directory = config.runs / (config.name or datetime.now().strftime("train_restorer-%Y%m%d-%H%M%S"))
-    config = with_smoke(config)
-    try:
-        with RunLogger(directory, seed=config.seed) as logger, Progress() as progress:
-            logger.log_config(config)
-            run(config, logger, fan_out(logger, progress))
-    except KeyboardInterrupt:
-        print(f"\ninterrupted: what was reached is in {directory}", file=sys.stderr)
-        return 130
-    except ValueError as error:
-        print(f"train_restorer: {error}", file=sys.stderr)
-        return 2
-    print(f"written to {directory}")
-    return 0
+def check(options: Options) -> None:
+    """Raise ValueError for numbers that must be at least 1."""
+    for name in ("n_train", "n_held_out", "n_frames", "channels", "epochs", "batch_size"):
+        if getattr(options, name) < 1:
+            raise ValueError(f"{name} is {getattr(options, name)}: it must be at least 1")
+    if options.depth < 2:
+        raise ValueError(f"depth is {options.depth}: an input and an output layer are needed, at least 2")
+    if options.workers < 0:
+        raise ValueError(f"workers is {options.workers}: it must not be negative; 0 draws in this process")
+
+
+def run(options: Options) -> None:
+    """Train in a new folder; an interrupted run leaves there what it reached."""
+    if options.smoke:
+        tiny = {"n_pixels": 32, "n_frames": 2, "n_train": 24, "n_held_out": 4, "channels": 8, "depth": 4}
+        options = replace(options, **tiny, epochs=40, workers=0)
+    check(options)
+    with new_run("train_restorer", options, options.seed) as output:
+        table = restorer(options, output)
+        improved = round(table.pop("improved") * options.n_held_out)
+        output.summary.extend(f"{name:12s} {value:.4f}" for name, value in table.items())
+        output.summary.append(
+            f"The network is better than its input on {improved} of {options.n_held_out} stacks it was not trained on."
+        )
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The exit status."""
+    return run_script("train_restorer", run, Options, __doc__, argv)
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Config, description=__doc__)))
+    sys.exit(main())

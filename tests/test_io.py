@@ -16,7 +16,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from torchmask.io import as_array, atomic_write, load_npz, read_json, save_npz, to_json, write_json
+from torchmask.io import (
+    as_array,
+    atomic_write,
+    free_name,
+    load_npz,
+    new_folder,
+    read_json,
+    save_npz,
+    to_json,
+    write_json,
+)
 
 
 def names(folder: Path) -> list[str]:
@@ -246,3 +256,15 @@ def test_json_refuses_the_rest_before_it_writes(tmp_path):
         read_json(tmp_path / "bad.json")
     with pytest.raises(ValueError, match="there is no file"):
         read_json(tmp_path / "absent.json")
+
+
+def test_a_new_folder_is_new(tmp_path):
+    assert free_name(tmp_path / "runs" / "run") == tmp_path / "runs" / "run"
+    assert new_folder(str(tmp_path / "runs" / "run")) == tmp_path / "runs" / "run"
+    (tmp_path / "runs" / "run-2").touch()
+    assert free_name(tmp_path / "runs" / "run") == tmp_path / "runs" / "run-3"
+    with pytest.raises(ValueError, match=r"run exists and is not overwritten: choose another, such as .*run-3$"):
+        new_folder(tmp_path / "runs" / "run")
+    with pytest.raises(ValueError, match="cannot be made"):
+        new_folder(tmp_path / "runs" / "run-2" / "below_a_file")
+    assert names(tmp_path / "runs") == ["run", "run-2"]

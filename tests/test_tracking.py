@@ -21,7 +21,7 @@ from tensorboard.plugins.hparams.metadata import parse_session_start_info_plugin
 from torchmask import tracking
 from torchmask.io import load_npz, read_json
 from torchmask.record import Record
-from torchmask.tracking import RunLogger, fan_out, free_name, read_metrics
+from torchmask.tracking import RunLogger, read_metrics
 
 
 @dataclass(frozen=True)
@@ -269,8 +269,6 @@ def test_nothing_is_overwritten(tmp_path):
         RunLogger(tmp_path / "run")
     assert {path: path.read_bytes() for path in before} == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run", "run-2"]
-    assert free_name(tmp_path / "run") == tmp_path / "run-3"
-    assert free_name(tmp_path / "new") == tmp_path / "new"
     (tmp_path / "file").touch()
     with pytest.raises(ValueError, match="cannot be made"):
         RunLogger(tmp_path / "file" / "run")
@@ -328,12 +326,6 @@ def test_checkpoints_are_written_during_the_run(tmp_path, monkeypatch):
             log(record(step, "fit/a", x=torch.tensor([step])))
             assert load_npz(path)["step"] == step
     assert [entry.name for entry in path.parent.iterdir()] == ["fit_a.npz"]
-
-
-def test_fan_out_calls_all_in_order():
-    calls = []
-    fan_out(lambda r: calls.append(("a", r.step)), lambda r: calls.append(("b", r.step)))(record(5))
-    assert calls == [("a", 5), ("b", 5)]
 
 
 def test_a_training_loop_of_ones_own(tmp_path):

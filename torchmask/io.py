@@ -74,6 +74,31 @@ def _refuse_existing(path: Path) -> None:
         raise ValueError(f"{path} exists and is not overwritten: choose another name or move it away")
 
 
+def new_folder(path: str | Path) -> Path:
+    """Make a folder, and those above it.
+
+    Raises ValueError if it exists (the message names one that is free) or cannot be made.
+    """
+    path = Path(path)
+    try:
+        path.mkdir(parents=True)
+    except FileExistsError:
+        raise ValueError(f"{path} exists and is not overwritten: choose another, such as {free_name(path)}") from None
+    except OSError as error:
+        raise ValueError(f"{path} cannot be made: {error}") from error
+    return path
+
+
+def free_name(path: str | Path) -> Path:
+    """`path` if nothing is there yet, or else the first of path-2, path-3, ... that is free."""
+    path = candidate = Path(path)
+    number = 1
+    while candidate.exists():
+        number += 1
+        candidate = path.with_name(f"{path.name}-{number}")
+    return candidate
+
+
 def save_npz(path: str | Path, arrays: Mapping[str, Any], *, replace: bool = False) -> None:
     """Write tensors, arrays and numbers to a compressed .npz file, atomically.
 

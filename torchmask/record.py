@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from torch import Tensor
 
@@ -27,3 +27,18 @@ class Record:
 
 
 Callback = Callable[[Record], None]
+
+
+def fan_out(*callbacks: Callback) -> Callback:
+    """One callback that hands each record to several, such as a `RunLogger` and a `Progress`."""
+
+    def call_all(record: Record) -> None:
+        for callback in callbacks:
+            callback(record)
+
+    return call_all
+
+
+def label_stage(callback: Callback, label: str) -> Callback:
+    """The same callback for an algorithm that runs several times: its stage, such as "fit", becomes "fit/LABEL"."""
+    return lambda record: callback(replace(record, stage=f"{record.stage}/{label}"))

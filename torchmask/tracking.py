@@ -30,8 +30,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import torchmask
-from torchmask.io import as_array, atomic_write, save_npz, to_json, write_json
-from torchmask.record import Callback, Record
+from torchmask.io import as_array, atomic_write, new_folder, save_npz, to_json, write_json
+from torchmask.record import Record
 from torchmask.viz.figures import stretch
 
 if TYPE_CHECKING:
@@ -42,26 +42,6 @@ _SMALLEST_IMAGE = 16  # pixels on a side; smaller arrays are tables of numbers
 _CHECKPOINT_INTERVAL = 5.0  # s
 _FLUSH_INTERVAL = 10  # s, of TensorBoard's events
 _PACKAGES = ("torch", "numpy", "scipy", "cma", "scikit-image", "kornia", "astropy", "trimesh")
-
-
-def fan_out(*callbacks: Callback) -> Callback:
-    """One callback that hands each record to several, such as a `RunLogger` and a `Progress`."""
-
-    def call_all(record: Record) -> None:
-        for callback in callbacks:
-            callback(record)
-
-    return call_all
-
-
-def free_name(directory: str | Path) -> Path:
-    """`directory` if nothing is there yet, or else the first of directory-2, directory-3, ... that is free."""
-    path = candidate = Path(directory)
-    number = 1
-    while candidate.exists():
-        number += 1
-        candidate = path.with_name(f"{path.name}-{number}")
-    return candidate
 
 
 class RunLogger:
@@ -102,7 +82,7 @@ class RunLogger:
     def __init__(self, directory: str | Path, *, seed: int | None = None) -> None:
         from torch.utils.tensorboard import SummaryWriter  # before the folder is made: it may not be installed
 
-        self.directory: Path = _claim(Path(directory))
+        self.directory: Path = new_folder(directory)
         self._start = time.monotonic()
         self._charts: dict[str, dict[str, list[str]]] = {}  # category -> title -> tags
         self._charted: set[tuple[str, str]] = set()
@@ -275,17 +255,6 @@ def read_metrics(directory: str | Path) -> list[dict[str, Any]]:
         return [json.loads(line) for line in lines]
     except ValueError as error:
         raise ValueError(f"{path} is damaged: {error}") from error
-
-
-def _claim(directory: Path) -> Path:
-    try:
-        directory.mkdir(parents=True)
-    except FileExistsError:
-        free = free_name(directory)
-        raise ValueError(f"{directory} exists and is not overwritten: choose another, such as {free}") from None
-    except OSError as error:
-        raise ValueError(f"{directory} cannot be made: {error}") from error
-    return directory
 
 
 def _environment(seed: int | None) -> dict[str, Any]:

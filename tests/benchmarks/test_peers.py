@@ -1,12 +1,12 @@
 """The side-by-side benchmark: that each peer is used as it should be, and that the table says what was measured."""
 
-import importlib.util
+import dataclasses
 import json
 import logging
-import sys
 from importlib.metadata import PackageNotFoundError
-from pathlib import Path
 
+import peer_methods
+import peers
 import pytest
 import torch
 
@@ -18,18 +18,7 @@ from torchmask.optics.detector import Detector
 from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
 
-PATH = Path(__file__).parents[2] / "benchmarks" / "peers.py"
 GRID = Grid.nyquist(1.0, 550e-9, 48)
-
-
-@pytest.fixture(scope="module")
-def script():
-    spec = importlib.util.spec_from_file_location("peers", PATH)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["peers"] = module
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules["peers"]
 
 
 def observe(strength=3.0, n_frames=8):
@@ -49,27 +38,27 @@ def best_score(candidates, observation):
 
 
 @pytest.mark.parametrize("method", ["richardson_lucy", "unsupervised_wiener", "known_psfs"])
-def test_each_deconvolution_improves_on_shift_and_add(script, observation, method):
-    config = script.Config()
-    before = best_score(script.added(observation, config), observation)
-    assert best_score(getattr(script, method)(observation, config), observation) < 0.8 * before
+def test_each_deconvolution_improves_on_shift_and_add(observation, method):
+    effort = peer_methods.Effort()
+    before = best_score(peer_methods.added(observation, effort), observation)
+    assert best_score(getattr(peer_methods, method)(observation, effort), observation) < 0.8 * before
 
 
-def test_the_limit_is_ahead_of_every_peer(script, observation):
-    config = script.Config()
+def test_the_limit_is_ahead_of_every_peer(observation):
+    effort = peer_methods.Effort()
     names = ("added", "richardson_lucy", "unsupervised_wiener")
-    peers = [best_score(getattr(script, name)(observation, config), observation) for name in names]
-    assert best_score(script.known_psfs(observation, config), observation) < min(peers)
+    scores = [best_score(getattr(peer_methods, name)(observation, effort), observation) for name in names]
+    assert best_score(peer_methods.known_psfs(observation, effort), observation) < min(scores)
 
 
-def test_torchmfbd_restores_and_leaves_nothing_behind(script, observation, tmp_path, monkeypatch, capsys):
+def test_torchmfbd_restores_and_leaves_nothing_behind(observation, tmp_path, monkeypatch, capsys):
     pytest.importorskip("torchmfbd")
     monkeypatch.chdir(tmp_path)
     state, disabled = torch.get_rng_state(), logging.root.manager.disable
-    monkeypatch.setattr(script, "MFBD_SETTINGS", (script.MFBDSettings(20, 0.1, 1e-3),))
-    candidates = list(script.mfbd(observation, script.Config(mfbd_iterations=60)))
-    assert len(candidates) == len(script._CUTOFFS)
-    added = best_score(script.added(observation, script.Config()), observation)
+    monkeypatch.setattr(peer_methods, "MFBD_SETTINGS", (peer_methods.MFBDSettings(20, 0.1, 1e-3),))
+    candidates = list(peer_methods.mfbd(observation, peer_methods.Effort(mfbd_iterations=60)))
+    assert len(candidates) == len(peer_methods._CUTOFFS)
+    added = best_score(peer_methods.added(observation, peer_methods.Effort()), observation)
     assert best_score(candidates, observation) < 0.8 * added
     assert torch.equal(torch.get_rng_state(), state)
     assert logging.root.manager.disable == disabled
@@ -78,7 +67,7 @@ def test_torchmfbd_restores_and_leaves_nothing_behind(script, observation, tmp_p
     assert capsys.readouterr() == ("", "")
 
 
-def test_torchmfbd_gets_the_telescope_in_its_own_units(script, observation, monkeypatch):
+def test_torchmfbd_gets_the_telescope_in_its_own_units(observation, monkeypatch):
     torchmfbd = pytest.importorskip("torchmfbd")
     from torchmfbd.util import psf_scale
 
@@ -90,71 +79,69 @@ def test_torchmfbd_gets_the_telescope_in_its_own_units(script, observation, monk
 
     monkeypatch.setattr(torchmfbd, "Deconvolution", look)
     with pytest.raises(Seen) as caught:
-        script._run_mfbd(observation, script.MFBD_SETTINGS[0], 1)
+        peer_methods._run_mfbd(observation, peer_methods.MFBD_SETTINGS[0], 1)
     config = caught.value.args[0]
     scale = psf_scale(config["object1"]["wavelength"], config["telescope"]["diameter"], config["images"]["pix_size"])
     # How many times the diameter the pupil plane is wide: wavelength / (pixel_scale D), 2 / 0.95 here.
     assert scale == pytest.approx(2 / 0.95, rel=1e-12)
 
 
-def test_torchmfbd_is_not_asked_to_model_a_mask(script):
-    stack = script.simulated(script.Config(smoke=True))["satellite_mask"]
-    assert list(script.mfbd(stack, script.Config())) == []
+def test_torchmfbd_is_not_asked_to_model_a_mask():
+    stack = peers.simulated(smoke=True)["satellite_mask"]
+    assert list(peer_methods.mfbd(stack, peer_methods.Effort())) == []
 
 
-def test_a_peer_gets_the_best_of_its_candidates_and_of_clipping(script):
+def test_a_peer_gets_the_best_of_its_candidates_and_of_clipping():
     truth = make_scene((48, 48), 1e4, SceneOptions(size=0.5))
     noise = torch.randn(48, 48, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     images = {"worse": truth + 20 * noise, "better": truth + 5 * noise}
-    candidates = [script.Candidate(name, image, 1.0) for name, image in images.items()]
-    row = script.best("peer", iter(candidates), truth, 0.5)
+    candidates = [peer_methods.Candidate(name, image, 1.0) for name, image in images.items()]
+    row = peers.best("peer", iter(candidates), truth, 0.5)
     assert row["settings"] == "better"
     assert (
         row["score"]
         == relative_error(images["better"].clamp(min=0), truth, 0.5)
         < relative_error(images["better"], truth, 0.5)
     )
-    assert script.best("peer", iter([]), truth, 0.5) is None
+    assert peers.best("peer", iter([]), truth, 0.5) is None
 
 
-def test_the_lead_leaves_out_who_knows_the_psfs(script):
-    scores = {script.OURS: 0.1, "torchmfbd": 0.2, "shift-and-add": 0.4, script.LIMIT: 0.05}
+def test_the_lead_leaves_out_who_knows_the_psfs():
+    scores = {peers.OURS: 0.1, "torchmfbd": 0.2, "shift-and-add": 0.4, peers.LIMIT: 0.05}
     rows = [{"stack": "s", "method": name, "score": value} for name, value in scores.items()]
-    lead = script.lead(rows)
+    lead = peers.lead(rows)
     assert lead["best_peer"] == "torchmfbd"
     assert (lead["lead"], lead["over_limit"]) == (pytest.approx(2.0), pytest.approx(2.0))
 
 
-def test_the_table_holds_every_method_with_versions(script, tmp_path, capsys):
+def test_the_table_holds_every_method_with_versions(tmp_path, capsys):
     pytest.importorskip("torchmfbd")
-    config = script.Config(smoke=True, runs=tmp_path, name="peers")
-    assert script.main(config) == 0
+    argv = ["--smoke", "--out", str(tmp_path / "peers")]
+    assert peers.main(argv) == 0
     record = json.loads((tmp_path / "peers" / "peers.json").read_text())
     found = {(row["stack"], row["method"]) for row in record["rows"]}
-    everything = {(stack, method) for stack in ("satellite_mask", "satellite_full") for method in script.METHODS}
+    everything = {(stack, method) for stack in ("satellite_mask", "satellite_full") for method in peers.METHODS}
     assert everything - found == {("satellite_mask", "torchmfbd")}
     assert all(0 < row["score"] < 1 and row["seconds"] >= 0 for row in record["rows"])
     text = (tmp_path / "peers" / "peers.md").read_text()
     assert text in capsys.readouterr().out
     assert all(f"{name} {number}" in text for name, number in record["versions"].items())
-    assert script.main(config) == 2  # nothing is overwritten
+    assert peers.main(argv) == 1  # nothing is overwritten
     assert "exists" in capsys.readouterr().err
 
 
-def test_a_missing_package_or_truth_is_one_line_before_any_work(script, observation, tmp_path, monkeypatch, capsys):
-    import dataclasses
-
+def test_a_missing_package_or_truth_is_one_line_before_any_work(observation, tmp_path, monkeypatch, capsys):
     path = tmp_path / "blind.npz"
     dataclasses.replace(observation, object=None, psfs=None).save(path)
-    monkeypatch.setattr(script, "versions", dict)
-    assert script.main(script.Config(stacks=(path,), runs=tmp_path, name="new")) == 2
+    monkeypatch.setattr(peers, "versions", dict)
+    assert peers.main([str(path), "--out", str(tmp_path / "new")]) == 1
     assert "lacks object, psfs" in capsys.readouterr().err
     monkeypatch.undo()
 
     def missing(name):
         raise PackageNotFoundError(name)
 
-    monkeypatch.setattr(script, "version", missing)
-    assert script.main(script.Config(runs=tmp_path, name="new")) == 2
+    monkeypatch.setattr(peers, "version", missing)
+    assert peers.main(["--out", str(tmp_path / "new")]) == 1
     assert "torchmask[bench]" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()

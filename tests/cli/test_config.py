@@ -11,7 +11,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchmask.cli.config import load_config, parse, save_config
+from torchmask.cli.config import load_config, save_config
 
 
 @dataclass(frozen=True)
@@ -71,15 +71,6 @@ def test_paths_that_exist_become_absolute_and_places_of_results_are_not_stored(t
         save_config(tmp_path / "config.yaml", "test", Options())
 
 
-def test_the_command_line_wins_over_the_file_and_the_file_over_defaults(tmp_path):
-    path = tmp_path / "c.yaml"
-    path.write_text("wavelength: 1e-6\nkind: hybrid\ninner: {count: 3}\n")
-    found = parse(Options, "test", ["--config", str(path), "--kind", "cma", "--inner.size", "0.5"])
-    assert found == Options(config=path, wavelength=1e-6, kind="cma", inner=Inner(size=0.5, count=3))
-    assert parse(Options, "test", [f"--config={path}"]).kind == "hybrid"
-    assert parse(Options, "test", []) == Options()
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -102,7 +93,7 @@ def test_the_command_line_wins_over_the_file_and_the_file_over_defaults(tmp_path
         ("bars: [[1, 2], [3]]", r"bars\[1\] has 1 items: 2 are needed"),
         ("bars: 3", "bars is 3: a list is needed"),
         ("inner: {sun: [1, 2]}", "inner.sun has 2 items: 3 are needed"),
-        ("command: restore", "it is for `torchmask restore`, not for `torchmask test`"),
+        ("command: restore", "it is for restore, not for test"),
         ("wavelength: [1", "is no valid YAML"),
         ("wavelength: 1\0", "is no valid YAML"),
     ],

@@ -252,7 +252,7 @@ def test_codesign_refuses_before_it_searches(tmp_path, capsys, monkeypatch, give
         raise AssertionError("the search began")
 
     monkeypatch.setattr("torchmask.design.search.evolve", never)  # of the default method, cma
-    assert main(["codesign", *given, "--runs", str(tmp_path / "runs")]) == 1
+    assert main(["codesign", *given, "--out", str(tmp_path / "runs" / "first")]) == 1
     err = capsys.readouterr().err
     assert err.count("\n") == 1
     assert re.search(message, err), err
@@ -327,7 +327,7 @@ def test_an_interrupted_restoration_goes_on_to_the_same_result(runs, tmp_path, m
     # What cannot be gone on from: other settings, a run without a checkpoint, no run at all.
     capsys.readouterr()
     refused(["restore", "--resume", tmp_path / "cut", "--tv-weight", "2"], tmp_path, capsys, "other frames or settings")
-    refused(["restore", "--resume", runs / "simulate"], tmp_path, capsys, "it is for `torchmask simulate`")
+    refused(["restore", "--resume", runs / "simulate"], tmp_path, capsys, "it is for simulate, not for restore")
     (tmp_path / "rest/resume.npz").unlink()
     refused(["restore", "--resume", tmp_path / "rest"], tmp_path, capsys, "no .*resume.npz to go on from")
     refused(["restore", "--resume", tmp_path / "none"], tmp_path, capsys, "there is no config file .*none/config.yaml")
@@ -343,12 +343,14 @@ def test_a_warning_is_one_line_too(runs, tmp_path, capsys):
 
 
 def test_codesign_runs_from_the_package_and_its_config_is_strict(tmp_path, capsys):
-    argv = ["codesign", "--smoke", "--runs", str(tmp_path), "--imaging.n-photons", "1e6"]
-    run(*argv, "--name", "first")
-    assert "score" in capsys.readouterr().out
+    argv = ["codesign", "--smoke", "--out", str(tmp_path / "first"), "--imaging.n-photons", "1e6"]
+    run(*argv)
+    out = capsys.readouterr().out
+    assert "score" in out
+    assert f"tensorboard --logdir {tmp_path}\n" in out
     stored = yaml.safe_load((tmp_path / "first/config.yaml").read_text())
     assert (stored["imaging"]["n_photons"], stored["design"]["n_subapertures"]) == (1e6, 5)
-    assert main([*argv, "--name", "first"]) == 1
+    assert main(argv) == 1
     assert "first-2" in capsys.readouterr().err
     (tmp_path / "bad.yaml").write_text("design: {n_holes: 5}")
     assert main([*argv, "--config", str(tmp_path / "bad.yaml")]) == 1

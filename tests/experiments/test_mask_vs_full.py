@@ -1,42 +1,35 @@
 """The comparison of mask and full pupil: its physics, its statistics, and that nothing is computed twice."""
 
 import dataclasses
-import importlib.util
 import json
 import math
-import sys
-from pathlib import Path
 
+import mask_vs_full as script
+import mask_vs_full_report as report
 import numpy as np
 import pytest
 import torch
 from scipy import stats
 
 from torchmask.atmosphere.phase import TurbulencePhase
+from torchmask.cli.config import load_config
 from torchmask.io import save_npz
 from torchmask.optics.psf import psf_from_samples
 from torchmask.optics.zernike import zernike_basis
 
-PATH = Path(__file__).parents[2] / "experiments" / "mask_vs_full.py"
 CENTERS = [[0.4, 0.0], [-0.2, 0.3], [-0.2, -0.3]]
 
 
 @pytest.fixture(scope="module")
-def script():
-    spec = importlib.util.spec_from_file_location("mask_vs_full", PATH)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["mask_vs_full"] = module
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules["mask_vs_full"]
+def runs(tmp_path_factory):
+    """Holds the folder of a tiny run, first, and its sweep."""
+    runs = tmp_path_factory.mktemp("runs")
+    assert script.main(tiny(runs, "first")) == 0
+    return runs
 
 
-@pytest.fixture(scope="module")
-def finished(script, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("runs")
-    config = script.Config(smoke=True, name="first", runs=folder, sweep=folder / "sweep", workers=1)
-    assert script.main(config) == 0
-    return config
+def tiny(runs, name):
+    return ["--smoke", "--workers", "1", "--sweep", str(runs / "sweep"), "--out", str(runs / name)]
 
 
 def task(**changes):
@@ -56,7 +49,7 @@ def draws(mask, full, **cell):
 
 
 @pytest.mark.parametrize("which", ["mask", "full"])
-def test_the_given_aberrations_make_the_point_spread_functions_of_the_frames(script, which):
+def test_the_given_aberrations_make_the_point_spread_functions_of_the_frames(which):
     own = task(instrument=which)
     observation, coefficients = script.observe(own)
     aperture, grid = observation.aperture, observation.grid
@@ -77,7 +70,7 @@ def test_the_given_aberrations_make_the_point_spread_functions_of_the_frames(scr
     assert error(n_modes) < 0.5 * error(n_modes // 6) < 0.5 * error(1)
 
 
-def test_recording_changes_no_screen_and_leaves_nothing_that_its_modes_explain(script):
+def test_recording_changes_no_screen_and_leaves_nothing_that_its_modes_explain():
     observation, _ = script.observe(task())
     aperture = observation.aperture
     samples = aperture.samples(observation.grid, 4)
@@ -90,62 +83,62 @@ def test_recording_changes_no_screen_and_leaves_nothing_that_its_modes_explain(s
     assert float(explained.abs().max()) < 1e-9 * float(phase.abs().max())
 
 
-def test_the_full_pupil_reaches_as_far_and_gets_light_by_its_area(script):
+def test_the_full_pupil_reaches_as_far_and_gets_light_by_its_area():
     mask, full = (script.observe(task(instrument=which))[0] for which in ("mask", "full"))
     reach = max(math.dist(a, b) for a in CENTERS for b in CENTERS) + 0.2
     assert full.aperture.outer_diameter == pytest.approx(reach, rel=1e-12)
     assert full.n_photons / mask.n_photons == pytest.approx(reach**2 / (3 * 0.2**2), rel=1e-12)
 
 
-def test_frames_turned_round_are_another_start_of_the_full_pupil(script):
+def test_frames_turned_round_are_another_start_of_the_full_pupil():
     first, again, other = (script.measure(task(instrument="full", start=start)) for start in (0, 0, 1))
     assert first["score"] == again["score"]
     assert abs(first["chi_square"] / other["chi_square"] - 1) > 1e-6
     assert first["mean_frame"] == pytest.approx(other["mean_frame"], rel=1e-9)
 
 
-def test_the_ratio_is_that_of_a_paired_t_test_of_logarithms(script):
+def test_the_ratio_is_that_of_a_paired_t_test_of_logarithms():
     rng = np.random.default_rng(0)
     mask, full = np.exp(rng.normal(-2, 0.5, 6)), np.exp(rng.normal(-1.8, 0.5, 6))
-    (cell,) = script.summarise(draws(mask, full))
+    (cell,) = report.summarise(draws(mask, full))
     test = stats.ttest_rel(np.log(mask), np.log(full))
-    low, high = test.confidence_interval(script.CONFIDENCE)
+    low, high = test.confidence_interval(report.CONFIDENCE)
     assert cell["ratio"] == pytest.approx(stats.gmean(mask) / stats.gmean(full), rel=1e-12)
     assert (cell["ratio_low"], cell["ratio_high"]) == pytest.approx((math.exp(low), math.exp(high)), rel=1e-9)
-    assert (cell["verdict"] is None) == (test.pvalue > 1 - script.CONFIDENCE)
+    assert (cell["verdict"] is None) == (test.pvalue > 1 - report.CONFIDENCE)
     assert cell["mask_blindness"] == pytest.approx(stats.gmean(mask) / 0.1, rel=1e-12)
 
 
-def test_who_wins_is_computed(script):
+def test_who_wins_is_computed():
     rows = draws([0.10, 0.12, 0.08], [0.20, 0.25, 0.15], n_photons=1e7)
     rows += draws([0.30, 0.32, 0.28], [0.20, 0.20, 0.19], n_photons=1e5)
     rows += draws([0.1, 0.3, 0.2], [0.2, 0.1, 0.3], n_photons=1e6)
     rows += draws([0.1], [0.9], n_photons=1e4)
-    cells = script.summarise(rows)
+    cells = report.summarise(rows)
     assert [cell["verdict"] for cell in cells] == ["mask", "full", None, None]
-    lines = script.findings(cells)
+    lines = report.findings(cells)
     for line, words in zip(lines, ("the mask wins", "the full pupil wins", "undecided.", "(one draw)"), strict=False):
         assert words in line
     assert "the mask wins 1, the full pupil 1, and 2 are undecided" in lines[-1]
-    script.figure(cells)  # the unlimited interval of one draw is drawn too
+    report.figure(cells)  # the unlimited interval of one draw is drawn too
 
 
-def test_everything_is_in_the_folder(script, finished):
-    folder = finished.runs / "first"
-    assert sorted(path.name for path in folder.iterdir()) == [f"mask_vs_full.{end}" for end in ("json", "md", "png")]
+def test_everything_is_in_the_folder(runs):
+    folder = runs / "first"
+    assert all((folder / f"mask_vs_full.{end}").is_file() for end in ("json", "md", "png"))
+    assert load_config(folder / "config.yaml", script.Options, "mask_vs_full").photons == (1e5, 1e6)
     record = json.loads((folder / "mask_vs_full.json").read_text())
     assert len(record["rows"]) == 2 * 2 * 2  # photons, seeds, instruments
     for row in record["rows"]:
-        n_starts = 1 if row["instrument"] == "mask" else finished.restarts
-        assert len(row["scores_of_starts"]) == n_starts
+        assert len(row["scores_of_starts"]) == 1
         assert row["score"] in row["scores_of_starts"]
         assert 0 < row["floor"] < row["mean_frame"]
     text = (folder / "mask_vs_full.md").read_text()
     assert all(line in text for line in record["findings"])
 
 
-def test_a_second_run_computes_nothing_and_a_wider_one_only_what_is_new(script, finished, monkeypatch):
-    done = len(list(finished.sweep.glob("tasks/mask_vs_full-*.json")))
+def test_a_second_run_computes_nothing_and_a_wider_one_only_what_is_new(runs, monkeypatch):
+    done = len(list(runs.glob("sweep/tasks/mask_vs_full-*.json")))
     calls = []
 
     def counted(task):
@@ -153,20 +146,19 @@ def test_a_second_run_computes_nothing_and_a_wider_one_only_what_is_new(script, 
         return {"score": 0.5, "mean_frame": 0.9, "chi_square": 1.0, "iterations": 1, "converged": True, "seconds": 0.0}
 
     monkeypatch.setattr(script, "measure", counted)
-    again = {**vars(finished), "name": "again"}
-    assert script.main(script.Config(**again)) == 0
+    assert script.main(tiny(runs, "again")) == 0
     assert calls == []
-    first, second = (json.loads((finished.runs / n / "mask_vs_full.json").read_text()) for n in ("first", "again"))
+    first, second = (json.loads((runs / name / "mask_vs_full.json").read_text()) for name in ("first", "again"))
     assert first["rows"] == second["rows"]
     preset = script.with_presets
     wider = (1e5, 1e6, 1e7)
-    monkeypatch.setattr(script, "with_presets", lambda config: dataclasses.replace(preset(config), photons=wider))
-    assert script.main(script.Config(**{**again, "name": "wider"})) == 0
+    monkeypatch.setattr(script, "with_presets", lambda options: dataclasses.replace(preset(options), photons=wider))
+    assert script.main(tiny(runs, "wider")) == 0
     assert len(calls) == done // 2  # one more number of photons beside two
     assert {call["n_photons"] for call in calls} == {1e7}
 
 
-def test_an_interrupted_run_keeps_what_is_done(script, finished, monkeypatch, tmp_path, capsys):
+def test_an_interrupted_run_keeps_what_is_done(monkeypatch, tmp_path, capsys):
     count = 0
 
     def stopping(task):
@@ -177,63 +169,63 @@ def test_an_interrupted_run_keeps_what_is_done(script, finished, monkeypatch, tm
         return {"score": 0.5, "mean_frame": 0.9, "chi_square": 1.0, "iterations": 1, "converged": True, "seconds": 0.0}
 
     monkeypatch.setattr(script, "measure", stopping)
-    monkeypatch.setattr(script, "choose_mask", lambda config, progress: script.instrument(task()))
-    config = script.Config(smoke=True, name="stopped", runs=tmp_path, sweep=tmp_path / "sweep", workers=1)
-    assert script.main(config) == 130
-    assert "--sweep" in capsys.readouterr().err
+    monkeypatch.setattr(script, "choose_mask", lambda options, callback: script.instrument(task()))
+    assert script.main(tiny(tmp_path, "stopped")) == 130
+    assert f"with --sweep {tmp_path / 'sweep'} the next run goes on from there" in capsys.readouterr().err
     assert len(list((tmp_path / "sweep" / "tasks").glob("*.json"))) == 3
-    assert not (tmp_path / "stopped").exists()
+    assert json.loads((tmp_path / "stopped" / "status.json").read_text())["status"] == "interrupted"
+    assert not (tmp_path / "stopped" / "mask_vs_full.json").exists()
 
 
-def test_a_scene_counts_by_its_content(script, tmp_path):
+def test_a_scene_counts_by_its_content(tmp_path):
     path = tmp_path / "scene.npz"
     save_npz(path, {"image": np.eye(8)})
-    config = script.Config(scenes=(path,), views=1)
-    before = script.scenes(config)["scene.npz"]
+    options = script.Options(scenes=(path,), views=1)
+    before = script.scenes(options)["scene.npz"]
     save_npz(path, {"image": np.ones((8, 8))}, replace=True)
-    assert script.scenes(config)["scene.npz"]["sha256"] != before["sha256"]
+    assert script.scenes(options)["scene.npz"]["sha256"] != before["sha256"]
     assert script.observe(task(scene=before))[0].n_photons == pytest.approx(1e6)
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("options", "message"),
     [
-        ({"full": True, "smoke": True}, "choose one"),
-        ({"photons": ()}, "photons"),
-        ({"seeds": (1, 1)}, "none twice"),
-        ({"views": 0}, "views"),
-        ({"restarts": 0}, "restarts"),
-        ({"restarts": 11}, "10 frames"),
-        ({"scenes": (Path("none.obj"),)}, "none.obj"),
-        ({"scenes": (Path("a/x.obj"), Path("b/x.obj"))}, "a name of its own"),
+        (["--full", "--smoke"], "choose one"),
+        (["--photons"], "photons is ()"),
+        (["--photons", "0"], "n_photons is 0.0"),
+        (["--d-over-r0", "7", "0"], "d_over_r0 is 0.0"),
+        (["--outer-scale", "-1"], "outer_scale is -1.0"),
+        (["--readout-noise", "-1"], "readout_noise is -1.0"),
+        (["--n-pixels", "4"], "an image of more pixels"),
+        (["--fill-factor", "3"], "fill_factor is 3.0"),
+        (["--seeds", "1", "1"], "none twice"),
+        (["--views", "0"], "views is 0"),
+        (["--restarts", "0"], "restarts is 0"),
+        (["--restarts", "11"], "10 frames"),
+        (["--scenes", "none.obj"], "none.obj"),
+        (["--scenes", "a/x.obj", "b/x.obj"], "a name of its own"),
+        (["--mask", "none.json"], "none.json"),
+        (["--workers", "0"], "n_workers is 0"),
     ],
 )
-def test_what_cannot_run_is_one_line_before_any_work(script, tmp_path, capsys, changes, message):
-    config = script.Config(runs=tmp_path, sweep=tmp_path / "sweep", name="bad", **changes)
-    assert script.main(config) == 2
+def test_what_cannot_run_is_one_line_before_any_work(tmp_path, capsys, options, message):
+    out = ["--sweep", str(tmp_path / "sweep"), "--out", str(tmp_path / "runs" / "bad")]
+    assert script.main([*options, *out]) == 1
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_existing_folder_is_never_touched(script, finished, capsys):
-    before = (finished.runs / "first" / "mask_vs_full.json").stat().st_mtime_ns
-    assert script.main(finished) == 2
-    assert "exists" in capsys.readouterr().err
-    assert (finished.runs / "first" / "mask_vs_full.json").stat().st_mtime_ns == before
+def test_an_existing_folder_is_never_touched(runs, capsys):
+    before = {path: path.stat().st_mtime_ns for path in (runs / "first").iterdir()}
+    assert script.main(tiny(runs, "first")) == 1
+    assert "first exists and is not overwritten" in capsys.readouterr().err
+    assert {path: path.stat().st_mtime_ns for path in (runs / "first").iterdir()} == before
 
 
-@pytest.mark.parametrize("inside", ["", "sweep"])
-def test_restorations_are_not_kept_in_the_folder_of_the_run(script, tmp_path, capsys, inside):
-    config = script.Config(smoke=True, name="run", runs=tmp_path, sweep=tmp_path / "run" / inside)
-    assert script.main(config) == 2
-    assert "elsewhere" in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_the_whole_grid_is_the_one_asked_for(script):
-    config = script.with_presets(script.Config(full=True))
-    assert (min(config.photons), max(config.photons)) == (1e4, 1e8)
-    assert (min(config.d_over_r0), max(config.d_over_r0)) == (3, 15)
-    assert len(config.seeds) >= 5
+def test_the_whole_grid_is_the_one_asked_for():
+    options = script.with_presets(script.Options(full=True))
+    assert (min(options.photons), max(options.photons)) == (1e4, 1e8)
+    assert (min(options.d_over_r0), max(options.d_over_r0)) == (3, 15)
+    assert len(options.seeds) >= 5

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 
@@ -29,9 +28,13 @@ def finished(tmp_path_factory):
     """The folder that holds a tiny run of each script, and their common sweep."""
     runs = tmp_path_factory.mktemp("runs")
     for name, script in SCRIPTS.items():
-        config = script.Config(smoke=True, runs=runs, sweep=runs / "sweep", name=name, workers=1)
-        assert script.main(config) == 0
+        assert script.main(tiny(runs, name)) == 0
     return runs
+
+
+def tiny(runs, name, sweep=None):
+    """Arguments of a tiny run in this process."""
+    return ["--smoke", "--workers", "1", "--sweep", str(sweep or runs / "sweep"), "--out", str(runs / name)]
 
 
 def rows(finished, name):
@@ -47,7 +50,7 @@ def test_picture_numbers_and_table_are_written(finished, name):
     assert min(picture.shape[:2]) > 400
     assert len(np.unique(picture.reshape(-1, picture.shape[-1]), axis=0)) > 20
     stored = json.loads((folder / f"{name}.json").read_text())
-    assert stored["config"]["smoke"] is True
+    assert json.loads((folder / "config.json").read_text())["smoke"] is True
     table = [line for line in (folder / f"{name}.md").read_text().splitlines() if line.startswith("|")]
     assert len(table) == len(stored["rows"]) + 2
     assert len({line.count("|") for line in table}) == 1
@@ -56,25 +59,24 @@ def test_picture_numbers_and_table_are_written(finished, name):
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_nothing_is_overwritten(finished, name, capsys):
     before = {path: path.stat().st_mtime_ns for path in (finished / name).iterdir()}
-    config = SCRIPTS[name].Config(smoke=True, runs=finished, sweep=finished / "sweep", name=name, workers=1)
-    assert SCRIPTS[name].main(config) == 2
-    assert "exists and is not overwritten: choose another --name" in capsys.readouterr().err
+    assert SCRIPTS[name].main(tiny(finished, name)) == 1
+    assert f"{name} exists and is not overwritten: choose another, such as" in capsys.readouterr().err
     assert {path: path.stat().st_mtime_ns for path in (finished / name).iterdir()} == before
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_a_bad_setting_is_one_line(tmp_path, name, capsys):
-    config = SCRIPTS[name].Config(smoke=True, runs=tmp_path, sweep=tmp_path / "sweep", workers=0)
-    assert SCRIPTS[name].main(config) == 2
-    assert "n_workers is 0" in capsys.readouterr().err
+    assert SCRIPTS[name].main([*tiny(tmp_path, "new/run"), "--workers", "0"]) == 1
+    err = capsys.readouterr().err
+    assert err.startswith(f"{name}: error: n_workers is 0")
+    assert err.count("\n") == 1
     assert not list(tmp_path.iterdir())
 
 
 def test_a_finished_sweep_is_read_and_gives_the_same_numbers(finished, tmp_path):
     tasks = finished / "sweep" / "tasks"
     before = {path: path.stat().st_mtime_ns for path in tasks.iterdir()}
-    config = asymptotic_limit.Config(smoke=True, runs=tmp_path, sweep=finished / "sweep", name="again", workers=1)
-    assert asymptotic_limit.main(config) == 0
+    assert asymptotic_limit.main(tiny(tmp_path, "again", finished / "sweep")) == 0
     assert {path: path.stat().st_mtime_ns for path in tasks.iterdir()} == before
     again = json.loads((tmp_path / "again" / "asymptotic_limit.json").read_text())["rows"]
     assert again == rows(finished, "asymptotic_limit")
@@ -134,10 +136,9 @@ def test_the_limit_is_that_of_the_criterion(finished):
 def test_a_ratio_below_one_is_said_so():
     good = {"mask": "m", "model": "pistons", "n_frames": 1, "ratio": 1.03, "ratio_error": 0.001}
     screens = good | {"model": "von_karman", "sampling_error": -1e-3}
-    config = asymptotic_limit.Config()
-    assert "never below 1 within its error" in asymptotic_limit.findings(config, [good, screens])[0]
+    assert "never below 1 within its error" in asymptotic_limit.findings(7.0, [good, screens])[0]
     bad = good | {"ratio": 0.99}
-    assert "BELOW 1 BY MORE THAN ITS ERROR" in asymptotic_limit.findings(config, [good, bad, screens])[0]
+    assert "BELOW 1 BY MORE THAN ITS ERROR" in asymptotic_limit.findings(7.0, [good, bad, screens])[0]
 
 
 def test_the_masks_of_the_gallery_are_those_of_its_numbers(finished):
@@ -164,13 +165,13 @@ def curve(values, scatter=0.0):
 
 
 def test_a_curve_that_goes_up_is_said_so():
-    config = mse_vs_n.Config()
-    assert "The curve never goes up." in mse_vs_n.findings(config, curve([0.3, 0.2, 0.1]))
+    options = mse_vs_n.Options()
+    assert "The curve never goes up." in mse_vs_n.findings(options, curve([0.3, 0.2, 0.1]))
     up = curve([0.3, 0.2, 0.204, 0.1], scatter=0.01)
     assert mse_vs_n.rises(up) == [(4, 5, pytest.approx(0.02), 0.01)]
-    assert any("goes up BEYOND the scatter of the searches: 4 to 5" in line for line in mse_vs_n.findings(config, up))
+    assert any("goes up BEYOND the scatter of the searches: 4 to 5" in line for line in mse_vs_n.findings(options, up))
     up = curve([0.3, 0.2, 0.204, 0.1], scatter=0.03)
-    assert any("goes up within the scatter" in line for line in mse_vs_n.findings(config, up))
+    assert any("goes up within the scatter" in line for line in mse_vs_n.findings(options, up))
 
 
 def test_where_the_curve_flattens():
@@ -179,14 +180,14 @@ def test_where_the_curve_flattens():
     assert mse_vs_n.reached(falling, 0.51) == 5
     assert mse_vs_n.reached(falling, 0.0) == 3
     assert mse_vs_n.reached(falling, 1.0) == 14
-    text = " ".join(mse_vs_n.findings(mse_vs_n.Config(), falling))
+    text = " ".join(mse_vs_n.findings(mse_vs_n.Options(), falling))
     assert "flattens between N = 6 and 9" in text
     assert "N = 11 is more than it takes: it has made 100 % of the drop" in text
     slower = curve([0.1 + 0.75**k for k in range(18)])  # N = 3 to 20
-    assert "flattens between N = 10 and 15" in " ".join(mse_vs_n.findings(mse_vs_n.Config(), slower))
-    assert "N = 11 is a reasonable choice: it has made 91 %" in " ".join(mse_vs_n.findings(mse_vs_n.Config(), slower))
+    assert "flattens between N = 10 and 15" in " ".join(mse_vs_n.findings(mse_vs_n.Options(), slower))
+    assert "N = 11 is a reasonable choice: it has made 91 %" in " ".join(mse_vs_n.findings(mse_vs_n.Options(), slower))
     straight = curve([1 - 0.05 * k for k in range(18)])
-    assert "N = 11 is too few" in " ".join(mse_vs_n.findings(mse_vs_n.Config(), straight))
+    assert "N = 11 is too few" in " ".join(mse_vs_n.findings(mse_vs_n.Options(), straight))
 
 
 def test_holes_too_large_for_the_turbulence_are_in_the_curve_but_not_measured(finished):
@@ -201,25 +202,43 @@ def test_holes_too_large_for_the_turbulence_are_in_the_curve_but_not_measured(fi
 
 
 def test_the_scripts_share_their_searches(tmp_path):
-    settings = {"n_subapertures": (3,), "n_pixels": 64, "budget": 100, "seed": (0, 1), "sweep": tmp_path / "sweep"}
-    gallery = optimal_masks.Config(runs=tmp_path, name="gallery", workers=1, **settings)
-    assert optimal_masks.main(gallery) == 0
+    search = ["--n-subapertures", "3", "--n-pixels", "64", "--budget", "100", "--workers", "1"]
+    search += ["--sweep", str(tmp_path / "sweep")]
+    assert optimal_masks.main([*search, "--out", str(tmp_path / "gallery")]) == 0
     searches = set((tmp_path / "sweep" / "tasks").iterdir())
-    line = mse_vs_n.Config(runs=tmp_path, name="curve", workers=1, d_over_r0=3.0, n_draws=2, **settings)
-    assert mse_vs_n.main(dataclasses.replace(line, n_frames=20)) == 0
+    assert mse_vs_n.main([*search, "--d-over-r0", "3", "--n-draws", "2", "--out", str(tmp_path / "curve")]) == 0
     assert set((tmp_path / "sweep" / "tasks").glob("*search*")) == searches
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--frames"], "frames is ()"),
+        (["--frames", "5", "0"], "frames is (5, 0)"),
+        (["--d-over-r0", "0"], "d_over_r0 is 0.0"),
+        (["--outer-scale", "0"], "outer_scale is 0.0"),
+        (["--piston-stacks", "1"], "piston_stacks is 1"),
+        (["--n-pixels", "2"], "a sub-aperture"),
+    ],
+)
+def test_what_could_not_be_drawn_is_told_before_the_search(tmp_path, capsys, options, message):
+    out = ["--sweep", str(tmp_path / "sweep"), "--out", str(tmp_path / "run")]
+    assert asymptotic_limit.main([*options, *out]) == 1
+    assert capsys.readouterr().err.startswith(f"asymptotic_limit: error: {message}")
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_table_on_the_command_line(tmp_path, capsys):
-    config = design_table.Config(tmp_path / "table", smoke=True, workers=1)
-    assert design_table.main(config) == 0
+    argv = [str(tmp_path / "table"), "--smoke", "--workers", "1"]
+    assert design_table.main(argv) == 0
     assert "d/r0 is 1.57, above 1.5" in capsys.readouterr().out  # three holes at D/r0 = 7
     found = json.loads((tmp_path / "table" / "table.json").read_text())["rows"]
     assert [row["infeasible"] is None for row in found] == [False, True]
     assert found[1]["wiener_mse"] > 0
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "table" / "tasks").iterdir()}
-    assert design_table.main(config) == 0
+    assert design_table.main(argv) == 0
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "table" / "tasks").iterdir()} == before
-    crowded = dataclasses.replace(config, space=dataclasses.replace(config.space, diameter_over_r0=(30.0,)))
-    assert design_table.main(crowded) == 2
+    assert design_table.main([*argv, "--space.diameter-over-r0", "30"]) == 1
     assert "no combination can be designed" in capsys.readouterr().err
+    assert design_table.main([*argv, "--space.exponent", "-3"]) == 1
+    assert capsys.readouterr().err == "design_table: error: exponent is -3.0: it must be finite and not negative\n"

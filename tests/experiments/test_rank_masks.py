@@ -1,5 +1,4 @@
 import csv
-import dataclasses
 import json
 import math
 
@@ -15,9 +14,9 @@ from torchmask.optics.aperture import SparseAperture
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    config = rank_masks.Config(smoke=True, name="ranking", runs=tmp_path_factory.mktemp("runs"))
-    assert rank_masks.main(config) == 0
-    return config.runs / "ranking"
+    folder = tmp_path_factory.mktemp("runs") / "ranking"
+    assert rank_masks.main(["--smoke", "--out", str(folder)]) == 0
+    return folder
 
 
 @pytest.mark.parametrize("name", catalog.names())
@@ -32,7 +31,7 @@ def test_the_largest_fill_factor_is_where_holes_touch(name):
 
 
 def test_all_ranked_masks_collect_the_same_light():
-    known, crowded = rank_masks.lay_out(rank_masks.Config())
+    known, crowded = rank_masks.lay_out(rank_masks.Options())
     assert set(known) | set(crowded) == set(catalog.names())
     assert not set(known) & set(crowded)
     for name, mask in known.items():
@@ -53,7 +52,7 @@ def test_the_table_is_in_order_and_the_same_in_all_files(finished):
 
 
 def test_rows_hold_what_the_library_says_of_the_masks(finished):
-    criterion = rank_masks.make_criterion(dataclasses.replace(rank_masks.Config(), n_frequencies=64))
+    criterion = rank_masks.make_criterion(rank_masks.Options(n_frequencies=64))
     rows = {row["mask"]: row for row in json.loads((finished / "ranking.json").read_text())["rows"]}
     own = load_mask(finished / "torchmask_6.json")
     for name, mask in (("golay6", SparseAperture.from_catalog("golay6", 1.0, 0.15)), ("torchmask_6", own)):
@@ -66,12 +65,12 @@ def test_rows_hold_what_the_library_says_of_the_masks(finished):
 
 def test_a_finished_run_is_not_overwritten(finished, capsys):
     before = (finished / "ranking.json").read_bytes()
-    assert rank_masks.main(rank_masks.Config(smoke=True, name="ranking", runs=finished.parent)) == 2
+    assert rank_masks.main(["--smoke", "--out", str(finished)]) == 1
     assert "exists and is not overwritten" in capsys.readouterr().err
     assert (finished / "ranking.json").read_bytes() == before
 
 
 def test_impossible_requests_are_refused(tmp_path, capsys):
-    assert rank_masks.main(rank_masks.Config(fill_factor=-0.15, smoke=True, runs=tmp_path)) == 2
-    assert "rank_masks: fill_factor is -0.15" in capsys.readouterr().err
+    assert rank_masks.main(["--smoke", "--fill-factor", "-0.15", "--out", str(tmp_path / "new" / "run")]) == 1
+    assert "rank_masks: error: fill_factor is -0.15" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 import redundancy
+import redundancy_report
 import torch
 
 from torchmask.atmosphere.von_karman import von_karman_structure_function
@@ -45,7 +46,7 @@ def test_a_large_full_pupil_approaches_the_limit_of_many_speckles():
     The first correction is the mean of D'' u^2 / 2 over exp(-D(u)): with D = 6.88 u^(5/3) in units of r0 the mean of
     u^2 is 6.88^(-6/5) Gamma(12/5) / Gamma(6/5) = 0.134, and half the Laplacian of D at B is 9.56 B^(-1/3).
     """
-    assert pytest.approx(0.4353, abs=5e-5) == redundancy.KORFF
+    assert pytest.approx(0.4353, abs=5e-5) == redundancy_report.KORFF
     pupil = redundancy.raster_of(FullAperture(1.0), GRID)
     shift = 32
     product = pupil * torch.roll(pupil, (0, -shift), dims=(0, 1))
@@ -53,7 +54,7 @@ def test_a_large_full_pupil_approaches_the_limit_of_many_speckles():
     ratios = []
     for d_over_r0 in (8, 12, 16):
         kept = redundancy.expected_power(pupil, (0, shift), GRID, 1 / d_over_r0, 1e6)
-        excess = kept * transfer / (redundancy.KORFF / d_over_r0**2) - 1
+        excess = kept * transfer / (redundancy_report.KORFF / d_over_r0**2) - 1
         ratios.append(excess / (0.64 * (shift * STEP * d_over_r0) ** (-1 / 3)))
     assert ratios[0] > ratios[1] > ratios[2] > 1
     assert ratios[2] < 1.5
@@ -61,9 +62,9 @@ def test_a_large_full_pupil_approaches_the_limit_of_many_speckles():
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    config = redundancy.Config(smoke=True, name="redundancy", runs=tmp_path_factory.mktemp("runs"))
-    assert redundancy.main(config) == 0
-    return config.runs / "redundancy"
+    folder = tmp_path_factory.mktemp("runs") / "redundancy"
+    assert redundancy.main(["--smoke", "--out", str(folder)]) == 0
+    return folder
 
 
 def test_drawn_contrasts_agree_with_the_closed_forms(finished):
@@ -71,7 +72,7 @@ def test_drawn_contrasts_agree_with_the_closed_forms(finished):
     assert {row["pupil"] for row in rows} == {"full pupil", "Golay-6", "row"}
     # 80 rows of either sign, Student's t of 40 frames: 5 standard errors are exceeded once in a thousand runs.
     for key in ("short", "long", "pistons"):
-        assert redundancy.deviation(rows, key) < 5
+        assert redundancy_report.deviation(rows, key) < 5
     for row in rows:
         assert row["long_theory"] == pytest.approx(
             math.exp(-float(von_karman_structure_function(torch.tensor(row["baseline"]), 1 / 7, 20.0)) / 2), rel=1e-4
@@ -91,5 +92,22 @@ def test_picture_and_table_are_written_once(finished, capsys):
     table = [line for line in (finished / "redundancy.md").read_text().splitlines() if line.startswith("|")]
     assert len(table) == len(rows) + 2
     assert len({line.count("|") for line in table}) == 1
-    assert redundancy.main(redundancy.Config(smoke=True, name="redundancy", runs=finished.parent)) == 2
+    assert redundancy.main(["--smoke", "--out", str(finished)]) == 1
     assert "exists and is not overwritten" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--d-over-r0", "0"], "d_over_r0 is 0.0"),
+        (["--outer-scale", "-1"], "outer_scale is -1.0"),
+        (["--n-frames", "1"], "n_frames is 1"),
+        (["--row-holes", "1"], "row_holes is 1"),
+    ],
+)
+def test_a_bad_setting_is_one_line(tmp_path, capsys, options, message):
+    assert redundancy.main([*options, "--out", str(tmp_path / "new" / "run")]) == 1
+    err = capsys.readouterr().err
+    assert err.startswith(f"redundancy: error: {message}")
+    assert err.count("\n") == 1
+    assert not list(tmp_path.iterdir())

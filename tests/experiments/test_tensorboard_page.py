@@ -44,9 +44,9 @@ return [texts.filter(text => text).join(''), images];
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    runs = tmp_path_factory.mktemp("runs")
-    assert codesign.main(codesign.Config(smoke=True, runs=runs, name="tiny")) == 0
-    return runs / "tiny"
+    folder = tmp_path_factory.mktemp("runs") / "tiny"
+    assert codesign.main(["codesign", "--smoke", "--out", str(folder)]) == 0
+    return folder
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +130,7 @@ def test_the_event_file_reads_back_with_every_group(run):
         for value in event.summary.value
         if value.tag == "custom_scalars__config__"
     ]
-    for title in (b"design", b"observation", b"restoration", b"comparison"):
+    for title in (b"design", b"simulation", b"restoration", b"comparison"):
         assert title in layout[-1]
     assert rb"comparison/mask/score" in layout[-1].replace(b"\\", b"")
     events = EventAccumulator(str(run), size_guidance={"scalars": 0})

@@ -12,9 +12,9 @@ from torchmask.io import load_npz
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    runs = tmp_path_factory.mktemp("runs")
-    assert train_restorer.main(train_restorer.Config(smoke=True, runs=runs, name="tiny")) == 0
-    return runs / "tiny"
+    folder = tmp_path_factory.mktemp("runs") / "tiny"
+    assert train_restorer.main(["--smoke", "--out", str(folder)]) == 0
+    return folder
 
 
 def test_the_network_beats_its_input_on_stacks_it_has_not_seen(finished):
@@ -71,5 +71,24 @@ def test_turning_keeps_pairs_together():
 
 
 def test_an_existing_folder_is_refused(finished, capsys):
-    assert train_restorer.main(train_restorer.Config(smoke=True, runs=finished.parent, name="tiny")) == 2
+    assert train_restorer.main(["--smoke", "--out", str(finished)]) == 1
     assert "tiny-2" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--mask", "none"], "no mask is called 'none'"),
+        (["--fill-factor", "0"], "fill_factor is 0.0"),
+        (["--ranges.r0", "-1", "2"], "r0 is (-1.0, 2.0)"),
+        (["--n-train", "0"], "n_train is 0"),
+        (["--depth", "1"], "depth is 1"),
+        (["--workers", "-1"], "workers is -1"),
+    ],
+)
+def test_a_bad_setting_is_one_line_and_leaves_nothing(tmp_path, capsys, options, message):
+    assert train_restorer.main([*options, "--out", str(tmp_path / "new" / "run")]) == 1
+    err = capsys.readouterr().err
+    assert err.startswith(f"train_restorer: error: {message}")
+    assert err.count("\n") == 1
+    assert not list(tmp_path.iterdir())

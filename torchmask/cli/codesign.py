@@ -1,15 +1,13 @@
 """`torchmask codesign`: design a mask, observe a scene through turbulence with it, restore the image, compare.
 
 The rival is a full pupil that reaches the same spatial frequencies and receives photons in proportion to its area. All
-results, figures and TensorBoard events go to one new folder, runs/<name>/.
+results, figures and TensorBoard events go to one new folder, runs/codesign-date-time by default.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
-from datetime import datetime
-from pathlib import Path
 from typing import Literal
 
 import torch
@@ -18,7 +16,7 @@ from rich.table import Table
 
 from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.cli.design import make_criterion, search
-from torchmask.cli.options import ConfigOptions, SearchOptions
+from torchmask.cli.options import ExperimentOptions, SearchOptions
 from torchmask.cli.report import log_design, log_observation
 from torchmask.cli.run import Run, new_run
 from torchmask.design.search import SearchResult
@@ -29,7 +27,7 @@ from torchmask.observation import Observation
 from torchmask.optics.aperture import Aperture, FullAperture, SparseAperture
 from torchmask.optics.detector import Detector
 from torchmask.optics.packing import hole_diameter
-from torchmask.record import Callback
+from torchmask.record import Callback, label_stage
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.result import RestorationResult
 from torchmask.simulation.exposures import simulate_observation
@@ -72,9 +70,13 @@ class RestorationOptions:
     """Upper limit of iterations, of all starts together; one start takes 1000 at most."""
 
 
-@dataclass(frozen=True)
-class Config:
-    """Everything a run depends on."""
+@dataclass(frozen=True, kw_only=True)
+class Options(ExperimentOptions):
+    """Design a mask, observe a scene through turbulence with it, restore the image, and compare with a full pupil.
+
+    The full pupil reaches the same spatial frequencies and receives photons in proportion to its area. All results,
+    figures and TensorBoard events go to one new folder.
+    """
 
     design: SearchOptions = field(default_factory=SearchOptions)
     imaging: ImagingOptions = field(default_factory=ImagingOptions)
@@ -83,106 +85,86 @@ class Config:
     restoration: RestorationOptions = field(default_factory=RestorationOptions)
     preset: Literal["default", "paper"] = "default"
     """`paper`: CMA-ES alone, piston and tip-tilt only, no aberration prior, as the seed method has it."""
-    smoke: bool = False
-    """Everything tiny, to see that it runs."""
     seed: int = 0
     """Of the search, the turbulence and the noise."""
-    name: str | None = None
-    """Folder of the run below `runs`; None: date and time."""
-    runs: Path = Path("runs")
-    """Where run folders are made."""
 
 
-@dataclass(frozen=True)
-class Options(Config, ConfigOptions):
-    """Design a mask, observe a scene through turbulence with it, restore the image, and compare with a full pupil.
-
-    The full pupil reaches the same spatial frequencies and receives photons in proportion to its area. All results,
-    figures and TensorBoard events go to one new folder, runs/<name>/.
-    """
-
-
-def with_presets(config: Config) -> Config:
-    """The config that runs: `preset` and `smoke` replace what they stand for."""
-    design, imaging, restoration = config.design, config.imaging, config.restoration
-    if config.preset == "paper":
+def with_presets(options: Options) -> Options:
+    """The options that run: `preset` and `smoke` replace what they stand for."""
+    design, imaging, restoration = options.design, options.imaging, options.restoration
+    if options.preset == "paper":
         design = dataclasses.replace(design, method="cma", refine=False)
         restoration = dataclasses.replace(restoration, n_modes=3, prior=False)
-    if config.smoke:
+    if options.smoke:
         design = dataclasses.replace(design, n_subapertures=5, budget=200, n_frequencies=64)
         imaging = dataclasses.replace(imaging, n_pixels=64, n_frames=3)
         restoration = dataclasses.replace(restoration, max_iterations=15)
-    return dataclasses.replace(config, design=design, imaging=imaging, restoration=restoration)
+    return dataclasses.replace(options, design=design, imaging=imaging, restoration=restoration)
 
 
-def image_grid(config: Config) -> Grid:
+def image_grid(options: Options) -> Grid:
     """The grid of the exposures: Nyquist for the mask's disc."""
-    return Grid.nyquist(config.imaging.diameter, config.imaging.wavelength, config.imaging.n_pixels)
+    return Grid.nyquist(options.imaging.diameter, options.imaging.wavelength, options.imaging.n_pixels)
 
 
-def outside(config: Config) -> tuple[TurbulencePhase, Detector]:
+def outside(options: Options) -> tuple[TurbulencePhase, Detector]:
     """What comes between the scene and the frames."""
-    imaging = config.imaging
+    imaging = options.imaging
     if not imaging.d_over_r0 > 0:
         raise ValueError(f"imaging.d_over_r0 is {imaging.d_over_r0}: it must be positive")
     turbulence = TurbulencePhase(imaging.diameter / imaging.d_over_r0, imaging.outer_scale * imaging.diameter)
     return turbulence, Detector(imaging.readout_noise)
 
 
-def inversion(config: Config, aperture: Aperture, n_modes: int | None) -> MyopicDeconvolution:
+def inversion(options: Options, aperture: Aperture, n_modes: int | None) -> MyopicDeconvolution:
     """The restoration, told what an observer knows: instrument, read-out noise and turbulence."""
-    imaging, options = config.imaging, config.restoration
+    imaging, wanted = options.imaging, options.restoration
     return MyopicDeconvolution(
         aperture,
-        image_grid(config),
+        image_grid(options),
         n_modes=n_modes,
         r0=imaging.diameter / imaging.d_over_r0,
         outer_scale=imaging.outer_scale * imaging.diameter,
         readout_noise=imaging.readout_noise,
-        aberration_prior=options.prior,
-        max_iterations=options.max_iterations,
+        aberration_prior=wanted.prior,
+        max_iterations=wanted.max_iterations,
     )
 
 
-def check(config: Config) -> None:
+def check(options: Options) -> None:
     """Raise ValueError for what the stages after the search would refuse: the search takes long."""
-    outside(config)
-    design, diameter = config.design, config.imaging.diameter
+    outside(options)
+    design, diameter = options.design, options.imaging.diameter
     size = hole_diameter(design.n_subapertures, diameter, design.fill_factor)
     hole = SparseAperture(torch.zeros(1, 2, dtype=torch.float64), size, diameter)
-    inversion(config, hole, config.restoration.n_modes or 1)
+    inversion(options, hole, options.restoration.n_modes or 1)
 
 
-def design_mask(config: Config, callback: Callback) -> SearchResult:
+def design_mask(options: Options, callback: Callback) -> SearchResult:
     """Search for the mask that minimises MSE_a, with photon noise alone as in the reference case."""
-    imaging = config.imaging
-    grid = Grid.nyquist(imaging.diameter, imaging.wavelength, config.design.n_frequencies)
-    criterion = make_criterion(config.design, grid, NoisePSD(imaging.n_photons), imaging.n_frames)
-    return search(config.design, criterion, imaging.diameter, config.seed, callback)
+    imaging = options.imaging
+    grid = Grid.nyquist(imaging.diameter, imaging.wavelength, options.design.n_frequencies)
+    criterion = make_criterion(options.design, grid, NoisePSD(imaging.n_photons), imaging.n_frames)
+    return search(options.design, criterion, imaging.diameter, options.seed, callback)
 
 
-def observe(config: Config, scene: torch.Tensor, aperture: Aperture, callback: Callback) -> Observation:
+def observe(options: Options, scene: torch.Tensor, aperture: Aperture, callback: Callback) -> Observation:
     """Draw short exposures end to end: the full turbulent phase, and no model that the inversion knows.
 
     One seed: mask and full pupil look through the same screens.
     """
-    turbulence, detector = outside(config)
-    generator = torch.Generator().manual_seed(config.seed)
-    n_frames = config.imaging.n_frames
+    turbulence, detector = outside(options)
+    generator = torch.Generator().manual_seed(options.seed)
+    n_frames = options.imaging.n_frames
     return simulate_observation(
-        scene, aperture, image_grid(config), turbulence, detector, n_frames, generator, callback=callback
+        scene, aperture, image_grid(options), turbulence, detector, n_frames, generator, callback=callback
     )
 
 
-def restore(config: Config, observation: Observation, callback: Callback) -> RestorationResult:
+def restore(options: Options, observation: Observation, callback: Callback) -> RestorationResult:
     """Restore the object from the frames."""
-    method = inversion(config, observation.aperture, config.restoration.n_modes)
+    method = inversion(options, observation.aperture, options.restoration.n_modes)
     return method.restore(observation.frames, callback=callback)
-
-
-def under(stage: str, callback: Callback) -> Callback:
-    """The same callback under another stage's name: both instruments run the same algorithms."""
-    return lambda record: callback(dataclasses.replace(record, stage=stage))
 
 
 def metrics(observation: Observation, result: RestorationResult, cutoff: float) -> dict[str, float]:
@@ -201,13 +183,13 @@ def metrics(observation: Observation, result: RestorationResult, cutoff: float) 
     }
 
 
-def codesign(config: Config, scene: torch.Tensor, output: Run) -> dict[str, dict[str, float]]:
+def codesign(options: Options, scene: torch.Tensor, output: Run) -> dict[str, dict[str, float]]:
     """Design, observe, restore and compare; returns the metrics of each instrument."""
     logger, callback = output.logger, output.callback
-    design = design_mask(config, callback)
-    log_design(design, image_grid(config), logger)
+    design = design_mask(options, callback)
+    log_design(design, image_grid(options), logger)
     mask = design.aperture
-    cutoff = image_grid(config).cutoff(config.imaging.diameter)
+    cutoff = image_grid(options).cutoff(options.imaging.diameter)
     full = FullAperture(mask.extent)
     table: dict[str, dict[str, float]] = {}
     arrays: dict[str, torch.Tensor | float] = {
@@ -218,9 +200,9 @@ def codesign(config: Config, scene: torch.Tensor, output: Run) -> dict[str, dict
     pictures = {}
     for name, aperture in (("mask", mask), ("full", full)):
         light = scene * (aperture.area / mask.area)
-        observation = observe(config, light, aperture, under(f"observation/{name}", callback))
+        observation = observe(options, light, aperture, label_stage(callback, name))
         log_observation(f"observation/{name}", observation, logger)
-        result = restore(config, observation, under(f"restoration/{name}", callback))
+        result = restore(options, observation, label_stage(callback, name))
         logger.figure(f"restoration/{name}_cost", viz.history_figure({name: result.cost.tolist()}, "cost"))
         table[name] = metrics(observation, result, cutoff)
         for key, value in table[name].items():
@@ -228,7 +210,7 @@ def codesign(config: Config, scene: torch.Tensor, output: Run) -> dict[str, dict
         pictures[f"{name}, {table[name]['photons_per_frame']:.1e} photons"] = (observation.frames[0], result.object)
         arrays |= {f"{name}_object": result.object, f"{name}_coefficients": result.coefficients}
         arrays |= {f"{name}_frames": observation.frames}
-    logger.figure("comparison", viz.comparison_figure(scene, pictures, cutoff, image_grid(config).pixel_scale))
+    logger.figure("comparison", viz.comparison_figure(scene, pictures, cutoff, image_grid(options).pixel_scale))
     logger.table("comparison/table", [{"instrument": name, **row} for name, row in table.items()])
     save_npz(logger.directory / "result.npz", {**arrays, "scene": scene})
     return table
@@ -245,13 +227,12 @@ def print_table(table: dict[str, dict[str, float]]) -> None:
     Console().print(view)
 
 
-def run(config: Config) -> None:
+def run(options: Options) -> None:
     """Run in a new folder; an interrupted run leaves there what it reached."""
-    directory = config.runs / (config.name or datetime.now().strftime("codesign-%Y%m%d-%H%M%S"))
-    config = with_presets(config)
-    check(config)
-    scene = make_scene(image_grid(config).shape, config.imaging.n_photons, config.scene)
-    with new_run("codesign", config, directory, config.seed) as output:
-        output.summary.append(f"look at it with: tensorboard --logdir {config.runs}")
-        table = codesign(config, scene, output)
+    options = with_presets(options)
+    check(options)
+    scene = make_scene(image_grid(options).shape, options.imaging.n_photons, options.scene)
+    with new_run("codesign", options, options.seed) as output:
+        output.summary.append(f"look at it with: tensorboard --logdir {output.directory.parent}")
+        table = codesign(options, scene, output)
     print_table(table)

@@ -1,4 +1,4 @@
-"""Options from the command line and from config.yaml, and back to config.yaml.
+"""Options to config.yaml and back.
 
 A config file holds what a result depends on. It is plain YAML: read without constructing any object, and strictly, so
 that a misspelt key cannot be taken for a default.
@@ -6,11 +6,9 @@ that a misspelt key cannot be taken for a default.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import types
 import typing
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union
 
@@ -20,29 +18,9 @@ T = TypeVar("T")
 
 CONFIG = "config.yaml"  # its name in the folder of a run
 _COMMAND = "command"  # the key that says which command a config file is for
-# Where results go and how errors are shown: no part of what is computed.
-_NOT_STORED = ("out", "name", "runs", "config", "resume", "debug")
+# Where work is done, where results go and how errors are shown: no part of what is computed.
+_NOT_STORED = ("out", "config", "resume", "debug", "sweep", "workers", "backend")
 _KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text", Path: "a path"}
-
-
-def parse(options: type[T], command: str, argv: Sequence[str]) -> T:
-    """The options of a command, by falling priority: `argv`, the file behind --config, the defaults of `options`.
-
-    Without --config the file is that of the run behind --resume, if one is given.
-
-    Raises ValueError for a config file that `load_config` refuses, SystemExit for wrong usage and for --help.
-    """
-    import tyro
-
-    prog = f"torchmask {command}"
-    early = argparse.ArgumentParser(prog=prog, add_help=False, allow_abbrev=False)
-    early.add_argument("--config", type=Path)
-    early.add_argument("--resume", type=Path)
-    given = early.parse_known_args(argv)[0]
-    path = given.resume / CONFIG if given.config is None and given.resume is not None else given.config
-    if path is None:
-        return tyro.cli(options, prog=prog, args=argv)
-    return tyro.cli(options, prog=prog, args=argv, default=load_config(path, options, command))
 
 
 def save_config(path: str | Path, command: str, options: Any) -> None:
@@ -76,7 +54,7 @@ def load_config(path: str | Path, options: type[T], command: str) -> T:
         values = dict(_mapping({} if values is None else values, "the file"))
         made_for = values.pop(_COMMAND, command)
         if made_for != command:
-            raise ValueError(f"it is for `torchmask {made_for}`, not for `torchmask {command}`")
+            raise ValueError(f"it is for {made_for}, not for {command}")
         return _build(options, values)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error

@@ -22,9 +22,8 @@ from torchmask.grid import Grid
 from torchmask.io import write_json
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.packing import hole_diameter
-from torchmask.record import Callback, Record
+from torchmask.record import Callback, Record, fan_out
 from torchmask.spectra import NoisePSD, PowerLawPSD
-from torchmask.tracking import fan_out
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +94,7 @@ def run(options: Options) -> None:
     )
     rules = constraints(options)
     last: list[Record] = []
-    with new_run("design", options, options.out, options.seed) as output:
+    with new_run("design", options, options.seed) as output:
         started = time.perf_counter()
 
         def keep(record: Record) -> None:

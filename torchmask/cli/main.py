@@ -1,18 +1,14 @@
-"""The command line: `torchmask COMMAND ...`.
-
-Exit status: 0 done; 1 something the user can mend, said in one line; 2 wrong usage; 130 interrupted.
-"""
+"""The command line: `torchmask COMMAND ...`."""
 
 from __future__ import annotations
 
 import argparse
 import importlib
-import os
 import sys
-import warnings
 from collections.abc import Sequence
 
 from torchmask import __version__
+from torchmask.cli.program import exit_status, parse
 
 COMMANDS = {
     "design": "search the mask with the smallest error of the restored image",
@@ -22,19 +18,23 @@ COMMANDS = {
     "masks": "list the catalogue of masks, or show one",
     "view": "draw a mask, a stack, a result or a run, and say what it holds",
 }
-# What the commands need beyond a plain install, by the name of the module.
-_EXTRAS = ("tyro", "rich", "yaml", "tensorboard", "matplotlib", "astropy", "cma", "imageio", "skimage", "kornia")
-_EXTRAS += ("trimesh", "ezdxf")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; returns the exit status, or raises SystemExit (2, or 0 for --help) from parsing the options."""
+    """Run a command; returns the exit status, or raises SystemExit (2, or 0 for --help) from parsing the options.
+
+    The statuses are those of `torchmask.cli.program`.
+    """
     arguments = list(sys.argv[1:] if argv is None else argv)
     parser = _parser()
     command = parser.parse_args(arguments[:1]).command
-    with warnings.catch_warnings():
-        warnings.showwarning = lambda message, *_, **__: _say(command, f"warning: {message}")
-        return _run(command, arguments[1:])
+    program = f"torchmask {command}"
+
+    def work() -> None:
+        module = importlib.import_module(f"torchmask.cli.{command}")
+        module.run(parse(module.Options, command, arguments[1:], prog=program))
+
+    return exit_status(program, work, debug="--debug" in arguments)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -50,36 +50,3 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("command", choices=COMMANDS, metavar="COMMAND", help="one of those above")
     parser.add_argument("--version", action="version", version=f"torchmask {__version__}")
     return parser
-
-
-def _run(command: str, argv: list[str]) -> int:
-    debug = "--debug" in argv
-    try:
-        module = importlib.import_module(f"torchmask.cli.{command}")
-        parse = importlib.import_module("torchmask.cli.config").parse
-        module.run(parse(module.Options, command, argv))
-    except KeyboardInterrupt:
-        if debug:
-            raise
-        _say(command, "interrupted")
-        return 130
-    except ModuleNotFoundError as error:
-        missing = (error.name or "").partition(".")[0]
-        if debug or missing not in _EXTRAS:
-            raise
-        _say(command, f"needs {missing}, which a plain install leaves out: pip install 'torchmask[experiments]'")
-        return 1
-    except BrokenPipeError:  # `torchmask masks | head` has read enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
-        return 1
-    except (ValueError, OSError) as error:
-        if debug:
-            raise
-        _say(command, f"error: {error}")
-        return 1
-    return 0
-
-
-def _say(command: str, message: str) -> None:
-    """One line on standard error, whatever the message looks like."""
-    print(f"torchmask {command}: {' '.join(message.split())}", file=sys.stderr)

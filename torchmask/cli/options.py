@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from torchmask.design.manufacture import load_mask
 from torchmask.optics.aperture import Aperture, FullAperture, SparseAperture
+from torchmask.record import Callback
 
 FULL = "full"  # what stands for a full pupil among the names of masks
 MASK_SUFFIXES = (".json", ".dxf", ".fits")
@@ -37,6 +38,36 @@ class RunOptions(ConfigOptions):
 
     out: Path | None = None
     """New folder for the results, for instance runs/first; None: runs/COMMAND-date-time."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExperimentOptions(RunOptions):
+    """Whether it is in earnest."""
+
+    smoke: bool = False
+    """Everything tiny, to see that it runs."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorkerOptions:
+    """Where tasks are done."""
+
+    workers: int | None = None
+    """Processes at a time; None: one per core."""
+    backend: Literal["loky", "ray"] = "loky"
+    """This machine or a Ray cluster."""
+
+    def keywords(self, callback: Callback) -> dict[str, Any]:
+        """The same as `run_tasks` and `design_table` call it."""
+        return {"n_workers": self.workers, "backend": self.backend, "callback": callback}
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepOptions(WorkerOptions, ExperimentOptions):
+    """An experiment of many independent tasks."""
+
+    sweep: Path = Path("runs/sweep")
+    """Where finished tasks are kept: a run that was stopped goes on from there, and others share what they have."""
 
 
 @dataclass(frozen=True)

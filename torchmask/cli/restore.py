@@ -119,7 +119,7 @@ def run(options: Options) -> None:
         max_iterations=options.max_iterations,
         tolerance=options.tolerance,
     )
-    with new_run("restore", options, options.out) as output:
+    with new_run("restore", options) as output:
         state = output.directory / CHECKPOINT
         if checkpoint is not None:
             shutil.copyfile(checkpoint, state)

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from torchmask.cli.config import CONFIG, save_config, stored
+from torchmask.cli.options import RunOptions, SweepOptions
+from torchmask.io import atomic_write, free_name, write_json
 from torchmask.progress import Progress
-from torchmask.record import Callback, Record
-from torchmask.tracking import RunLogger, fan_out, free_name
+from torchmask.record import Callback, Record, fan_out
+from torchmask.tracking import RunLogger
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -27,9 +32,18 @@ class Run:
     callback: Callback
     summary: list[str] = field(default_factory=list)
 
+    def report(self, name: str, numbers: Mapping[str, Any], text: str, figure: Figure | None = None) -> None:
+        """Write NAME.json for programs, NAME.md for readers, and NAME.png; the last two for TensorBoard too."""
+        write_json(self.directory / f"{name}.json", numbers)
+        with atomic_write(self.directory / f"{name}.md") as file:
+            file.write(text.encode())
+        self.logger.text(name, text)
+        if figure is not None:
+            self.logger.figure(name, figure)
+
 
 @contextmanager
-def new_run(command: str, options: Any, directory: Path | None, seed: int | None = None) -> Iterator[Run]:
+def new_run(command: str, options: RunOptions, seed: int | None = None) -> Iterator[Run]:
     """Log to a new folder (by default runs/COMMAND-date-time), and to the terminal.
 
     Where the request turns out to be impossible before any work is done (ValueError), the folder goes again. Whatever
@@ -37,7 +51,7 @@ def new_run(command: str, options: Any, directory: Path | None, seed: int | None
 
     Raises ValueError if the folder exists or cannot be made.
     """
-    directory = directory or free_name(Path("runs") / datetime.now().strftime(f"{command}-%Y%m%d-%H%M%S"))
+    directory = options.out or free_name(Path("runs") / datetime.now().strftime(f"{command}-%Y%m%d-%H%M%S"))
     parents = [parent for parent in directory.parents if not parent.exists()]
     useless = False  # until the folder is ours, and again once it holds results
 
@@ -54,6 +68,8 @@ def new_run(command: str, options: Any, directory: Path | None, seed: int | None
             yield run
     except KeyboardInterrupt:
         print(f"\nwhat was reached is in {directory}", file=sys.stderr)
+        if isinstance(options, SweepOptions):
+            print(f"with --sweep {options.sweep} the next run goes on from there", file=sys.stderr)
         raise
     except ValueError:
         if useless:

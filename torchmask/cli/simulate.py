@@ -58,7 +58,7 @@ def run(options: Options) -> None:
     turbulence = None if options.r0 is None else TurbulencePhase(options.r0, options.outer_scale)
     detector = Detector(options.readout_noise)
     scene = make_scene(grid.shape, options.n_photons, options.scene)
-    with new_run("simulate", options, options.out, options.seed) as output:
+    with new_run("simulate", options, options.seed) as output:
         generator = torch.Generator().manual_seed(options.seed)
         observation = simulate_observation(
             scene, aperture, grid, turbulence, detector, options.n_frames, generator, callback=output.callback

@@ -1,0 +1,149 @@
+"""A program of the command line: options in, exit status out. Each `torchmask COMMAND` is one, and each script that
+shares its ways.
+
+Exit status: 0 done; 1 something the user can mend, said in one line; 2 wrong usage; 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import os
+import sys
+import typing
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+from torchmask.cli.config import CONFIG, load_config
+
+T = TypeVar("T")
+
+# What programs need beyond a plain install, by the name of the module.
+_EXTRAS = ("tyro", "rich", "yaml", "tensorboard", "matplotlib", "astropy", "cma", "imageio", "skimage", "kornia")
+_EXTRAS += ("trimesh", "ezdxf", "joblib")
+
+
+def run_script(
+    name: str, run: Callable[[T], None], options: type[T], description: str | None, argv: Sequence[str] | None = None
+) -> int:
+    """Parse the options of a script and run it; returns the exit status.
+
+    Parameters
+    ----------
+    name : str
+        Of the script: it begins every message, and stands in its config files.
+    run : callable
+        Does the work. What it raises as ValueError or OSError is a mistake of the user's, and becomes one line.
+    options : type
+        Dataclass whose fields are the options; those of `torchmask.cli.options` bring --config, --debug and --out.
+    description : str, optional
+        Heads the help, usually the docstring of the script.
+    argv : sequence of str, optional
+        None: the arguments of the process.
+
+    Raises SystemExit (2, or 0 for --help) from parsing the options.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    return exit_status(
+        name,
+        lambda: run(parse(options, name, arguments, prog=name, description=description)),
+        debug="--debug" in arguments,
+    )
+
+
+def exit_status(program: str, work: Callable[[], None], debug: bool) -> int:
+    """Do the work; mistakes and warnings become one line each, unless `debug` asks for the traceback."""
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda message, *_, **__: _say(program, f"warning: {message}")
+        try:
+            work()
+        except KeyboardInterrupt:
+            if debug:
+                raise
+            _say(program, "interrupted")
+            return 130
+        except ModuleNotFoundError as error:
+            missing = (error.name or "").partition(".")[0]
+            if debug or missing not in _EXTRAS:
+                raise
+            _say(program, f"needs {missing}, which a plain install leaves out: pip install 'torchmask[experiments]'")
+            return 1
+        except BrokenPipeError:  # `torchmask masks | head` has read enough
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
+            return 1
+        except (ValueError, OSError) as error:
+            if debug:
+                raise
+            _say(program, f"error: {error}")
+            return 1
+    return 0
+
+
+def parse(options: type[T], command: str, argv: Sequence[str], *, prog: str, description: str | None = None) -> T:
+    """The options of a program, by falling priority: `argv`, the file behind --config, the defaults of `options`.
+
+    Without --config the file is that of the run behind --resume, for a program that has this option.
+
+    Raises ValueError for values that an option cannot have and for a config file that `load_config` refuses, SystemExit
+    for wrong usage and for --help.
+    """
+    import tyro
+
+    early = argparse.ArgumentParser(prog=prog, add_help=False, allow_abbrev=False)
+    known = {field.name for field in dataclasses.fields(typing.cast(Any, options))}
+    for name in known & {"config", "resume"}:
+        early.add_argument(f"--{name}", type=Path)
+    given = vars(early.parse_known_args(argv)[0])
+    path, resumed = given.get("config"), given.get("resume")
+    if path is None and resumed is not None:
+        path = resumed / CONFIG
+    default: dict[str, Any] = {} if path is None else {"default": load_config(path, options, command)}
+    with _checked_at_the_end(options):
+        return tyro.cli(options, prog=prog, args=argv, description=description, **default)
+
+
+@contextmanager
+def _checked_at_the_end(options: type) -> Iterator[None]:
+    """Groups of options check themselves when they are made, which tyro would call wrong usage.
+
+    So here the first mistake waits until all is parsed.
+    """
+    mistakes: list[ValueError] = []
+    kinds = {kind for group in _groups(options) for kind in group.__mro__ if "__post_init__" in vars(kind)}
+    checks = {kind: kind.__post_init__ for kind in kinds}
+
+    def deferred(check: Callable[[Any], None]) -> Callable[[Any], None]:
+        def note(self: Any) -> None:
+            try:
+                check(self)
+            except ValueError as error:
+                mistakes.append(error)
+
+        return note
+
+    for kind, check in checks.items():
+        kind.__post_init__ = deferred(check)
+    try:
+        yield
+    finally:
+        for kind, check in checks.items():
+            kind.__post_init__ = check
+    if mistakes:
+        raise mistakes[0]
+
+
+def _groups(options: type) -> set[Any]:
+    """The dataclasses that `options` is made of, itself among them."""
+    found = {options}
+    for hint in typing.get_type_hints(options).values():
+        if dataclasses.is_dataclass(hint):
+            found |= _groups(typing.cast(type, hint))
+    return found
+
+
+def _say(program: str, message: str) -> None:
+    """One line on standard error, whatever the message looks like."""
+    print(f"{program}: {' '.join(message.split())}", file=sys.stderr)
