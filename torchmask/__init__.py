@@ -23,7 +23,9 @@ from torchmask.optics.otf import OTF
 from torchmask.optics.psf import PSF
 from torchmask.optics.zernike import ZernikePhase
 from torchmask.restoration.baselines import average_psf, shift_and_add
+from torchmask.restoration.many import restore_many
 from torchmask.restoration.myopic import MyopicDeconvolution
+from torchmask.restoration.priors import EdgePreserving, TotalVariation
 from torchmask.restoration.result import RestorationResult
 from torchmask.restoration.wiener import multiframe_wiener
 from torchmask.simulation.dataset import StackDataset, StackRanges
@@ -39,6 +41,7 @@ __all__ = [
     "PSF",
     "AsymptoticMSE",
     "Detector",
+    "EdgePreserving",
     "FullAperture",
     "Grid",
     "MyopicDeconvolution",
@@ -53,6 +56,7 @@ __all__ = [
     "SparseAperture",
     "StackDataset",
     "StackRanges",
+    "TotalVariation",
     "TurbulencePhase",
     "ZernikePhase",
     "average_psf",
@@ -64,6 +68,7 @@ __all__ = [
     "multiframe_wiener",
     "read_observation",
     "refine_mask",
+    "restore_many",
     "restored_observables",
     "save_oifits",
     "save_restored",

@@ -11,6 +11,7 @@ from torchmask.metrics import relative_error
 from torchmask.observation import Observation
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.detector import Detector, image_formation
+from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.simulation.exposures import simulate_observation
 
 if importlib.util.find_spec("deepinv") is None:
@@ -35,7 +36,7 @@ def import_torchvision():
 
 import_torchvision()
 deepinv = pytest.importorskip("deepinv")
-from torchmask.interop.deepinv import StackPhysics  # noqa: E402
+from torchmask.interop.deepinv import DeepinvPrior, StackPhysics  # noqa: E402
 
 GRID = Grid.nyquist(1.0, 550e-9, 32)
 MASK = SparseAperture.from_catalog("golay6", mask_diameter=1.0, fill_factor=0.3)
@@ -177,3 +178,40 @@ def test_bad_images_and_observations_are_refused(observation):
         physics.A(torch.rand(1, 1, 9, 9).double())
     with pytest.raises(ValueError, match="no psfs"):
         StackPhysics.from_observation(Observation(observation.frames, MASK, GRID, 1.5))
+
+
+PRIORS = {
+    "smoothed TV": lambda: deepinv.optim.SmoothedTVPrior(),
+    "Tikhonov": lambda: deepinv.optim.Tikhonov(),
+    "relative differences": lambda: deepinv.optim.RDP(),
+}
+
+
+@pytest.mark.parametrize("make", PRIORS.values(), ids=PRIORS)
+def test_a_prior_of_deepinv_has_its_value_gradient_and_curvature(make):
+    """Gradient against central differences along a random direction; the curvature is not negative."""
+    prior = DeepinvPrior(make(), weight=0.7, unit=3.0)
+    image = 1 + torch.rand(12, 10, dtype=torch.float64, generator=seeded())
+    value, slope = prior.value_and_gradient(image)
+    assert float(value) == pytest.approx(0.7 * float(make()(image[None, None] / 3.0)), rel=1e-6)
+    along = torch.randn(12, 10, dtype=torch.float64, generator=seeded())
+    high, low = (float(prior.value_and_gradient(image + step * along)[0]) for step in (1e-4, -1e-4))
+    assert float((slope * along).sum()) == pytest.approx((high - low) / 2e-4, rel=1e-5)
+    assert float(prior.curvature(image).min()) >= 0
+
+
+def test_a_restoration_takes_it(observation):
+    prior = DeepinvPrior(deepinv.optim.SmoothedTVPrior())
+    result = MyopicDeconvolution(MASK, GRID, 3, prior=prior, max_iterations=100).restore(observation.frames)
+    ours, mean = (
+        relative_error(image, observation.object, 0.5) for image in (result.object, observation.frames.mean(0))
+    )
+    assert ours < mean
+    assert "SmoothedTVPrior" in result.prior
+
+
+def test_a_prior_without_a_value_is_refused():
+    with pytest.raises(ValueError, match="has no value"):
+        DeepinvPrior(deepinv.optim.PnP(deepinv.models.MedianFilter()))
+    with pytest.raises(ValueError, match="weight is -1"):
+        DeepinvPrior(deepinv.optim.Tikhonov(), weight=-1.0)

@@ -9,19 +9,15 @@ from __future__ import annotations
 
 import hashlib
 import json
-import traceback
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
-
+from torchmask.design.workers import require_backend, run_side_by_side
 from torchmask.io import read_json, to_json, write_json
 from torchmask.record import Callback, Record
 
-BACKENDS = ("loky", "ray")
 Task = Mapping[str, Any]
 
 
@@ -87,11 +83,12 @@ def run_tasks(
     n_tasks = len(pending)
     pending = {path: task for path, task in pending.items() if path not in results}
     failures = []
-    for path, result, failure in _compute(function, pending, backend, n_workers):
-        if failure is not None:
-            failures.append(f"{pending[path]}\n{failure}")
+    for outcome in run_side_by_side(function, pending, backend, n_workers):
+        path = outcome.key
+        if outcome.error is not None:
+            failures.append(f"{pending[path]}\n{outcome.traceback}")
             continue
-        result = to_json(result)
+        result = to_json(outcome.value)
         write_json(path, {"task": pending[path], "result": result, "sha256": _digest(result)}, replace=True)
         results[path] = result
         if callback is not None:
@@ -100,23 +97,6 @@ def run_tasks(
     if failures:
         raise RuntimeError(f"{len(failures)} of {n_tasks} tasks failed, the others are in {folder}: {failures[0]}")
     return [results[path] for path in paths]
-
-
-def require_backend(backend: str, n_workers: int | None) -> None:
-    """Raise ValueError unless tasks can run there: see `run_tasks`."""
-    if backend not in BACKENDS:
-        raise ValueError(f"backend is {backend!r}: known backends are {', '.join(BACKENDS)}")
-    if n_workers is not None and (n_workers != int(n_workers) or n_workers < 1):
-        raise ValueError(f"n_workers is {n_workers}: it must be a whole number of at least 1, or None for all cores")
-    try:
-        import joblib  # noqa: F401
-    except ImportError as error:
-        raise ValueError("a sweep needs joblib: pip install 'torchmask[design]'") from error
-    if backend == "ray":
-        try:
-            import ray  # noqa: F401
-        except ImportError as error:
-            raise ValueError("backend 'ray' needs Ray: pip install 'torchmask[cluster]'") from error
 
 
 def _digest(value: Any) -> str:
@@ -137,58 +117,3 @@ def _load(path: Path, task: Task) -> dict[str, Any] | None:
     except (ValueError, KeyError, TypeError) as error:
         warnings.warn(f"the file {path} is damaged ({error}): its task is computed again", RuntimeWarning, stacklevel=3)
         return None
-
-
-def _compute(
-    function: Callable[..., Any], pending: Mapping[Path, Task], backend: str, n_workers: int | None
-) -> Iterator[tuple[Path, Any, str | None]]:
-    """(path, result, None) or (path, None, traceback) of each task as it ends."""
-    import joblib
-
-    if not pending:
-        return
-    with _registered(backend) as cores:
-        n_jobs = min(n_workers or cores, len(pending))
-        # one task at a time: a batch would come back as a whole
-        options: dict[str, Any] = {"batch_size": 1, "pre_dispatch": "n_jobs", "return_as": "generator_unordered"}
-        parallel: Any = joblib.Parallel(n_jobs, backend=backend, **options)
-        yield from parallel(joblib.delayed(_guarded)(function, path, task) for path, task in pending.items())
-
-
-def _guarded(function: Callable[..., Any], path: Path, task: Task) -> tuple[Path, Any, str | None]:
-    """One task on one thread; a failure travels as text, so that it does not end the others."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        return path, function(dict(task)), None
-    except Exception:
-        return path, None, traceback.format_exc()
-    finally:
-        torch.set_num_threads(threads)
-
-
-@contextmanager
-def _registered(backend: str) -> Iterator[int]:
-    """The number of cores behind a backend, made known to joblib."""
-    import joblib
-
-    if backend == "loky":
-        yield joblib.cpu_count()
-        return
-    import ray
-    from ray.util.joblib.ray_backend import RayBackend
-
-    class Backend(RayBackend):
-        # joblib takes this from its parent, a pool of local processes that may wait for ever for one that died.
-        # Ray's actors report their death.
-        supports_return_generator = True
-
-    joblib.register_parallel_backend("ray", Backend)
-    ours = not ray.is_initialized()
-    if ours:
-        ray.init(log_to_driver=False)
-    try:
-        yield int(ray.cluster_resources()["CPU"])
-    finally:
-        if ours:
-            ray.shutdown()

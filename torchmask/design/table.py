@@ -21,7 +21,8 @@ from torchmask.design.constraint_base import Infeasible
 from torchmask.design.criterion import AsymptoticMSE, wiener_mse
 from torchmask.design.search import search_mask
 from torchmask.design.space import AXES, Design, DesignSpace
-from torchmask.design.sweep import require_backend, run_tasks
+from torchmask.design.sweep import run_tasks
+from torchmask.design.workers import require_backend
 from torchmask.grid import Grid
 from torchmask.io import atomic_write, write_json
 from torchmask.optics.aperture import SparseAperture

@@ -1,4 +1,4 @@
-"""torchmask's exposures as a physics of deepinv, so that its priors, optimisers and samplers run on them.
+"""torchmask's exposures as a physics of deepinv, and deepinv's priors in a restoration of torchmask.
 
 Needs the extra `deepinv`; nothing else in torchmask imports this module.
 """
@@ -8,11 +8,13 @@ from __future__ import annotations
 import math
 
 import torch
+from deepinv.optim import Prior  # pyright: ignore[reportMissingImports] -- an extra
 from deepinv.physics import LinearPhysics, PoissonGaussianNoise  # pyright: ignore[reportMissingImports] -- an extra
 from torch import Tensor
 
 from torchmask.observation import Observation
 from torchmask.optics.detector import image_formation, image_formation_adjoint
+from torchmask.restoration.priors import ObjectPrior
 
 
 class StackPhysics(LinearPhysics):
@@ -109,3 +111,50 @@ class StackPhysics(LinearPhysics):
         if y.ndim != 4 or y.shape[1] != n_frames:
             raise ValueError(f"the stack has shape {tuple(y.shape)}: it must be (batch, {n_frames}, rows, columns)")
         return image_formation_adjoint(y, self.psfs).sum(1, keepdim=True)
+
+
+class DeepinvPrior(ObjectPrior):
+    """A prior of deepinv as that on the object of a `MyopicDeconvolution`: weight * prior(image / unit).
+
+    Parameters
+    ----------
+    prior : deepinv.optim.Prior
+        An explicit one, which has a value: of `TVPrior` and the like, not of plug-and-play denoisers.
+    weight : float
+    unit : float
+        What counts as 1 for the prior, in mean pixels of the stack.
+
+    Raises
+    ------
+    ValueError
+        If the prior has no value, or a number is not finite and positive.
+
+    Examples
+    --------
+    >>> prior = DeepinvPrior(deepinv.optim.SmoothedTVPrior(), weight=1.0)  # doctest: +SKIP
+    >>> method = MyopicDeconvolution(mask, grid, prior=prior)  # doctest: +SKIP
+    """
+
+    def __init__(self, prior: Prior, weight: float = 1.0, unit: float = 1.0) -> None:
+        super().__init__()
+        if not prior.explicit_prior:
+            raise ValueError(f"{type(prior).__name__} has no value to minimise: give an explicit prior, as TVPrior is")
+        for name, value in (("weight", weight), ("unit", unit)):
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"{name} is {value}: it must be finite and positive")
+        self.prior = prior
+        self.weight: float = float(weight)
+        self.unit: float = float(unit)
+
+    def forward(self, image: Tensor) -> Tensor:
+        return self.weight * self.prior(image[None, None] / self.unit).sum()
+
+    def value_and_gradient(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """By deepinv's own gradient, which knows what to do where the penalty has a kink."""
+        with torch.no_grad():
+            value = self(image)
+        slope = self.prior.grad(image.detach()[None, None] / self.unit)[0, 0]
+        return value, (self.weight / self.unit) * slope.detach()
+
+    def extra_repr(self) -> str:
+        return f"weight={self.weight:g}, unit={self.unit:g}"

@@ -1,0 +1,100 @@
+"""Several stacks restored side by side, one on each core of a machine or a cluster."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+
+from torch import Tensor
+
+from torchmask.design.workers import require_backend, run_side_by_side
+from torchmask.observation import Observation
+from torchmask.record import Callback, Record
+from torchmask.restoration.myopic import MyopicDeconvolution
+from torchmask.restoration.result import RestorationResult
+
+
+def restore_many(
+    method: MyopicDeconvolution | Sequence[MyopicDeconvolution],
+    stacks: Sequence[Tensor | Observation],
+    *,
+    n_samples: int = 0,
+    seed: int = 0,
+    backend: str = "loky",
+    n_workers: int | None = None,
+    callback: Callback | None = None,
+) -> list[RestorationResult | Exception]:
+    """Restore every stack, each on one core; what goes wrong with one harms no other.
+
+    Parameters
+    ----------
+    method : MyopicDeconvolution, or one for each stack
+    stacks : sequence
+        Frames (T, H, W) [electrons], or observations, whose invalid pixels are left out.
+    n_samples, seed : int
+        As for `MyopicDeconvolution.restore`.
+    backend : {"loky", "ray"}
+        Processes on this machine (extra `design`), or a Ray cluster (extra `cluster`).
+    n_workers : int, optional
+        How many stacks at once; by default one per core. With 1 and "loky" they are restored in this process.
+    callback : callable, optional
+        Gets a `Record` of stage "stacks" after each stack: how many are done, and of that one its number, and
+        chi-square and iterations, or NaN if it failed.
+
+    Returns
+    -------
+    list
+        In the order of `stacks`: a `RestorationResult`, or the exception that the restoration ended with.
+
+    Raises
+    ------
+    ValueError
+        Before any work: unknown backend, a number of workers below 1, missing joblib or Ray, not as many methods as
+        stacks, a single tensor in place of a sequence of them.
+
+    Examples
+    --------
+    >>> import torch
+    >>> from torchmask.grid import Grid
+    >>> from torchmask.optics.aperture import SparseAperture
+    >>> mask = SparseAperture([[0.0, 0.3], [-0.3, -0.2], [0.3, -0.2]], 0.2, 1.0)
+    >>> method = MyopicDeconvolution(mask, Grid.nyquist(1.0, 550e-9, 32), n_modes=3, max_iterations=3)
+    >>> frames = torch.full((4, 32, 32), 20.0); frames[:, 12:20, 12:20] = 1000.0
+    >>> frames = torch.poisson(frames, generator=torch.Generator().manual_seed(0))
+    >>> one, other = restore_many(method, [frames, -frames], n_workers=1)
+    >>> one.object.shape, other
+    (torch.Size([32, 32]), ValueError('frames [0, 1, 2, 3] hold no light: leave them out'))
+    """
+    require_backend(backend, n_workers)
+    if isinstance(stacks, Tensor):
+        raise ValueError(
+            f"stacks is one tensor of shape {tuple(stacks.shape)}: give a list of stacks (T, H, W), or take "
+            "method.restore for one"
+        )
+    methods = [method] * len(stacks) if isinstance(method, MyopicDeconvolution) else list(method)
+    if len(methods) != len(stacks):
+        raise ValueError(
+            f"{len(methods)} methods are given for {len(stacks)} stacks: one for all, or as many are needed"
+        )
+    restore = partial(_restore, n_samples=n_samples, seed=seed)
+    tasks = dict(enumerate(zip(methods, stacks, strict=True)))
+    results: dict[int, RestorationResult | Exception] = {}
+    for outcome in run_side_by_side(restore, tasks, backend, n_workers):
+        result = outcome.value if outcome.error is None else outcome.error
+        results[outcome.key] = result
+        if callback is not None:
+            callback(Record("stacks", len(results), len(tasks), _numbers(outcome.key, result)))
+    return [results[number] for number in range(len(tasks))]
+
+
+def _restore(task: tuple[MyopicDeconvolution, Tensor | Observation], n_samples: int, seed: int) -> RestorationResult:
+    method, stack = task
+    if isinstance(stack, Observation):
+        return method.restore(stack.frames, valid=stack.valid, n_samples=n_samples, seed=seed)
+    return method.restore(stack, n_samples=n_samples, seed=seed)
+
+
+def _numbers(number: int, result: RestorationResult | Exception) -> dict[str, float]:
+    if isinstance(result, Exception):
+        return {"stack": number, "chi_square": float("nan"), "iterations": float("nan")}
+    return {"stack": number, "chi_square": float(result.chi_square.mean()), "iterations": len(result.cost)}
