@@ -2,7 +2,6 @@
 
 import importlib.util
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +11,6 @@ from hypothesis import strategies as st
 from skimage.metrics import structural_similarity
 
 from torchmask.metrics import align, lowpass, relative_error, shift, ssim
-
-STACKS = Path(__file__).parents[2] / "shared" / "stacks"
 
 
 def smooth_scene(rows: int, columns: int, cutoff: float, seed: int = 0) -> torch.Tensor:
@@ -154,10 +151,8 @@ def test_tensors_arrays_and_dtypes_agree():
     assert relative_error((estimate * 1000).round().long(), truth, 0.4) == pytest.approx(expected, abs=2e-3)
 
 
-def test_shared_definition():
-    if not (STACKS / "score.py").is_file():
-        pytest.skip("the stacks with the definition of the score are not beside this checkout")
-    spec = importlib.util.spec_from_file_location("shared_score", STACKS / "score.py")
+def test_shared_definition(shared):
+    spec = importlib.util.spec_from_file_location("shared_score", shared / "stacks" / "score.py")
     assert spec is not None
     assert spec.loader is not None
     definition = importlib.util.module_from_spec(spec)
@@ -165,7 +160,7 @@ def test_shared_definition():
     rng = np.random.default_rng(0)
     # Registered to 1e-3 pixel there and far finer here, the two differ by about (1e-3)^2 times the curvature.
     for name in ("skylab_1e7_mask", "mgs_1e6_full"):
-        with np.load(STACKS / f"{name}.npz", allow_pickle=False) as stack:
+        with np.load(shared / "stacks" / f"{name}.npz", allow_pickle=False) as stack:
             truth, frames = stack["object"], stack["frames"]
         for estimate in (frames[0], frames.mean(0), truth + truth.max() * rng.random(truth.shape)):
             for cutoff in (0.5, 0.2):

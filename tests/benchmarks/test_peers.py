@@ -10,27 +10,17 @@ import peers
 import pytest
 import torch
 
-from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.grid import Grid
 from torchmask.metrics import relative_error
 from torchmask.optics.aperture import FullAperture
-from torchmask.optics.detector import Detector
-from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
 
 GRID = Grid.nyquist(1.0, 550e-9, 48)
 
 
-def observe(strength=3.0, n_frames=8):
-    scene = make_scene(GRID.shape, 1e7, SceneOptions(size=0.5))
-    turbulence = TurbulencePhase(1 / strength, 20.0)
-    generator = torch.Generator().manual_seed(0)
-    return simulate_observation(scene, FullAperture(0.95), GRID, turbulence, Detector(1.5), n_frames, generator)
-
-
 @pytest.fixture(scope="module")
-def observation():
-    return observe()
+def observation(observe_satellite):
+    return observe_satellite(FullAperture(0.95), GRID, d_over_r0=3.0, n_frames=8)
 
 
 def best_score(candidates, observation):

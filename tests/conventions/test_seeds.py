@@ -10,10 +10,6 @@ GRID = tm.Grid.nyquist(diameter=1.0, wavelength=550e-9, n_pixels=32)
 MASK = tm.SparseAperture([[0.0, 0.3], [0.3, -0.2], [-0.3, -0.2]], 0.2, 1.0)
 
 
-def seeded(seed):
-    return torch.Generator().manual_seed(seed)
-
-
 def mask(generator):
     return tm.SparseAperture.random(5, 1.0, 0.1, generator).centers
 
@@ -34,7 +30,7 @@ def noise(generator):
 
 
 @pytest.mark.parametrize("draw", [mask, screens, frames, noise])
-def test_a_generator_decides_everything(draw):
+def test_a_generator_decides_everything(seeded, draw):
     state = torch.get_rng_state()
     first, again, other = draw(seeded(3)), draw(seeded(3)), draw(seeded(4))
     assert torch.equal(first, again)
@@ -56,7 +52,7 @@ def test_a_search_has_a_seed_of_its_own(method):
     assert np.array_equal(np.random.get_state()[1], numpy_state)  # noqa: NPY002
 
 
-def test_a_restoration_draws_no_chance():
+def test_a_restoration_draws_no_chance(seeded):
     observed = frames(seeded(0))
     method = tm.MyopicDeconvolution(MASK, GRID, n_modes=3, max_iterations=4)
     first, again = (method.restore(observed).object for _ in range(2))

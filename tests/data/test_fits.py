@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,7 +22,6 @@ from torchmask.restoration.result import RestorationResult
 fits = pytest.importorskip("astropy.io.fits")
 wcs = pytest.importorskip("astropy.wcs")
 
-REAL = Path(__file__).parents[3] / "shared" / "real" / "niriss"
 SCALE = 0.02  # arcsec
 HEADER = {"PIXELSCL": SCALE, "WAVELEN": 550e-9, "BUNIT": "electron", "RDNOISE": 3.0}
 SKY = {
@@ -569,12 +567,8 @@ def test_an_observation_of_parts_that_disagree_is_refused(mask, cube, fields, me
 # --- the real observations
 
 
-needs_real = pytest.mark.skipif(not REAL.is_dir(), reason="no real observations here")
-
-
-@needs_real
-def test_niriss_exposures_of_ab_dor():
-    paths = sorted(REAL.glob("ab-dor*.fits"))
+def test_niriss_exposures_of_ab_dor(niriss):
+    paths = sorted(niriss.glob("ab-dor*.fits"))
     mask = SparseAperture.from_catalog("jwst_niriss_ami_7")
     with pytest.raises(ValueError, match=r"no GAIN or EGAIN, which its unit DN/s needs: give gain"):
         read_observation(paths, mask)

@@ -270,11 +270,10 @@ def test_bad_scales_are_refused(tmp_path, suffix, scale):
         SAVE[suffix](tmp_path / f"mask{suffix}", masks()["discs"], scale=scale)
 
 
-def test_maps_too_coarse_for_the_holes_are_refused():
-    mask = SparseAperture.from_catalog("golay6", 1.0, 0.15)
+def test_maps_too_coarse_for_the_holes_are_refused(golay6):
     with pytest.raises(ValueError, match="at least 15 are needed") as error:
-        manufacture.amplitude_map(mask, 10)
-    manufacture.amplitude_map(mask, int(str(error.value).split("at least ")[1].split()[0]))
+        manufacture.amplitude_map(golay6, 10)
+    manufacture.amplitude_map(golay6, int(str(error.value).split("at least ")[1].split()[0]))
 
 
 def test_files_of_no_folder_are_refused(tmp_path):

@@ -1,7 +1,5 @@
 import dataclasses
-import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,8 +18,6 @@ from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.otf import hexagon_otf
 from torchmask.optics.psf import psf_from_samples
 
-SHARED = Path(__file__).parents[3] / "shared" / "masks.json"
-
 
 def mask_of(points, hole=0.1, diameter=1.0, **keywords):
     return SparseAperture(torch.as_tensor(np.array(points), dtype=torch.float64), hole, diameter, **keywords)
@@ -33,10 +29,8 @@ def lens(separation, radius):
     return 2 * radius**2 * (math.acos(x) - x * math.sqrt(1 - x**2)) if x < 1 else 0.0
 
 
-def test_the_catalogue_against_facts():
-    if not SHARED.exists():
-        pytest.skip("the file of facts the catalogue was made from is not here")
-    for name, fact in json.loads(SHARED.read_text())["masks"].items():
+def test_the_catalogue_against_facts(mask_facts):
+    for name, fact in mask_facts.items():
         entry, check = catalog.entry(name), fact["check"]
         mask = mask_of(entry.centers, entry.hole_diameter or 0.3, entry.pupil_diameter or 1.0, shape=entry.shape)
         mask.orientation = entry.orientation

@@ -38,11 +38,7 @@ def funnel(aperture):
     )
 
 
-def seeded(seed):
-    return torch.Generator().manual_seed(seed)
-
-
-def test_mean_growth_of_known_statistics(mask, bowl):
+def test_mean_growth_of_known_statistics(seeded, mask, bowl):
     result = machining_errors(bowl, mask, position_rms=0.003, n_draws=2000, generator=seeded(1))
     assert result.nominal_mse == 5
     mean, error = result.mean()
@@ -50,7 +46,7 @@ def test_mean_growth_of_known_statistics(mask, bowl):
     assert abs(mean - 12 * 0.003**2) < 4 * error
 
 
-def test_quantiles_of_known_statistics(mask, bowl):
+def test_quantiles_of_known_statistics(seeded, mask, bowl):
     result = machining_errors(bowl, mask, position_rms=0.003, n_draws=4000, generator=seeded(2))
     for level in (0.1, 0.5, 0.95):
         value, error = result.quantile(level)
@@ -61,14 +57,14 @@ def test_quantiles_of_known_statistics(mask, bowl):
         assert error == pytest.approx(math.sqrt(level * (1 - level) / 2000) / density, rel=0.5)
 
 
-def test_first_order_effects_leave_the_mean_exactly(mask):
+def test_first_order_effects_leave_the_mean_exactly(seeded, mask):
     result = machining_errors(slope, mask, position_rms=0.005, n_draws=64, generator=seeded(3))
     assert result.mean()[0] == pytest.approx(0, abs=1e-15)
     assert float(result.growth.std()) > 1e-3
 
 
 @pytest.mark.parametrize("quantile", [None, 0.9])
-def test_tolerance_of_known_statistics(mask, bowl, quantile):
+def test_tolerance_of_known_statistics(seeded, mask, bowl, quantile):
     result = machining_tolerance(
         bowl, mask, 4e-4, quantile=quantile, kind="position", n_draws=1000, generator=seeded(4)
     )
@@ -79,7 +75,7 @@ def test_tolerance_of_known_statistics(mask, bowl, quantile):
 
 
 @pytest.mark.parametrize(("quantile", "low", "high"), [(None, 0.6, 1.4), (0.9, 0.6, 1.4)])
-def test_the_statistical_error_covers_the_scatter(mask, bowl, quantile, low, high):
+def test_the_statistical_error_covers_the_scatter(seeded, mask, bowl, quantile, low, high):
     expected = math.sqrt(4e-4 / (12 if quantile is None else chi2(12).ppf(0.9)))
     results = [
         machining_tolerance(bowl, mask, 4e-4, quantile=quantile, kind="position", n_draws=200, generator=seeded(seed))
@@ -90,7 +86,7 @@ def test_the_statistical_error_covers_the_scatter(mask, bowl, quantile, low, hig
     assert low < math.sqrt((scores**2).mean()) < high
 
 
-def test_diameter_and_both(mask, bowl):
+def test_diameter_and_both(seeded, mask, bowl):
     def both(aperture):
         return bowl(aperture) / 5 * funnel(aperture) / 3
 
@@ -102,7 +98,7 @@ def test_diameter_and_both(mask, bowl):
 
 
 @pytest.mark.parametrize("kind", ["position", "diameter", "both"])
-def test_only_what_is_asked_for_errs(mask, bowl, kind):
+def test_only_what_is_asked_for_errs(seeded, mask, bowl, kind):
     moved, resized = set(), set()
 
     def record(aperture):
@@ -114,7 +110,7 @@ def test_only_what_is_asked_for_errs(mask, bowl, kind):
     assert (True in moved, True in resized) == (kind != "diameter", kind != "position")
 
 
-def test_the_diameter_error_is_gaussian_and_common_to_all_holes(mask):
+def test_the_diameter_error_is_gaussian_and_common_to_all_holes(seeded, mask):
     seen = []
 
     def record(aperture):
@@ -128,7 +124,7 @@ def test_the_diameter_error_is_gaussian_and_common_to_all_holes(mask):
     assert (np.abs(errors) < 0.002).mean() == pytest.approx(2 * norm.cdf(1) - 1, abs=4 * 0.033)
 
 
-def test_a_mask_that_only_gains_has_no_tolerance(mask):
+def test_a_mask_that_only_gains_has_no_tolerance(seeded, mask):
     result = machining_tolerance(lambda a: -(slope(a) ** 2) + 9, mask, n_draws=64, generator=seeded(8), kind="position")
     assert result.rms == math.inf
     assert math.isnan(result.error)
@@ -136,7 +132,7 @@ def test_a_mask_that_only_gains_has_no_tolerance(mask):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("name", ["golay6", "niriss"])
-def test_small_errors_follow_the_gradient_of_the_criterion(name, dtype):
+def test_small_errors_follow_the_gradient_of_the_criterion(seeded, name, dtype):
     """To first order each growth is the gradient along the error: its rms is the rms error times |g|."""
     criterion = AsymptoticMSE(Grid.nyquist(1.0, 550e-9, 96), PowerLawPSD(1.5, 1e7), NoisePSD(1e7), n_frames=20)
     criterion = criterion.to(dtype)
@@ -154,7 +150,7 @@ def test_small_errors_follow_the_gradient_of_the_criterion(name, dtype):
     assert float((result.growth**2).mean().sqrt()) / rms == pytest.approx(expected, rel=4 / math.sqrt(2 * 200))
 
 
-def test_diameter_errors_follow_the_derivative_of_the_criterion(mask):
+def test_diameter_errors_follow_the_derivative_of_the_criterion(seeded, mask):
     criterion = AsymptoticMSE(Grid.nyquist(1.0, 550e-9, 96), PowerLawPSD(1.5, 1e7), NoisePSD(1e7), n_frames=20)
 
     def logarithm(diameter):
@@ -165,7 +161,7 @@ def test_diameter_errors_follow_the_derivative_of_the_criterion(mask):
     assert float((result.growth**2).mean().sqrt()) / 1e-6 == pytest.approx(abs(expected), rel=4 / math.sqrt(2 * 200))
 
 
-def test_the_same_seed_gives_the_same_masks(mask, bowl):
+def test_the_same_seed_gives_the_same_masks(seeded, mask, bowl):
     first, again, other = (
         machining_errors(bowl, mask, 0.003, n_draws=32, generator=seeded(seed)).mse for seed in (11, 11, 12)
     )
@@ -173,7 +169,7 @@ def test_the_same_seed_gives_the_same_masks(mask, bowl):
     assert not torch.equal(first, other)
 
 
-def test_prints_its_main_numbers(mask, bowl):
+def test_prints_its_main_numbers(seeded, mask, bowl):
     text = str(machining_errors(bowl, mask, 0.003, n_draws=64, generator=seeded(13)))
     assert "0.003 m" in text
     assert "64 masks" in text

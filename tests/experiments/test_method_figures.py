@@ -94,16 +94,15 @@ def test_overlaps_computed_once_give_the_closed_form_otf():
     assert torch.allclose(asymptotic_limit.PistonOTFs(mask, grid).power(angles), expected, rtol=0, atol=1e-13)
 
 
-def test_the_mean_over_pistons_is_the_transfer_of_the_criterion():
+def test_the_mean_over_pistons_is_the_transfer_of_the_criterion(golay6):
     """E|h|^2 = N^2 |h~|^2 + sum over baselines |h~|^2: with noise far above the signal MSE_a gives it back."""
     grid = Grid.nyquist(1.0, 550e-9, 32)
-    mask = SparseAperture.from_catalog("golay6", 1.0, 0.15)
     nu = torch.hypot(*grid.frequencies(torch.float64))
-    power = asymptotic_limit.PistonOTFs(mask, grid).power(pistons(20_000, 6, 3))
+    power = asymptotic_limit.PistonOTFs(golay6, grid).power(pistons(20_000, 6, 3))
     for band in ((nu > 0.1) & (nu < 0.3), nu > 0.3):
         noise = 1e8
         criterion = AsymptoticMSE(grid, band.double(), torch.full(grid.shape, noise).double(), 1)
-        expected = float((1 - criterion.relative(mask)) * noise)
+        expected = float((1 - criterion.relative(golay6)) * noise)
         means = power[:, band].mean(-1)
         # 1 - S_n / (S_n + |h|^2) = |h|^2 / S_n less at most |h|^4 / S_n^2, |h| <= 1; the rest is rounding
         tolerance = 4 * float(means.std()) / math.sqrt(len(means)) + 1 / noise + 1e-15 * noise
@@ -124,13 +123,12 @@ def test_random_pistons_never_beat_the_limit_and_come_near_it(finished):
         assert abs(ratios[-1] - 1) < abs(ratios[0] - 1)
 
 
-def test_the_limit_is_that_of_the_criterion(finished):
+def test_the_limit_is_that_of_the_criterion(finished, golay6):
     grid = Grid.nyquist(1.0, 550e-9, 64)
-    mask = SparseAperture.from_catalog("golay6", 1.0, 0.15)
     for row in rows(finished, "asymptotic_limit"):
         if row["mask"] == "Golay-6":
             criterion = AsymptoticMSE(grid, PowerLawPSD(1.5, 1e7), NoisePSD(1e7), row["n_frames"])
-            assert row["mse_a"] == pytest.approx(float(criterion.relative(mask)), rel=1e-12)
+            assert row["mse_a"] == pytest.approx(float(criterion.relative(golay6)), rel=1e-12)
 
 
 def test_a_ratio_below_one_is_said_so():

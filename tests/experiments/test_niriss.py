@@ -2,7 +2,6 @@
 
 import json
 import math
-from pathlib import Path
 
 import companion_errors
 import companion_fit
@@ -21,7 +20,6 @@ from torchmask.optics.zernike import ZernikePhase
 # torch.func itself still scripts some derivatives.
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
 
-REAL = Path(__file__).parents[3] / "shared" / "real" / "niriss"
 MIDDLE, WIDTH = FILTERS[("NIRISS", "F480M")]
 SCALE = 0.0655 * ARCSEC
 
@@ -326,10 +324,9 @@ def test_missing_exposures_are_said_so(tmp_path, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not REAL.is_dir(), reason="the real exposures lie beside the checkout")
-def test_real_exposures(tmp_path, capsys):
+def test_real_exposures(niriss, tmp_path, capsys):
     """Small and rough; what counts is that it runs on files from the archive, and finds the mask's way round."""
-    config = niriss_ab_dor.Config(data=REAL, smoke=True, name="real", runs=tmp_path)
+    config = niriss_ab_dor.Config(data=niriss, smoke=True, name="real", runs=tmp_path)
     assert niriss_ab_dor.main(config) == 0
     results = json.loads((tmp_path / "real" / "results.json").read_text())
     assert not results["pose"]["mirrored"]

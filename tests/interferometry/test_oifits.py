@@ -3,7 +3,6 @@
 import dataclasses
 import itertools
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,7 +28,6 @@ from torchmask.simulation.exposures import simulate_observation
 reader = pytest.importorskip("oifits")
 fits = pytest.importorskip("astropy.io.fits")
 
-REAL = Path(__file__).parents[3] / "shared" / "real" / "niriss"
 CENTERS = [[0.0, 0.42], [0.38, -0.2], [-0.4, -0.15], [0.1, -0.05]]
 WAVELENGTH = 550e-9
 
@@ -412,12 +410,11 @@ def test_what_cannot_be_is_refused(tmp_path, mask, grid):
 # --- the sky
 
 
-@pytest.mark.skipif(not REAL.is_dir(), reason="no real observations here")
-def test_closure_phases_of_ab_dor_show_its_companion():
+def test_closure_phases_of_ab_dor_show_its_companion(niriss):
     # README of the observations: about 0.3 arcsec away, several magnitudes fainter; the calibrator shows none.
     mask = SparseAperture.from_catalog("jwst_niriss_ami_7")
     star, calibrator = (
-        frame_observables(read_observation(sorted(REAL.glob(name)), mask, gain=1.62, crop=48))
+        frame_observables(read_observation(sorted(niriss.glob(name)), mask, gain=1.62, crop=48))
         for name in ("ab-dor*.fits", "hd-37093*.fits")
     )
     assert float(star.closure_phases.rad2deg().abs().max()) > 2

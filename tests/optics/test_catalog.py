@@ -1,7 +1,5 @@
 import itertools
-import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,14 +11,6 @@ from torchmask.optics import catalog
 from torchmask.optics.aperture import SparseAperture
 
 GOLAY = {"golay3": 3, "golay6": 6, "golay9": 9, "golay12": 12, "golay12_alt": 12}
-SHARED = Path(__file__).parents[3] / "shared" / "masks.json"
-
-
-@pytest.fixture(scope="module")
-def shared():
-    if not SHARED.exists():
-        pytest.skip("the file of facts the catalogue was made from is not here")
-    return json.loads(SHARED.read_text())["masks"]
 
 
 def differences(points):
@@ -28,9 +18,9 @@ def differences(points):
     return (points[:, None] - points[None])[~np.eye(len(points), dtype=bool)]
 
 
-def test_every_mask_of_the_shared_file_with_its_coordinates(shared):
-    assert set(catalog.names()) == set(shared)
-    for name, fact in shared.items():
+def test_every_mask_of_the_shared_file_with_its_coordinates(mask_facts):
+    assert set(catalog.names()) == set(mask_facts)
+    for name, fact in mask_facts.items():
         mask = catalog.entry(name)
         # Facts are printed to six decimals; instruments' numbers carry over as they are.
         tolerance = 0.0 if mask.unit == "m" else 5.1e-7
@@ -44,9 +34,9 @@ def test_every_mask_of_the_shared_file_with_its_coordinates(shared):
             assert mask.hole_diameter == fact["hole_diameter"]
 
 
-def test_visir_hexagons_are_stored_flat_to_flat(shared):
+def test_visir_hexagons_are_stored_flat_to_flat(mask_facts):
     side = 0.61
-    assert shared["vlt_visir_7"]["hole_diameter"] == 2 * side
+    assert mask_facts["vlt_visir_7"]["hole_diameter"] == 2 * side
     assert catalog.entry("vlt_visir_7").hole_diameter == pytest.approx(math.sqrt(3) * side, rel=1e-15)
 
 

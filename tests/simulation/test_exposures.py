@@ -2,7 +2,6 @@
 
 import itertools
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,7 +20,6 @@ from torchmask.optics.psf import PSF
 from torchmask.simulation import exposures as module
 from torchmask.simulation.exposures import simulate_observation
 
-STACKS = Path(__file__).parents[3] / "shared" / "stacks"
 WAVELENGTH = 550e-9
 
 
@@ -159,10 +157,9 @@ def test_the_mean_psf_is_the_long_exposure():
         assert abs(float(values.mean()) - float(theory[ring].mean())) < 4 * error + lost
 
 
-@pytest.mark.skipif(not STACKS.is_dir(), reason="the stacks lie beside a checkout only")
 @pytest.mark.parametrize("name", ["skylab_1e7_mask", "skylab_1e7_full", "mgs_1e6_mask", "mgs_1e6_full"])
-def test_agrees_with_stacks_of_another_program(name):
-    other = Observation.load(STACKS / f"{name}.npz")
+def test_agrees_with_stacks_of_another_program(shared_stack, name):
+    other = shared_stack(name)
     assert other.object is not None
     assert other.psfs is not None
     assert other.n_photons is not None
@@ -322,9 +319,8 @@ def test_an_observation_need_not_know_the_truth(mask, grid, tmp_path):
     assert loaded.object is loaded.psfs is loaded.r0 is loaded.outer_scale is loaded.n_photons is None
 
 
-@pytest.mark.skipif(not STACKS.is_dir(), reason="the stacks lie beside a checkout only")
-def test_reads_the_stacks_of_another_program():
-    mask, full = (Observation.load(STACKS / f"skylab_1e7_{kind}.npz") for kind in ("mask", "full"))
+def test_reads_the_stacks_of_another_program(shared_stack):
+    mask, full = (shared_stack(f"skylab_1e7_{kind}") for kind in ("mask", "full"))
     assert isinstance(mask.aperture, SparseAperture)
     assert isinstance(full.aperture, FullAperture)
     assert mask.aperture.n_subapertures == 11

@@ -1,7 +1,6 @@
 """Rendering against brute force, closed forms of light and area, and an independent renderer."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +14,6 @@ from torchmask.simulation import render
 from torchmask.simulation.render import Mesh, load_mesh, render_mesh
 from torchmask.simulation.satellite import satellite_mesh
 
-SCENES = Path(__file__).parents[3] / "shared" / "scenes"
 UP = (0.0, 0.0, 1.0)
 
 
@@ -285,18 +283,17 @@ def test_bad_mesh_files_are_refused(tmp_path):
         load_mesh(tmp_path / "nan.obj")
 
 
-@pytest.mark.skipif(not SCENES.is_dir(), reason="the real meshes lie beside a checkout only")
-def test_agrees_with_an_independent_renderer():
+def test_agrees_with_an_independent_renderer(shared):
     # mars_global_surveyor_512.npz is a render without cast shadows. Its attitude, sun, ambient light and scale (four
     # numbers of light for some thousands of pixels) were found by matching outlines and then brightness.
-    reference = np.load(SCENES / "mars_global_surveyor_512.npz")["image"].astype(float)
+    reference = np.load(shared / "scenes" / "mars_global_surveyor_512.npz")["image"].astype(float)
     view = {
         "attitude": (57.366, 28.525, 17.100),
         "sun": (0.5924, 0.3541, 0.7237),
         "size": 445 / 512,
         "ambient": 0.02949,
     }
-    image = render_mesh(load_mesh(SCENES / "mars_global_surveyor.obj"), (512, 512), **view).numpy() * 1.0173
+    image = render_mesh(load_mesh(shared / "scenes" / "mars_global_surveyor.obj"), (512, 512), **view).numpy() * 1.0173
     # Only pixels on the outline may differ, and the outline is about as long as 15 % of the area.
     assert np.mean((image > 0) != (reference > 0)) < 0.025 * np.mean(reference > 0)
 
