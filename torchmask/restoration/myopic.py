@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -11,13 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.band import Band
 from torchmask.record import Callback
-from torchmask.restoration.aberrations import AberrationBasis, estimated_basis, turbulent_basis
 from torchmask.restoration.assembly import add_deviations, assemble_result
 from torchmask.restoration.checkpoint import Checkpoint, fingerprint_of
 from torchmask.restoration.forward import ExposureModel
@@ -26,6 +24,7 @@ from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.parallel import each_on_a_core
 from torchmask.restoration.priors import ObjectPrior, TotalVariation, as_prior, check_prior
 from torchmask.restoration.projected_lbfgs import Minimizer, ProjectedLBFGS
+from torchmask.restoration.recipe import ModelRecipe
 from torchmask.restoration.result import RestorationResult
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.solver import Solver, Traits
@@ -123,55 +122,48 @@ class MyopicDeconvolution:
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
     ) -> None:
-        _check_settings(aperture, r0, outer_scale, readout_noise, n_modes, static_modes, max_iterations, tolerance)
+        if readout_noise is not None and not (math.isfinite(readout_noise) and readout_noise >= 0):
+            raise ValueError(f"readout_noise is {readout_noise}: it must be finite and at least 0, in electrons rms")
+        if max_iterations < 1 or not tolerance >= 0:
+            raise ValueError(
+                f"max_iterations is {max_iterations} and tolerance {tolerance}: they must be at least 1 and at least 0"
+            )
         if wavelengths is None and weights is not None:
             raise ValueError("weights are given without wavelengths: give both")
         self.many_minima: bool = aperture.n_subapertures == 1
         self.known_r0: bool = r0 is not None
-        # Masks are made for holes of about r0; a full pupil that needs a restoration spans several.
-        self.r0: float = r0 or aperture.subaperture_diameter / (7 if self.many_minima else 1)
-        self.outer_scale: float = outer_scale or 20 * aperture.mask_diameter
+        self.recipe: ModelRecipe = ModelRecipe(
+            aperture,
+            grid,
+            Band.of([grid.wavelength] if wavelengths is None else wavelengths, weights),
+            frame_modes=(231 if self.many_minima else 6) if n_modes is None else n_modes,
+            static_modes=static_modes,
+            # Masks are made for holes of about r0; a full pupil that needs a restoration spans several.
+            r0=aperture.subaperture_diameter / (7 if self.many_minima else 1) if r0 is None else r0,
+            outer_scale=20 * aperture.mask_diameter if outer_scale is None else outer_scale,
+            whitened=aberration_prior,
+            dtype=dtype,
+            device=device,
+        )
         self.readout_noise: float | None = readout_noise
-        self.aberration_prior: bool = aberration_prior
         self.max_iterations: int = max_iterations
         self.tolerance: float = tolerance
-        self.aperture: Aperture = aperture
-        self.grid: Grid = grid
-        self.band: Band = Band.of([grid.wavelength] if wavelengths is None else wavelengths, weights)
-        self.frame_modes: int = n_modes or (231 if self.many_minima else 6)
-        self.static_modes: int = static_modes
         self.prior: ObjectPrior = as_prior(TotalVariation() if prior is None else prior)
         self.minimizer: Minimizer = minimizer or ProjectedLBFGS()
         self.schedule: Schedule = schedule or Schedule()
-        self._options = {"dtype": dtype, "device": device}
-        self._model: ExposureModel = self._build(self._turbulence())
+        self._model: ExposureModel = self.recipe.turbulent_model()
 
     @property
     def n_modes(self) -> int:
         """J, Zernike modes per sub-aperture of the coefficients that come back."""
-        return max(self.frame_modes, self.static_modes)
+        return self.recipe.n_modes
 
     @property
     def model(self) -> ExposureModel:
         """The model of the exposures, with the aperture where it lies now."""
-        if not torch.equal(self._model.pupil.aperture.centers, self.aperture.centers.detach()):
-            self._model = self._build(self._turbulence())
+        if not torch.equal(self._model.pupil.aperture.centers, self.recipe.aperture.centers.detach()):
+            self._model = self.recipe.turbulent_model()
         return self._model
-
-    def _turbulence(self) -> AberrationBasis:
-        options = (self.r0, self.outer_scale)
-        with torch.no_grad():
-            return turbulent_basis(
-                self.aperture, self.frame_modes, self.static_modes, *options, whitened=self.aberration_prior
-            )
-
-    def _build(self, basis: AberrationBasis, aperture: Aperture | None = None) -> ExposureModel:
-        return ExposureModel(aperture or still(self.aperture), self.grid, basis, self.band, **self._options)
-
-    def _model_of_errors(self, covariance: Tensor) -> ExposureModel:
-        if self.static_modes:
-            raise ValueError("covariance is given with static_modes: what is common to all frames is in the estimate")
-        return self._build(estimated_basis(self.aperture, self.n_modes, covariance))
 
     def objective(self, frames: Tensor | np.ndarray, *, valid: Tensor | np.ndarray | None = None) -> MyopicObjective:
         """The cost of object and aberrations behind `frames` (T, H, W) [electrons], to minimise in a way of your own.
@@ -179,7 +171,7 @@ class MyopicDeconvolution:
         It is differentiable in the centres of the aperture too. Arguments and errors as for `restore`.
         """
         stack = self._stack(frames, valid)
-        model = self._build(self._turbulence(), self.aperture)
+        model = self.recipe.turbulent_model(follows_aperture=True)
         stack = stack.to(model.dtype, model.device)
         return MyopicObjective(model, stack.frames, stack.precision, self.prior)
 
@@ -246,32 +238,32 @@ class MyopicDeconvolution:
             raise ValueError(f"n_samples is {n_samples}: 0 for no standard deviations, or at least 2")
         known = Known(coefficients, covariance, known_object)
         known.check()
-        model = self.model if covariance is None else self._model_of_errors(covariance)
+        model = self.model if covariance is None else self.recipe.estimated_model(covariance)
         stack = stack.to(model.dtype, model.device)
         with each_on_a_core(model.device) as parallel:
             objective = MyopicObjective(
                 model, stack.frames, stack.precision, self.prior, free=known.free, parallel=parallel
             )
             traits = self._traits(known, seed)
-            has_r0 = self.aberration_prior and not traits.estimated and Free.ABERRATIONS in known.free
+            has_r0 = self.recipe.whitened and not traits.estimated and Free.ABERRATIONS in known.free
             solver = Solver(objective, stack, traits, self.schedule, self.minimizer, callback)
             check_prior(self.prior, model.window.embed(stack.frames.mean(0).clamp(min=0)).double())
             file = self._checkpoint(checkpoint, solver, known)
             progress = solver.solve(known, start, file)
-            result = assemble_result(solver.objective, stack, progress, r0=self.r0 if has_r0 else None)
+            result = assemble_result(solver.objective, stack, progress, r0=self.recipe.r0 if has_r0 else None)
             if n_samples:
-                cutoff = min(0.5, self.grid.cutoff(self.aperture.extent))
+                cutoff = min(0.5, self.recipe.grid.cutoff(self.recipe.aperture.extent))
                 result = add_deviations(result, solver.objective, stack, progress, cutoff, n_samples)
         return replace(result, seconds=time.perf_counter() - started)
 
     def _stack(self, frames: Tensor | np.ndarray, valid: Tensor | np.ndarray | None) -> FrameStack:
-        bluest = replace(self.grid, wavelength=self.band.shortest)
-        return FrameStack.of(frames, valid, bluest, self.aperture, self.readout_noise)
+        bluest = replace(self.recipe.grid, wavelength=self.recipe.band.shortest)
+        return FrameStack.of(frames, valid, bluest, self.recipe.aperture, self.readout_noise)
 
     def _checkpoint(self, path: str | Path | None, solver: Solver, known: Known) -> Checkpoint | None:
         if path is None:
             return None
-        settings = (self.aberration_prior, self.known_r0, self.minimizer, self.schedule, solver.traits.seed)
+        settings = (self.recipe.whitened, self.known_r0, self.minimizer, self.schedule, solver.traits.seed)
         given = (known.coefficients, known.covariance, known.object)
         return Checkpoint(Path(path), fingerprint_of(solver.objective, settings, given))
 
@@ -280,43 +272,9 @@ class MyopicDeconvolution:
         return Traits(
             many_minima=self.many_minima,
             estimated=estimated,
-            prior_on_aberrations=self.aberration_prior,
-            r0_is_open=self.aberration_prior and not self.known_r0 and not estimated,
+            prior_on_aberrations=self.recipe.whitened,
+            r0_is_open=self.recipe.whitened and not self.known_r0 and not estimated,
             max_iterations=self.max_iterations,
             tolerance=self.tolerance,
             seed=seed,
-        )
-
-
-def still(aperture: Aperture) -> Aperture:
-    """A copy of an aperture that stays where it is while the other moves or trains."""
-    centers = aperture.centers.detach().clone()
-    if isinstance(aperture.centers, nn.Parameter):
-        centers = nn.Parameter(centers, requires_grad=False)
-    return copy.deepcopy(aperture, {id(aperture.centers): centers})
-
-
-def _check_settings(
-    aperture: Aperture,
-    r0: float | None,
-    outer_scale: float | None,
-    readout_noise: float | None,
-    n_modes: int | None,
-    static_modes: int,
-    max_iterations: int,
-    tolerance: float,
-) -> None:
-    if aperture.centers.ndim != 2:
-        raise ValueError(f"centers has shape {tuple(aperture.centers.shape)}: one mask (n_subapertures, 2) is needed")
-    for name, value in (("r0", r0), ("outer_scale", outer_scale)):
-        if value is not None and not (math.isfinite(value) and value > 0):
-            raise ValueError(f"{name} is {value}: it must be finite and positive, in m")
-    if readout_noise is not None and not (math.isfinite(readout_noise) and readout_noise >= 0):
-        raise ValueError(f"readout_noise is {readout_noise}: it must be finite and at least 0, in electrons rms")
-    for name, count, least in (("n_modes", n_modes, 1), ("static_modes", static_modes, 0)):
-        if count is not None and count < least:
-            raise ValueError(f"{name} is {count}: it must be a whole number of at least {least}")
-    if max_iterations < 1 or not tolerance >= 0:
-        raise ValueError(
-            f"max_iterations is {max_iterations} and tolerance {tolerance}: they must be at least 1 and at least 0"
         )

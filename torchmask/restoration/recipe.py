@@ -1,0 +1,85 @@
+"""What a model of the exposures is made from: the instrument and the aberrations it is assumed to have."""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from torchmask.grid import Grid
+from torchmask.optics.aperture import Aperture
+from torchmask.optics.band import Band
+from torchmask.restoration.aberrations import estimated_basis, turbulent_basis
+from torchmask.restoration.forward import ExposureModel
+
+
+@dataclass(frozen=True)
+class ModelRecipe:
+    """Aperture, grid and band of the exposures, and the prior on their aberrations.
+
+    frame_modes, static_modes : Zernike modes per sub-aperture of each frame, and of what all frames have in common
+    r0, outer_scale : of the turbulence [m]
+    whitened : whether the parameters are white under the prior; False: they are the coefficients themselves
+
+    Raises
+    ------
+    ValueError
+        For a population of apertures, and numbers that are out of range.
+    """
+
+    aperture: Aperture
+    grid: Grid
+    band: Band
+    frame_modes: int
+    static_modes: int
+    r0: float
+    outer_scale: float
+    whitened: bool
+    dtype: torch.dtype
+    device: torch.device | str | None
+
+    def __post_init__(self) -> None:
+        shape = tuple(self.aperture.centers.shape)
+        if len(shape) != 2:
+            raise ValueError(f"centers has shape {shape}: one mask (n_subapertures, 2) is needed")
+        for name, value in (("r0", self.r0), ("outer_scale", self.outer_scale)):
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"{name} is {value}: it must be finite and positive, in m")
+        for name, count, least in (("n_modes", self.frame_modes, 1), ("static_modes", self.static_modes, 0)):
+            if count < least:
+                raise ValueError(f"{name} is {count}: it must be a whole number of at least {least}")
+
+    @property
+    def n_modes(self) -> int:
+        """J, Zernike modes per sub-aperture of the coefficients."""
+        return max(self.frame_modes, self.static_modes)
+
+    def turbulent_model(self, *, follows_aperture: bool = False) -> ExposureModel:
+        """The model with aberrations of turbulence, for the aperture where it lies now, or wherever it goes."""
+        with torch.no_grad():
+            basis = turbulent_basis(
+                self.aperture, self.frame_modes, self.static_modes, self.r0, self.outer_scale, whitened=self.whitened
+            )
+        aperture = self.aperture if follows_aperture else still(self.aperture)
+        return ExposureModel(aperture, self.grid, basis, self.band, dtype=self.dtype, device=self.device)
+
+    def estimated_model(self, covariance: Tensor) -> ExposureModel:
+        """The model whose parameters are errors of estimated coefficients, of `covariance` (N J, N J) [rad^2].
+
+        Raises ValueError if the covariance has another shape or is not one, or there are static modes.
+        """
+        if self.static_modes:
+            raise ValueError("covariance is given with static_modes: what is common to all frames is in the estimate")
+        basis = estimated_basis(self.aperture, self.n_modes, covariance)
+        return ExposureModel(still(self.aperture), self.grid, basis, self.band, dtype=self.dtype, device=self.device)
+
+
+def still(aperture: Aperture) -> Aperture:
+    """A copy of an aperture that stays where it is while the other moves or trains."""
+    centers = aperture.centers.detach().clone()
+    if isinstance(aperture.centers, nn.Parameter):
+        centers = nn.Parameter(centers, requires_grad=False)
+    return copy.deepcopy(aperture, {id(aperture.centers): centers})
