@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from companion_errors import MEASURED, SIGNIFICANCE, Limits
-from companion_fit import Exposures, Fit
 from rich.table import Table
 from torch import Tensor
 
 from torchmask.grid import ARCSEC
+from torchmask.interferometry.companion import Exposures
+from torchmask.interferometry.companion_errors import MEASURED, polar
+from torchmask.interferometry.companion_fit import CompanionFit
+from torchmask.interferometry.companion_limits import SIGNIFICANCE, DetectionLimits
 from torchmask.viz.style import COLORS, FAINT, new_figure, styled
 
 if TYPE_CHECKING:
@@ -79,6 +81,28 @@ def table(results: dict[str, Any]) -> Table:
     return sheet
 
 
+def _centroid(image: Tensor, row: int, column: int) -> tuple[float, Tensor]:
+    """Light of 3 x 3 pixels, and its centre (y, x)."""
+    box = image[row - 1 : row + 2, column - 1 : column + 2]
+    offsets = torch.arange(-1, 2, dtype=torch.float64)
+    place = torch.stack([(box.sum(1) * offsets).sum(), (box.sum(0) * offsets).sum()]) / box.sum().clamp(min=1e-30)
+    return float(box.sum()), place + torch.tensor([row, column])
+
+
+def brightest_beside(image: Tensor, to_pixels: Tensor, most: float = 0.7) -> dict[str, Any]:
+    """The brightest source beside the star in a restored image, up to a separation [arcsec]."""
+    row, column = divmod(int(image.argmax()), image.shape[1])
+    flux, star = _centroid(image, row, column)
+    rest = image.clone()
+    rest[row - 1 : row + 2, column - 1 : column + 2] = 0
+    y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in image.shape), indexing="ij")
+    pixels_per_radian = float(to_pixels[0].norm()) / 2**0.5
+    rest[torch.hypot(y - row, x - column) > most * ARCSEC * pixels_per_radian] = 0
+    light, place = _centroid(image, *divmod(int(rest.argmax()), image.shape[1]))
+    position = torch.linalg.inv(to_pixels.mean(0)) @ (place - star)
+    return polar(torch.cat([torch.tensor([light / flux], dtype=torch.float64), position])) | {"star": star.tolist()}
+
+
 def upright(image: Tensor, star: Sequence[float], to_pixels: Tensor, half: float = 0.7, n: int = 141) -> np.ndarray:
     """An image with north up and east left, `half` arcsec to each side of the star, in its nearest pixels."""
     from scipy.ndimage import map_coordinates
@@ -115,7 +139,7 @@ def draw_marks(ax: Axes, marks: Sequence[dict[str, float]]) -> None:
 
 @styled
 def search_figure(
-    offsets: Tensor, maps: dict[str, Tensor], limits: Limits, marks: Sequence[dict[str, float]] = ()
+    offsets: Tensor, maps: dict[str, Tensor], limits: DetectionLimits, marks: Sequence[dict[str, float]] = ()
 ) -> Figure:
     """Contrast over the limit at its separation wherever a companion was looked for; what exceeds it; the limit."""
     figure = new_figure(2.7 * len(maps) + 3.9, 3.4)
@@ -145,7 +169,7 @@ def search_figure(
 
 
 @styled
-def exposures_figure(exposures: Exposures, fit: Fit, radius: float) -> Figure:
+def exposures_figure(exposures: Exposures, fit: CompanionFit, radius: float) -> Figure:
     """The first exposure, the model of it, and what is left, in units of the peak."""
     from matplotlib.colors import LogNorm
 

@@ -1,20 +1,25 @@
-"""What several files of tests stand on: reference data beside a checkout, seeds, a mask, exposures of the satellite."""
+"""What several files of tests stand on: reference data beside a checkout, seeds, a mask, a satellite, a binary."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.grid import Grid
 from torchmask.observation import Observation
 from torchmask.optics.aperture import Aperture, SparseAperture
 from torchmask.optics.detector import Detector
+from torchmask.optics.psf import psf_from_samples
+from torchmask.optics.zernike import ZernikePhase
 from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
 
@@ -77,3 +82,61 @@ def observe_satellite() -> Callable[..., Observation]:
         return simulate_observation(scene, aperture, grid, turbulence, Detector(1.5), n_frames, generator)
 
     return observe
+
+
+@pytest.fixture(scope="session")
+def sky_matrix() -> Callable[[float, float], np.ndarray]:
+    """(2, 2) from pixels (x, y) to (east, north) [rad]: north `angle` [deg] from y, east to the left of it."""
+
+    def matrix(angle: float, pixel_scale: float) -> np.ndarray:
+        c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
+        return pixel_scale * np.array([[-c, s], [s, c]])
+
+    return matrix
+
+
+@pytest.fixture(scope="session")
+def static_aberrations() -> Tensor:
+    """Those that `expose_binary` puts into every exposure (7, 6) [rad rms]."""
+    return 0.06 * torch.randn(7, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+
+
+@pytest.fixture(scope="session")
+def expose_binary(static_aberrations: Tensor) -> Callable[..., tuple[Tensor, Tensor]]:
+    """Electrons and their rms of one exposure of a binary through seven holes.
+
+    From a pupil twice as fine and an image twice as wide as those of `CompanionModel`: companion (contrast, east,
+    north), star at `place` (y, x); static aberrations, and small ones of its own; the pixel's square, Poisson and
+    read-out noise.
+    """
+
+    def expose(
+        aperture: Aperture,
+        grid: Grid,
+        sky: np.ndarray,
+        companion: np.ndarray,
+        place: tuple[float, float],
+        wavelengths: Sequence[float],
+        seed: int,
+    ) -> tuple[Tensor, Tensor]:
+        n_pixels, own = grid.shape[0], torch.Generator().manual_seed(seed)
+        change = 0.005 * torch.randn(7, 6, dtype=torch.float64, generator=own)
+        total = torch.zeros(())
+        for wavelength in wavelengths:
+            coloured = Grid(n_pixels, grid.pixel_scale, wavelength)
+            coefficients = (static_aberrations + change) * grid.wavelength / wavelength
+            phase = ZernikePhase(aperture, coloured, 6, oversampling=4)(coefficients)
+            total = total + psf_from_samples(aperture.samples(coloured, 4), phase) / len(wavelengths)
+        nu_y, nu_x = (torch.fft.fftfreq(n, dtype=torch.float64) for n in total.shape)
+        x, y = np.linalg.inv(sky) @ companion[1:]
+
+        def at(row: float, column: float) -> Tensor:
+            return torch.exp(-2j * math.pi * (nu_y[:, None] * row + nu_x * column))
+
+        square = torch.sinc(nu_y)[:, None] * torch.sinc(nu_x)
+        seen = at(*place) + companion[0] * at(place[0] + y, place[1] + x)
+        image = 1e8 * torch.fft.ifft2(torch.fft.fft2(total) * square * seen).real[:n_pixels, :n_pixels]
+        noise = (image.clamp(min=0) + 100**2).sqrt()
+        return image + noise * torch.randn(image.shape, dtype=torch.float64, generator=own), noise
+
+    return expose

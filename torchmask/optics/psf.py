@@ -29,6 +29,16 @@ def psf_from_samples(samples: PupilSamples, phase: Tensor | None = None) -> Tens
     PSF = |FFT(P exp(i phase))|^2 with `phase` (..., [frame,] N, P) [rad] on the samples (..., N, P): where it has more
     axes than they, the last one before N is the frame. Returns (..., [frame,] rows, columns).
     """
+    psf = focal_intensity(samples, phase)
+    return psf / psf.sum(dim=(-2, -1), keepdim=True)
+
+
+def focal_intensity(samples: PupilSamples, phase: Tensor | None = None) -> Tensor:
+    """What `psf_from_samples` makes a PSF of: |FFT(P exp(i phase))|^2 without the unit sum.
+
+    Light that the phase scatters beyond the raster is missing here, so the image of the rest keeps its brightness when
+    the phase changes. A pupil whose image lies within the raster has the sum of its squared open fractions.
+    """
     weights, index = samples.weights, samples.index
     if phase is not None and phase.ndim > weights.ndim:
         weights, index = weights.unsqueeze(-3), index.unsqueeze(-3)
@@ -40,8 +50,7 @@ def psf_from_samples(samples: PupilSamples, phase: Tensor | None = None) -> Tens
     pupil = torch.zeros(*field.shape[:-1], math.prod(samples.raster), dtype=field.dtype, device=field.device)
     pupil = pupil.scatter_add(-1, index, field).unflatten(-1, samples.raster)
     amplitude = torch.fft.fft2(pupil, norm="ortho")
-    psf = (amplitude.real**2 + amplitude.imag**2) / _cell_transfer(samples)
-    return psf / psf.sum(dim=(-2, -1), keepdim=True)
+    return (amplitude.real**2 + amplitude.imag**2) / _cell_transfer(samples)
 
 
 def _cell_transfer(samples: PupilSamples) -> Tensor:

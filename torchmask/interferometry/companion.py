@@ -1,0 +1,226 @@
+"""A star and a faint companion beside it, as exposures through a mask show them.
+
+A companion is (contrast, east, north): its flux over that of the star, and its offset on the sky [rad]. Both have one
+colour. They are imaged through aberrations common to all exposures plus small ones of each, blurred by the pixel and
+the spread of its charge, on a flat background. `fit_companion` finds all of that.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchmask.grid import Grid
+from torchmask.observation import Observation
+from torchmask.optics.aperture import Aperture
+from torchmask.optics.band import Band
+from torchmask.optics.psf import focal_intensity
+from torchmask.optics.zernike import ZernikePhase
+
+OWN_MODES = 3  # piston, tip and tilt of every hole, which each exposure has for itself
+_FIELD = 3  # of the PSFs, in widths of an exposure: sets how finely the holes are sampled, to half a percent
+
+
+@dataclass(frozen=True, eq=False)
+class Exposures:
+    """Exposures of one star, which stands in the middle of each but for a fraction of a pixel.
+
+    frames, errors : (T, H, W) electrons, and their rms
+    valid : (T, H, W) bool
+    to_pixels : (T, 2, 2) from (east, north) [rad] to (y, x) [pixel]
+
+    Examples
+    --------
+    >>> east_is_left = torch.tensor([[0.0, 1.0], [-1.0, 0.0]], dtype=torch.float64) / 3e-7  # rad per pixel
+    >>> frames = torch.rand(2, 32, 32, dtype=torch.float64)
+    >>> exposures = Exposures(frames, frames.sqrt(), frames > 0.01, east_is_left.expand(2, -1, -1))
+    >>> exposures[:1].frames.shape
+    torch.Size([1, 32, 32])
+    """
+
+    frames: Tensor
+    errors: Tensor
+    valid: Tensor
+    to_pixels: Tensor
+
+    def __getitem__(self, chosen: Sequence[int] | slice) -> Exposures:
+        index = chosen if isinstance(chosen, slice) else list(chosen)
+        return Exposures(self.frames[index], self.errors[index], self.valid[index], self.to_pixels[index])
+
+    @classmethod
+    def from_observations(cls, observations: Sequence[Observation]) -> Exposures:
+        """The frames of several observations of one star, each with its own direction of north.
+
+        Raises ValueError if there is none, or one lacks errors or sky coordinates.
+        """
+        if not observations:
+            raise ValueError("observations is empty: give at least one")
+        parts = []
+        for number, seen in enumerate(observations):
+            matrix, errors = seen.sky_matrix, seen.errors
+            if matrix is None:
+                raise ValueError(f"observation {number} has no CD matrix in its header, which tells where north is")
+            if errors is None:
+                raise ValueError(f"observation {number} has no errors, such as an ERR extension gives")
+            valid = torch.ones_like(seen.frames, dtype=torch.bool) if seen.valid is None else seen.valid
+            to_pixels = torch.linalg.inv(matrix).flip(0).expand(len(seen.frames), 2, 2)  # (x, y) becomes (y, x)
+            parts.append((seen.frames.double(), errors.double(), valid.expand(seen.frames.shape), to_pixels))
+        return cls(*(torch.cat(values) for values in zip(*parts, strict=True)))
+
+
+@dataclass(frozen=True, eq=False)
+class Parameters:
+    """All that the exposures of a star and its companion depend on.
+
+    static : (N J,) coefficients of the aberrations common to all exposures [rad rms], hole by hole
+    blur : (2,) variances of the spread of charge along y and x [pixel^2]
+    own : (T, 4 + 3 N) of each exposure: flux [electrons], background [electrons per pixel], y and x of the star
+        [pixel], and piston, tip and tilt of every hole on top of `static` [rad rms]
+    companion : (3,) contrast, east, north; a contrast of 0 if there is none
+
+    Examples
+    --------
+    >>> alone = Parameters(torch.zeros(21), torch.full((2,), 0.1), torch.zeros(5, 13), torch.zeros(3))
+    >>> len(alone.of_exposures(slice(0, None, 2)).own)
+    3
+    """
+
+    static: Tensor
+    blur: Tensor
+    own: Tensor
+    companion: Tensor
+
+    def of_exposures(self, chosen: slice) -> Parameters:
+        """Those of some of the exposures."""
+        return replace(self, own=self.own[chosen])
+
+
+class CompanionModel:
+    """Images of a star and a companion through a mask, and how near the star and how well they are to be believed.
+
+    Parameters
+    ----------
+    aperture : Aperture
+        One mask, on the axes of the detector.
+    grid : Grid
+        Of the exposures; coefficients are rad at its wavelength.
+    n_modes : int
+        J, Zernike modes of every hole in the aberrations common to all exposures, at least 3.
+    band : Band
+        Aberrations are path differences, the same for all its wavelengths.
+    radius : float
+        Pixels this far from the middle of an exposure are compared with the model.
+    flux_error : float
+        The variance of a pixel is that of its noise plus (flux_error x its flux)^2, for what no model of optics and
+        detector gets right. `fit_companion` on a single star and `unexplained_flux` measure it.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than 3 modes, or the grid samples the aperture too coarsely.
+
+    Examples
+    --------
+    >>> from torchmask.optics.aperture import SparseAperture
+    >>> mask = SparseAperture([[0.0, 0.4], [-0.35, -0.2], [0.35, -0.25]], 0.15, 1.0)
+    >>> grid = Grid.nyquist(1.0, 550e-9, 32)
+    >>> model = CompanionModel(mask, grid, n_modes=3, band=Band.of([550e-9]), radius=12.0)
+    >>> place = torch.tensor([1e6, 0.0, 16.0, 16.0], dtype=torch.float64)  # flux, background, y, x
+    >>> companion = torch.tensor([0.01, 0.0, 1e-6], dtype=torch.float64)  # 1 rad on the sky is 1e7 pixels
+    >>> to_pixels = torch.tensor([[0.0, 1.0], [-1.0, 0.0]], dtype=torch.float64) / grid.pixel_scale
+    >>> model.image(torch.zeros(9).double(), torch.zeros(2).double(), place, companion, to_pixels).shape
+    torch.Size([32, 32])
+    """
+
+    def __init__(
+        self,
+        aperture: Aperture,
+        grid: Grid,
+        n_modes: int,
+        band: Band,
+        radius: float,
+        flux_error: float = 0.01,
+    ) -> None:
+        if n_modes < OWN_MODES:
+            raise ValueError(f"n_modes is {n_modes}: piston, tip and tilt of every hole, {OWN_MODES}, are the least")
+        self.grid, self.radius, self.flux_error = grid, radius, flux_error
+        self.n_subapertures, self.n_modes = aperture.n_subapertures, n_modes
+        self._colours = []
+        for wavelength, share in zip(band.wavelengths, band.shares, strict=True):
+            coloured = replace(grid, wavelength=wavelength)
+            samples, phase = aperture.samples(coloured, _FIELD), ZernikePhase(aperture, coloured, n_modes, _FIELD)
+            self._colours.append((samples, phase, grid.wavelength / wavelength, share / samples.weights.square().sum()))
+        rows, columns = (_FIELD * side for side in grid.shape)
+        self._nu_y = torch.fft.fftfreq(rows, dtype=torch.float64)[:, None]
+        self._nu_x = torch.fft.rfftfreq(columns, dtype=torch.float64)
+        self._pixel = torch.sinc(self._nu_y) * torch.sinc(self._nu_x)
+        y, x = torch.meshgrid(*(torch.arange(n).double() - n // 2 for n in grid.shape), indexing="ij")
+        self.near: Tensor = torch.hypot(y, x) <= radius  # (H, W), the pixels that are compared
+
+    def psf(self, aberrations: Tensor) -> Tensor:
+        """(3 H, 3 W), origin at [0, 0], through aberrations (N J) [rad rms], in units of the light through the mask.
+
+        Aberrations that scatter light out of this field leave the rest as bright as it was. A sum held at 1 would tie
+        the star's flux to all of them, and Gauss-Newton steps zigzag then.
+        """
+        coefficients = aberrations.view(self.n_subapertures, self.n_modes)
+        colours = [
+            share * focal_intensity(samples, phase(ratio * coefficients))
+            for samples, phase, ratio, share in self._colours
+        ]
+        return torch.stack(colours).sum(0)
+
+    def image(self, aberrations: Tensor, blur: Tensor, place: Tensor, companion: Tensor, to_pixels: Tensor) -> Tensor:
+        """One exposure (H, W) [electrons], differentiable in all but the directions on the sky.
+
+        Parameters
+        ----------
+        aberrations : (N J,) tensor
+            Static and own ones together [rad rms].
+        blur : (2,) tensor
+        place : (4,) tensor
+            Flux, background, y and x of the star.
+        companion : (3,) tensor
+        to_pixels : (2, 2) tensor
+        """
+        flux, background, y, x = place
+        contrast, offset = companion[0], to_pixels @ companion[1:]
+        spread = torch.exp(-2 * math.pi**2 * (blur[0] * self._nu_y**2 + blur[1] * self._nu_x**2))
+        transfer = torch.fft.rfft2(self.psf(aberrations)) * (flux * spread * self._pixel)
+        sky = self._shift(y, x) * (1 + contrast * self._shift(offset[0], offset[1]))
+        return self._window(transfer * sky) + background
+
+    def images(self, parameters: Parameters, to_pixels: Tensor) -> Tensor:
+        """All exposures (T, H, W) [electrons], whose directions on the sky are `to_pixels` (T, 2, 2)."""
+        shots = zip(parameters.own, to_pixels, strict=True)
+        shared = (parameters.blur, parameters.companion)
+        return torch.stack(
+            [self.image(self.total(parameters.static, own), shared[0], own[:4], shared[1], sky) for own, sky in shots]
+        )
+
+    def total(self, static: Tensor, own: Tensor) -> Tensor:
+        """Aberrations (N J) of one exposure whose own parameters are `own` (4 + 3 N)."""
+        extra = own[4:].view(self.n_subapertures, OWN_MODES)
+        return static + torch.nn.functional.pad(extra, (0, self.n_modes - OWN_MODES)).flatten()
+
+    def moved(self, images: Tensor, offsets: Tensor) -> Tensor:
+        """Images (H, W), dark outside, moved by each of `offsets` (M, 2) [pixel, (y, x)]: (M, H, W)."""
+        rows, columns = (_FIELD * side for side in self.grid.shape)
+        transfer = torch.fft.rfft2(images, s=(rows, columns))
+        return self._window(transfer * self._shift(*offsets.T[..., None, None]))
+
+    def root_weights(self, exposures: Exposures) -> Tensor:
+        """One over the rms error of each pixel (T, H, W), 0 where it is not compared."""
+        variance = exposures.errors**2 + (self.flux_error * exposures.frames.clamp(min=0)) ** 2
+        return torch.where(exposures.valid & self.near, variance, torch.inf).rsqrt()
+
+    def _shift(self, y: Tensor, x: Tensor) -> Tensor:
+        return torch.exp(-2j * math.pi * (self._nu_y * y + self._nu_x * x))
+
+    def _window(self, transfer: Tensor) -> Tensor:
+        rows, columns = self.grid.shape
+        return torch.fft.irfft2(transfer, s=(_FIELD * rows, _FIELD * columns))[..., :rows, :columns]

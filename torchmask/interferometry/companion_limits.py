@@ -1,0 +1,83 @@
+"""Where to look for a companion, and how faint one would be found beside a star."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchmask.grid import ARCSEC
+
+SIGNIFICANCE = 5.0  # times the scatter where there is no companion: what counts as found
+_ANNULUS, _REACH = 0.1, 0.025  # [arcsec] width of an annulus, and how far its scatter is measured beyond its borders
+
+
+def search_offsets(step: float, least: float = 0.1, most: float = 0.7) -> Tensor:
+    """Offsets (M, 2), (east, north) [rad], of a square raster between two separations.
+
+    Parameters
+    ----------
+    step, least, most : float
+        Of the raster, and the separations that bound it [arcsec].
+
+    Examples
+    --------
+    >>> offsets = search_offsets(0.1, least=0.05, most=0.25)
+    >>> offsets.shape, bool((offsets.norm(dim=1) < 0.25 * ARCSEC).all())
+    (torch.Size([20, 2]), True)
+    """
+    n = math.ceil(most / step)
+    line = torch.arange(-n, n + 1, dtype=torch.float64) * step * ARCSEC
+    grid = torch.cartesian_prod(line, line)
+    separation = torch.linalg.vector_norm(grid, dim=1) / ARCSEC
+    return grid[(separation > least) & (separation < most)]
+
+
+@dataclass(frozen=True, eq=False)
+class DetectionLimits:
+    """Faintest companion that would be found, by the separation of annuli around the star.
+
+    separation : (A,) middle of each annulus [arcsec]
+    contrast : (A,) flux over that of the star
+
+    Examples
+    --------
+    >>> limits = DetectionLimits(np.array([0.1, 0.3]), np.array([0.02, 0.01]))
+    >>> round(float(limits(torch.tensor([0.2 * ARCSEC, 0.0]))), 6)
+    0.015
+    """
+
+    separation: np.ndarray
+    contrast: np.ndarray
+
+    def __call__(self, offsets: Tensor) -> Tensor:
+        """Limiting contrast at offsets (..., 2) [rad], linear between annuli."""
+        away = torch.linalg.vector_norm(offsets, dim=-1) / ARCSEC
+        return torch.as_tensor(np.interp(away.numpy(), self.separation, self.contrast))
+
+
+def detection_limits(offsets: Tensor, contrast: Tensor) -> DetectionLimits:
+    """`SIGNIFICANCE` times the rms contrast that is found, annulus by annulus, where there is no companion.
+
+    Parameters
+    ----------
+    offsets : (M, 2) tensor
+        [rad], from 0.1 arcsec on and at least as dense as the annuli are wide, 0.1 arcsec.
+    contrast : (M,) tensor
+        What `search_companions` finds there beside a single star.
+
+    Examples
+    --------
+    >>> offsets = search_offsets(0.05)
+    >>> limits = detection_limits(offsets, torch.full((len(offsets),), 1e-3, dtype=torch.float64))
+    >>> limits.separation.round(2), limits.contrast.round(4)
+    (array([0.15, 0.25, 0.35, 0.45, 0.55, 0.65]), array([0.005, 0.005, 0.005, 0.005, 0.005, 0.005]))
+    """
+    away = torch.linalg.vector_norm(offsets, dim=1) / ARCSEC
+    edges = torch.arange(_ANNULUS, float(away.max()) + _ANNULUS / 2, _ANNULUS, dtype=torch.float64)
+    rings = [(away >= low - _REACH) & (away < low + _ANNULUS + _REACH) for low in edges[:-1]]
+    rms = [SIGNIFICANCE * float(contrast[ring].square().mean().sqrt()) for ring in rings]
+    return DetectionLimits((edges[:-1] + _ANNULUS / 2).numpy(), np.array(rms))
