@@ -4,30 +4,31 @@ import math
 
 import pytest
 import torch
-from torchmask.restoration.model import ExposureModel
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.band import Band
+from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.linearization import Linearization
 
 GRID = Grid.nyquist(1.0, 550e-9, (20, 24))
 
 
-def setup(dtype=torch.float64, **options):
+def setup(dtype=torch.float64, band=None):
     angles = torch.arange(4, dtype=dtype) * math.pi / 2
     mask = SparseAperture(torch.stack([angles.cos(), angles.sin()], -1) * 0.37, 0.25, 1.0)
-    model = ExposureModel(mask, GRID, 3, dtype=dtype, **options)
+    model = ExposureModel(mask, GRID, 3, band, dtype=dtype)
     generator = torch.Generator().manual_seed(0)
-    shape = (5, 3, model.n_parameters)
-    image = torch.rand(model.field.shape, dtype=dtype, generator=generator)
-    changes = torch.randn(5, *model.field.shape, dtype=dtype, generator=generator)
+    shape = (5, 3, model.aberrations.n_parameters)
+    image = torch.rand(model.window.field.shape, dtype=dtype, generator=generator)
+    changes = torch.randn(5, *model.window.field.shape, dtype=dtype, generator=generator)
     z = 0.5 * torch.randn(shape[1:], dtype=dtype, generator=generator)
     return model, image, z, changes, torch.randn(shape, dtype=dtype, generator=generator), generator
 
 
-@pytest.mark.parametrize("wavelengths", [None, [560e-9, 600e-9]])
-def test_forward_is_the_derivative(wavelengths):
-    model, image, z, images, zs, _ = setup(wavelengths=wavelengths)
+@pytest.mark.parametrize("band", [None, Band.of((560e-9, 600e-9))])
+def test_forward_is_the_derivative(band):
+    model, image, z, images, zs, _ = setup(band=band)
     linear = Linearization(model, image, z).forward(images, zs)
     for number in range(len(images)):
         exact = torch.autograd.functional.jvp(model, (image, z), (images[number], zs[number]))[1]

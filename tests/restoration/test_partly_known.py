@@ -4,23 +4,21 @@ import math
 
 import pytest
 import torch
-from torchmask.restoration.model import ExposureModel
 
 from torchmask.grid import Grid
 from torchmask.metrics import relative_error
-from torchmask.optics.aperture import SparseAperture
+from torchmask.restoration.aberrations import whitening
+from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.myopic import MyopicDeconvolution
-from torchmask.restoration.priors import root, whitening
 
 GRID = Grid.nyquist(1.0, 550e-9, 40)
 N_MODES, R0, ERROR = 3, 0.2, 0.4  # rad
 
 
 @pytest.fixture(scope="module")
-def exposures():
+def exposures(five_holes):
     """Mask, object, frames, and the true and the measured coefficients."""
-    angles = torch.arange(5, dtype=torch.float64) * 2 * math.pi / 5
-    mask = SparseAperture(torch.stack([angles.cos(), angles.sin()], -1) * 0.38, 0.22, 1.0)
+    mask = five_holes
     generator = torch.Generator().manual_seed(3)
     columns = whitening(mask, N_MODES, R0, 20.0)
     z = torch.randn(8, columns.shape[1], dtype=torch.float64, generator=generator)
@@ -30,7 +28,7 @@ def exposures():
     scene[16:24, 17:23] = 3
     scene[19:22, 9:30] += 1
     scene *= 1e6 / scene.sum()
-    image = torch.zeros(model.field.shape, dtype=torch.float64)
+    image = torch.zeros(model.window.field.shape, dtype=torch.float64)
     image[:40, :40] = scene
     frames = torch.poisson(model(image, true.flatten(1)), generator=generator)
     measured = true + ERROR * torch.randn(true.shape, dtype=torch.float64, generator=generator)
@@ -81,13 +79,6 @@ def test_with_a_known_object(exposures):
     assert error(refined.coefficients[fits], true[fits]) < 0.2 * ERROR
 
 
-def test_root_of_a_covariance():
-    """Its square is the covariance, but for errors below 1 mrad."""
-    half = torch.randn(6, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    covariance = half @ half.T
-    torch.testing.assert_close(root(covariance) @ root(covariance), covariance, rtol=0, atol=1.01e-6)
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -110,21 +101,3 @@ def test_refuses_static_modes(exposures):
     method = MyopicDeconvolution(mask, GRID, N_MODES, static_modes=3)
     with pytest.raises(ValueError, match="static_modes"):
         method.restore(frames, coefficients=measured, covariance=torch.eye(15))
-
-
-def test_full_waves_come_off_the_pistons(exposures):
-    """PSFs stay as they are; no piston is left beyond half a wave, and correlated ones come no further away."""
-    mask, _, _, true, _ = exposures
-    waves = torch.zeros_like(true)
-    waves[0, 1, 0], waves[1, 4, 0], waves[2, 0, 0] = 2 * math.pi, -4 * math.pi, 6 * math.pi
-    far, nowhere = (true + waves).flatten(1), torch.zeros(8, 15, dtype=torch.float64)
-    model = ExposureModel(mask, GRID, N_MODES)
-    back = model.unwrapped(far, nowhere)
-    torch.testing.assert_close(model.psf(back), model.psf(true.flatten(1)), rtol=0, atol=1e-12)
-    assert float(back[:, ::N_MODES].abs().max()) <= math.pi
-    model = ExposureModel(mask, GRID, N_MODES, whitening(mask, N_MODES, R0, 20.0))
-    z = far @ torch.linalg.pinv(model.mixing).T
-    back = model.unwrapped(z, nowhere[:, 1:])
-    torch.testing.assert_close(model.psf(back), model.psf(z), rtol=0, atol=1e-12)
-    assert bool((back.norm(dim=1) <= z.norm(dim=1) + 1e-12).all())
-    assert float(back[2].norm()) < float(z[2].norm()) - 1

@@ -4,16 +4,16 @@ import math
 
 import pytest
 import torch
-from torchmask.restoration.model import ExposureModel
-from torchmask.restoration.problem import JointProblem, State
 
 from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.grid import Grid
 from torchmask.metrics import align, lowpass
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.detector import Detector
-from torchmask.restoration.conjugate import conjugate_gradients
+from torchmask.restoration.aberrations import AberrationBasis, whitening
+from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.myopic import MyopicDeconvolution
+from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.posterior import (
     _bias,
     _filter,
@@ -22,40 +22,31 @@ from torchmask.restoration.posterior import (
     _sample,
     smooth,
 )
-from torchmask.restoration.priors import divergence, gradient, whitening
+from torchmask.restoration.priors import TotalVariation, divergence, gradient
+from torchmask.restoration.state import Calibration, State
 from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
 
 GRID = Grid.nyquist(1.0, 550e-9, 48)
 
 
-def mask(n=5):
-    angles = torch.arange(n, dtype=torch.float64) * 2 * math.pi / n
-    return SparseAperture(torch.stack([angles.cos(), angles.sin()], -1) * 0.38, 0.22, 1.0)
-
-
-def problem(n_static=0, free=("object", "aberrations"), n_frames=3, photons=1e4):
+def problem(mask, n_common=0, free=Free.OBJECT | Free.ABERRATIONS | Free.COMMON, n_frames=3, photons=1e4):
     """A block seen through a field without margin, so that convolutions are periodic."""
-    columns = whitening(mask(), 3, 0.3, 20.0)
-    model = ExposureModel(mask(), GRID, 3, columns, margin=0.0, n_static=n_static)
+    basis = AberrationBasis(whitening(mask, 3, 0.3, 20.0), 3, n_common)
+    model = ExposureModel(mask, GRID, basis, margin=0.0)
     generator = torch.Generator().manual_seed(0)
     image = torch.full(GRID.shape, 0.2, dtype=torch.float64)
     image[18:30, 16:34] = 3.0
-    z = 0.5 * torch.randn(n_frames, model.n_parameters, dtype=torch.float64, generator=generator)
-    if n_static:
-        z[:, -n_static:] = z[0, -n_static:]
+    z = 0.5 * torch.randn(n_frames, basis.n_parameters, dtype=torch.float64, generator=generator)
+    z = basis.with_common_of(z, z[:1])
     precision = torch.full((n_frames, 1, 1), photons, dtype=torch.float64)
     ones = torch.ones(n_frames, dtype=torch.float64)
-    centre = torch.zeros_like(z)
-    stated = JointProblem(model, model(image, z), precision, centre, tv_weight=1.0, free=free)
-    return stated, State(image, z, ones, 1.0, ones)
+    stated = MyopicObjective(model, model(image, z), precision, TotalVariation(), free=free)
+    return stated, State(image, z, Calibration(ones, ones, 1.0))
 
 
-def test_gradient_and_divergence_are_adjoint():
-    generator = torch.Generator().manual_seed(0)
-    image, dy, dx = (torch.randn(7, 9, dtype=torch.float64, generator=generator) for _ in range(3))
-    left = sum(float((a * b).sum()) for a, b in zip(gradient(image), (dy, dx), strict=True))
-    assert left == pytest.approx(float((image * divergence(dy, dx)).sum()), rel=1e-12)
+def power_of(stated, state):
+    return stated.object_quadratic(state.image, state.z, state.calibration)[1]
 
 
 def test_smooth_is_a_gaussian_of_that_width():
@@ -64,15 +55,6 @@ def test_smooth_is_a_gaussian_of_that_width():
     y, x = torch.meshgrid(torch.arange(64.0) - 20, torch.arange(48.0) - 30, indexing="ij")
     expected = torch.exp(-(y**2 + x**2) / (2 * 3.0**2)) / (2 * math.pi * 3.0**2)
     torch.testing.assert_close(smooth(point, 3.0), expected.double(), rtol=0, atol=1e-8)  # float32 distances
-
-
-def test_conjugate_gradients_solve():
-    generator = torch.Generator().manual_seed(0)
-    root = torch.randn(12, 12, dtype=torch.float64, generator=generator)
-    matrix = root @ root.T + torch.eye(12, dtype=torch.float64)
-    right = torch.randn(4, 12, dtype=torch.float64, generator=generator)
-    found = conjugate_gradients(lambda x: x @ matrix, right, lambda x: x / matrix.diagonal(), 50)
-    torch.testing.assert_close(found, torch.linalg.solve(matrix, right.T).T, rtol=1e-9, atol=1e-9)
 
 
 def test_noise_of_the_prior_has_its_hessian_as_covariance():
@@ -87,10 +69,10 @@ def test_noise_of_the_prior_has_its_hessian_as_covariance():
     assert float(error.max()) < 5 * math.sqrt(2 / n)  # a sample variance is off by sqrt(2 / n); 5 sigma of 465 entries
 
 
-def test_the_object_alone_has_the_closed_form():
+def test_the_object_alone_has_the_closed_form(five_holes):
     """With known PSFs and an even prior the posterior is diagonal in frequency: variance 1 / (power + prior |k|^2)."""
-    stated, state = problem(free=("object",))
-    power, prior = stated.object_quadratic(state)[1], torch.full(GRID.shape, 40.0, dtype=torch.float64)
+    stated, state = problem(five_holes, free=Free.OBJECT)
+    power, prior = power_of(stated, state), torch.full(GRID.shape, 40.0, dtype=torch.float64)
     generator = torch.Generator().manual_seed(1)
     objects, aberrations = _sample(stated, state, power, prior, 0.0, 12, generator)
     assert not bool(aberrations.any())
@@ -106,35 +88,33 @@ def test_the_object_alone_has_the_closed_form():
 
 
 @pytest.mark.slow
-def test_aberrations_alone_have_the_inverse_of_their_hessian():
+def test_aberrations_alone_have_the_inverse_of_their_hessian(five_holes):
     """With a known object the frames are apart, and the Hessian is a small matrix."""
-    stated, state = problem(free=("aberrations",), n_frames=1)
+    stated, state = problem(five_holes, free=Free.ABERRATIONS, n_frames=1)
     model = stated.model
     jacobian = torch.autograd.functional.jacobian(lambda z: model(state.image, z).flatten(), state.z)[:, 0]
-    hessian = 1e4 * jacobian.T @ jacobian + torch.eye(model.n_parameters, dtype=torch.float64)
+    hessian = 1e4 * jacobian.T @ jacobian + torch.eye(state.z.shape[1], dtype=torch.float64)
     expected = torch.linalg.inv(hessian).diagonal()
     prior = torch.ones(GRID.shape, dtype=torch.float64)
     n = 200
-    _, samples = _sample(
-        stated, state, stated.object_quadratic(state)[1], prior, 0.0, n, torch.Generator().manual_seed(2)
-    )
+    _, samples = _sample(stated, state, power_of(stated, state), prior, 0.0, n, torch.Generator().manual_seed(2))
     ratio = samples[:, 0].square().mean(0) / expected
     assert float((ratio - 1).abs().max()) < 4.5 * math.sqrt(2 / n)
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_without_a_prior_what_is_seen_scatters_as_it_should_and_the_rest_stays(dtype):
+def test_without_a_prior_what_is_seen_scatters_as_it_should_and_the_rest_stays(dtype, five_holes):
     """The mean piston has no curvature at all then: rounding must not send it to infinity."""
-    model = ExposureModel(mask(), GRID, 3, margin=0.0, dtype=dtype)
-    known, truth = problem(free=("aberrations",), n_frames=1)
-    z = truth.z @ known.model.mixing.T
+    model = ExposureModel(five_holes, GRID, 3, margin=0.0, dtype=dtype)
+    known, truth = problem(five_holes, free=Free.ABERRATIONS, n_frames=1)
+    z = known.model.aberrations.coefficients(truth.z).flatten(1)
     frames, precision = model(truth.image, z), known.precision.to(dtype)
-    stated = JointProblem(model, frames, precision, torch.zeros_like(z), tv_weight=1.0, free=known.free)
-    state = State(truth.image, z, truth.gains, 0.0, truth.excess)
+    stated = MyopicObjective(model, frames, precision, TotalVariation(), free=known.free)
+    state = State(truth.image, z, truth.calibration).calibrated(aberration_weight=0.0)
     jacobian = torch.autograd.functional.jacobian(lambda z: model(state.image, z).flatten(), z)[:, 0]
     values, vectors = torch.linalg.eigh(1e4 * jacobian.T @ jacobian)
     assert float(values[0]) < 1e-6 * float(values[1])
-    prior, power = torch.ones(GRID.shape, dtype=torch.float64), stated.object_quadratic(state)[1]
+    prior, power = torch.ones(GRID.shape, dtype=torch.float64), power_of(stated, state)
     n = 100
     samples = _sample(stated, state, power, prior, 0.0, n, torch.Generator().manual_seed(2))[1][:, 0] @ vectors
     ratio = samples[:, 1:].square().mean(0) * values[1:]
@@ -142,31 +122,29 @@ def test_without_a_prior_what_is_seen_scatters_as_it_should_and_the_rest_stays(d
     assert float(samples[:, 0].abs().max()) < float(samples[:, 1].abs().max())
 
 
-def test_common_aberrations_are_alike_and_better_known():
-    single = problem(n_frames=4)
-    common = problem(n_static=3, n_frames=4)
+def test_common_aberrations_are_alike_and_better_known(five_holes):
+    single = problem(five_holes, n_frames=4)
+    common = problem(five_holes, n_common=3, n_frames=4)
     prior = torch.full(GRID.shape, 40.0, dtype=torch.float64)
     spread = []
     for stated, state in (single, common):
-        _, z = _sample(
-            stated, state, stated.object_quadratic(state)[1], prior, 0.0, 40, torch.Generator().manual_seed(3)
-        )
+        _, z = _sample(stated, state, power_of(stated, state), prior, 0.0, 40, torch.Generator().manual_seed(3))
         spread.append(z[..., -3:].square().mean().sqrt())
     assert float((z[..., -3:] - z[:, :1, -3:]).abs().max()) < 1e-12
     assert float(spread[1]) < 0.75 * float(spread[0])  # 0.5 if the four frames said the same
 
 
-def test_an_unknown_object_leaves_aberrations_less_known_and_the_other_way_round():
+def test_an_unknown_object_leaves_aberrations_less_known_and_the_other_way_round(five_holes):
     prior = torch.full(GRID.shape, 1.0, dtype=torch.float64)
     results = {}
-    for free in (("object",), ("aberrations",), ("object", "aberrations")):
-        stated, state = problem(free=free, photons=300.0)
+    everything = Free.OBJECT | Free.ABERRATIONS
+    for free in (Free.OBJECT, Free.ABERRATIONS, everything):
+        stated, state = problem(five_holes, free=free, photons=300.0)
         generator = torch.Generator().manual_seed(3)
-        objects, z = _sample(stated, state, stated.object_quadratic(state)[1], prior, 0.0, 30, generator)
+        objects, z = _sample(stated, state, power_of(stated, state), prior, 0.0, 30, generator)
         results[free] = float(lowpass(objects, 0.3).square().mean()), float(z.square().mean())
-    both = results["object", "aberrations"]
-    assert both[0] > 1.02 * results["object",][0]
-    assert both[1] > 1.02 * results["aberrations",][1]
+    assert results[everything][0] > 1.02 * results[Free.OBJECT][0]
+    assert results[everything][1] > 1.02 * results[Free.ABERRATIONS][1]
 
 
 def inside(observation, result):
@@ -188,18 +166,17 @@ def test_about_two_thirds_of_bright_pixels_lie_within_one_sigma(photons):
     assert 0.5 < inside(seen, result) < 0.85
 
 
-def test_coefficients_scatter_as_said():
+def test_coefficients_scatter_as_said(five_holes):
     """Errors of the coefficients over their standard deviations, from frames that the model itself has made."""
-    aperture = mask()
-    columns = whitening(aperture, 3, 1.5, 20.0)
+    columns = whitening(five_holes, 3, 1.5, 20.0)
     generator = torch.Generator().manual_seed(5)
     z = torch.randn(6, columns.shape[1], dtype=torch.float64, generator=generator)
     true = (z @ columns.T).unflatten(1, (5, 3))
-    model = ExposureModel(aperture, GRID, 3)
-    image = torch.zeros(model.field.shape, dtype=torch.float64)
+    model = ExposureModel(five_holes, GRID, 3)
+    image = torch.zeros(model.window.field.shape, dtype=torch.float64)
     image[18:30, 16:34], image[20:24, 20:42] = 3000.0, 5000.0
     frames = torch.poisson(model(image, true.flatten(1)).clamp(min=0), generator=generator)
-    method = MyopicDeconvolution(aperture, GRID, 3, r0=1.5, outer_scale=20.0)
+    method = MyopicDeconvolution(five_holes, GRID, 3, r0=1.5, outer_scale=20.0)
     result = method.restore(frames, known_object=image[:48, :48], n_samples=30)
     error = result.coefficients - true
     error[..., 0] -= error[..., 0].mean(1, keepdim=True)
@@ -210,11 +187,11 @@ def test_coefficients_scatter_as_said():
     assert not bool(result.object_std.any())  # it is known
 
 
-def test_deviations_are_kept_and_asked_for(tmp_path):
-    aperture, frames = mask(), torch.full((2, 48, 48), 20.0, dtype=torch.float64)
+def test_deviations_are_kept_and_asked_for(tmp_path, five_holes):
+    frames = torch.full((2, 48, 48), 20.0, dtype=torch.float64)
     frames[:, 16:30, 20:28] = 1000.0
     frames = torch.poisson(frames, generator=torch.Generator().manual_seed(0))
-    method = MyopicDeconvolution(aperture, GRID, 3, max_iterations=3)
+    method = MyopicDeconvolution(five_holes, GRID, 3, max_iterations=3)
     plain = method.restore(frames)
     assert plain.object_std is None
     assert plain.coefficients_std is None

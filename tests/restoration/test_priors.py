@@ -1,58 +1,274 @@
-"""Total variation against its definition and gradient; the whitening against the covariance it factors."""
+"""Priors on the object: known values, gradients and curvatures against automatic differentiation, for every prior."""
+
+import math
+from functools import partial
 
 import pytest
 import torch
+from torch import nn
 
-from torchmask.atmosphere.von_karman import modal_covariance
-from torchmask.optics.aperture import FullAperture, SparseAperture
-from torchmask.restoration.priors import total_variation, total_variation_curvature, whitening
-
-
-def test_total_variation_of_known_images():
-    step = torch.zeros(8, 10, dtype=torch.float64)
-    step[2:6, 3:7] = 5.0
-    # A square of side 4 and height 5: 16 unit edges, but at one corner both differences fall on one pixel.
-    assert float(total_variation(step, 1e-9)[0]) == pytest.approx(5 * (14 + 2**0.5), rel=1e-6)
-    assert float(total_variation(torch.full((4, 4), 3.0))[0]) == 0
-    diagonal = torch.zeros(8, 8, dtype=torch.float64)
-    diagonal[3, 3] = 1
-    assert float(total_variation(diagonal, 1e-9)[0]) == pytest.approx(2 + 2**0.5, rel=1e-6)  # isotropic, not 4
+from torchmask.restoration.priors import (
+    EdgePreserving,
+    FunctionPrior,
+    ObjectPrior,
+    TotalVariation,
+    as_prior,
+    check_prior,
+    divergence,
+    gradient,
+)
 
 
-def test_total_variation_gradient():
-    image = torch.rand(5, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
-    for epsilon in (0.01, 0.3):
-        value, gradient = total_variation(image, epsilon)
-        (expected,) = torch.autograd.grad(value, image)
-        assert (gradient - expected).abs().max() < 1e-12
-    flat = torch.ones(3, 3)
-    assert total_variation(flat)[1].abs().max() == 0
+def squares(image):
+    """As a stranger writes one."""
+    return 0.5 * (gradient(image)[0] ** 2 + 3.0 * gradient(image)[1] ** 2).sum()
 
 
-def test_curvature_majorises():
-    """A quadratic in one pixel with that curvature lies above TV everywhere and touches it at the image."""
-    generator = torch.Generator().manual_seed(1)
-    image = torch.rand(6, 7, dtype=torch.float64, generator=generator)
-    value, gradient = total_variation(image)
-    curvature = total_variation_curvature(image)
+class Learned(nn.Module):
+    """A filter whose weights are parameters."""
+
+    def __init__(self):
+        super().__init__()
+        generator = torch.Generator().manual_seed(4)
+        self.kernel = nn.Parameter(torch.randn(2, 1, 3, 3, dtype=torch.float64, generator=generator))
+
+    def forward(self, image):
+        return torch.log1p(nn.functional.conv2d(image[None, None], self.kernel.to(image), padding=1) ** 2).sum()
+
+
+class Entropy:
+    """With a gradient and a curvature of its own."""
+
+    def __call__(self, image):
+        return ((image + 1) * (image + 1).log()).sum()
+
+    def gradient(self, image):
+        return (image + 1).log() + 1
+
+    def curvature(self, image):
+        return 1 / (image + 1)
+
+
+class Ridge(ObjectPrior):
+    """A subclass that writes `forward` only."""
+
+    def forward(self, image):
+        return 0.7 * (image**2).sum()
+
+
+PRIORS = {
+    "total variation": TotalVariation,
+    "smoother total variation": lambda: TotalVariation(2.0, 0.3),
+    "edge preserving": EdgePreserving,
+    "edge preserving, other threshold": lambda: EdgePreserving(0.7, 0.1),
+    "function": lambda: squares,
+    "module": Learned,
+    "own gradient": Entropy,
+    "subclass": Ridge,
+}
+each_prior = pytest.mark.parametrize("make", PRIORS.values(), ids=PRIORS.keys())
+
+
+def rough(rows=6, columns=7, seed=0, dtype=torch.float64):
+    return torch.rand(rows, columns, dtype=dtype, generator=torch.Generator().manual_seed(seed))
+
+
+def exact_gradient(prior, image):
+    leaf = image.detach().clone().requires_grad_()
+    return torch.autograd.grad(prior(leaf), leaf)[0]
+
+
+@each_prior
+@pytest.mark.parametrize(("dtype", "rounding"), [(torch.float64, 1e-12), (torch.float32, 2e-5)])
+def test_value_and_gradient_are_those_of_autograd(make, dtype, rounding):
+    prior, image = as_prior(make()), 3 * rough(dtype=dtype)
+    value, slope = prior.value_and_gradient(image)
+    expected = exact_gradient(prior, image)
+    assert value.ndim == 0
+    assert not value.requires_grad
+    assert not slope.requires_grad
+    assert slope.dtype == dtype
+    assert float(value) == pytest.approx(float(prior(image).detach()), rel=rounding)
+    assert float((slope - expected).abs().max()) < rounding * float(expected.abs().max())
+
+
+@each_prior
+def test_gradcheck(make):
+    prior = as_prior(make())
+    assert torch.autograd.gradcheck(prior, rough(4, 5).requires_grad_())
+    if make is not PRIORS["own gradient"]:
+        assert torch.autograd.gradgradcheck(prior, rough(4, 5, seed=1).requires_grad_())
+
+
+@each_prior
+def test_curvature_majorises_or_is_the_diagonal_of_the_hessian(make):
+    """Within the statistical error of eight probes: the off-diagonal part of a row, over the square root of eight."""
+    prior, image = as_prior(make()), rough()
+    hessian = torch.autograd.functional.hessian(prior, image).reshape(image.numel(), -1)
+    exact = hessian.diagonal()
+    off = (hessian.square().sum(1) - exact.square()).clamp(min=0).sqrt()
+    found = prior.curvature(image)
+    assert found.shape == image.shape
+    assert bool((found >= 0).all())
+    if type(prior).curvature is ObjectPrior.curvature or isinstance(prior, FunctionPrior):
+        assert bool(((found.flatten() - exact.clamp(min=0)).abs() < 4.5 * off / math.sqrt(8) + 1e-12).all())
+    else:
+        assert bool((found.flatten() >= exact - 1e-12).all())
+
+
+@pytest.mark.parametrize("make", [TotalVariation, partial(TotalVariation, 2.0, 0.3), EdgePreserving])
+def test_curvature_majorises(make):
+    """A quadratic in one pixel with that curvature lies above the prior everywhere and touches it at the image."""
+    prior = make()
+    image = rough(seed=1)
+    value, slope = prior.value_and_gradient(image)
+    curvature = prior.curvature(image)
     for step in (-2.0, -0.1, -0.001, 0.001, 0.1, 2.0):
         moved = image.clone()
         moved[2, 3] += step
-        bound = value + gradient[2, 3] * step + 0.5 * curvature[2, 3] * step**2
-        assert float(total_variation(moved)[0]) <= float(bound) + 1e-12
+        bound = value + slope[2, 3] * step + 0.5 * curvature[2, 3] * step**2
+        assert float(prior(moved)) <= float(bound) + 1e-12
 
 
-@pytest.mark.parametrize("aperture", [SparseAperture([[0.0, 0.3], [0.3, -0.2]], 0.2, 1.0), FullAperture(1.0)])
-def test_whitening_factors_the_covariance_without_the_common_piston(aperture):
-    n_sub, n_modes = aperture.n_subapertures, 4
-    factor = whitening(aperture, n_modes, 0.15, 20.0)
-    assert factor.shape == (n_sub * n_modes, n_sub * n_modes - 1)
-    common = torch.zeros(n_sub, n_modes, dtype=torch.float64)
-    common[:, 0] = n_sub**-0.5
-    common = common.flatten()
-    covariance = modal_covariance(aperture, n_modes, 0.15, 20.0)
-    scale = covariance.abs().max()
-    assert (common @ factor).abs().max() < 1e-6 * scale**0.5
-    # What is left of the covariance is what no mean piston enters.
-    other = torch.eye(n_sub * n_modes, dtype=torch.float64) - torch.outer(common, common)
-    assert (factor @ factor.T - other @ covariance @ other).abs().max() < 1e-11 * scale
+def test_total_variation_of_known_images():
+    sharp = TotalVariation(epsilon=1e-9)
+    step = torch.zeros(8, 10, dtype=torch.float64)
+    step[2:6, 3:7] = 5.0
+    # A square of side 4 and height 5: 16 unit edges, but at one corner both differences fall on one pixel.
+    assert float(sharp(step)) == pytest.approx(5 * (14 + 2**0.5), rel=1e-6)
+    assert float(TotalVariation()(torch.full((4, 4), 3.0))) == 0
+    diagonal = torch.zeros(8, 8, dtype=torch.float64)
+    diagonal[3, 3] = 1
+    assert float(sharp(diagonal)) == pytest.approx(2 + 2**0.5, rel=1e-6)  # isotropic, not 4
+    assert float(TotalVariation(3.0, 1e-9)(step)) == pytest.approx(3 * float(sharp(step)), rel=1e-12)
+
+
+def test_total_variation_gradient():
+    for epsilon in (0.01, 0.3):
+        prior, image = TotalVariation(epsilon=epsilon), rough(5, 6)
+        assert (prior.value_and_gradient(image)[1] - exact_gradient(prior, image)).abs().max() < 1e-12
+    assert TotalVariation().value_and_gradient(torch.ones(3, 3))[1].abs().max() == 0
+
+
+def test_edge_preserving_is_quadratic_in_slopes_and_linear_in_edges():
+    weight, threshold = 3.0, 0.5
+    prior = EdgePreserving(weight, threshold)
+    ramp = torch.zeros(6, 8, dtype=torch.float64)
+    ramp[2, 3] = 1.0
+    lengths = torch.tensor([1.0, 1.0, 2**0.5], dtype=torch.float64)  # of its slopes: from above, the left, and its own
+
+    def expected(height):
+        ratio = height * lengths / threshold
+        return float(weight * threshold**2 * (ratio - torch.log1p(ratio)).sum())
+
+    for height in (1e-3, 0.5, 40.0):
+        assert float(prior(height * ramp)) == pytest.approx(expected(height), rel=1e-9)
+    # Its limits: half the weight times squares, weight times threshold times lengths.
+    small, large = 1e-6, 1e6
+    assert float(prior(small * ramp)) == pytest.approx(weight / 2 * small**2 * 4, rel=1e-5)
+    assert float(prior(large * ramp)) == pytest.approx(weight * threshold * large * float(lengths.sum()), rel=1e-4)
+
+
+def test_edge_preserving_differentiates_where_the_image_is_flat():
+    flat = torch.full((4, 5), 2.0, dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(EdgePreserving()(flat), flat)
+    assert float(slope.abs().max()) == 0
+    assert float(EdgePreserving(2.0).curvature(flat.detach()).min()) == pytest.approx(8.0)  # 4 squares, each weight / 2
+
+
+def test_gradient_and_divergence_are_adjoint():
+    generator = torch.Generator().manual_seed(0)
+    image, dy, dx = (torch.randn(7, 9, dtype=torch.float64, generator=generator) for _ in range(3))
+    left = sum(float((a * b).sum()) for a, b in zip(gradient(image), (dy, dx), strict=True))
+    assert left == pytest.approx(float((image * divergence(dy, dx)).sum()), rel=1e-12)
+
+
+def test_a_linear_prior_has_no_curvature():
+    assert float(as_prior(lambda image: 0.3 * image.sum()).curvature(rough()).abs().max()) == 0
+
+
+def test_a_concave_prior_has_no_negative_curvature():
+    assert float(as_prior(lambda image: -(image**2).sum()).curvature(rough()).abs().max()) == 0
+
+
+def test_own_gradient_and_curvature_are_used():
+    """They are known to be used by being wrong."""
+
+    class Wrong(Entropy):
+        def gradient(self, image):
+            return torch.full_like(image, 7.0)
+
+        def curvature(self, image):
+            return torch.full_like(image, 9.0)
+
+    prior = as_prior(Wrong())
+    assert prior.value_and_gradient(rough())[1].unique().tolist() == [7.0]
+    assert prior.curvature(rough()).unique().tolist() == [9.0]
+
+
+def test_what_a_prior_is_called_tells_it_from_others():
+    """A checkpoint goes by it; the repr of a function would hold an address."""
+    assert repr(TotalVariation(2.0)) == "TotalVariation(weight=2, epsilon=0.01)"
+    assert repr(EdgePreserving()) == "EdgePreserving(weight=2, threshold=0.5)"
+    assert repr(as_prior(squares)).endswith("squares")
+    assert "0x" not in repr(as_prior(squares))
+    assert repr(as_prior(Learned())) == repr(Learned())
+    assert list(as_prior(Learned()).state_dict()) == ["function.kernel"]
+
+
+def test_a_prior_stays_the_same_object():
+    prior = EdgePreserving()
+    assert as_prior(prior) is prior
+
+
+@pytest.mark.parametrize("number", [0.0, -1.0, math.nan, math.inf])
+def test_refuses_numbers(number):
+    for make, name in ((TotalVariation, "epsilon"), (EdgePreserving, "threshold")):
+        for which in ("weight", name):
+            with pytest.raises(ValueError, match=f"{which} is {number}: it must be finite and positive"):
+                make(**{which: number})
+
+
+def test_refuses_what_cannot_be_called():
+    with pytest.raises(TypeError, match=r"prior is 3\.0: it must be a function or module"):
+        as_prior(3.0)
+
+
+def test_a_subclass_without_forward_says_so():
+    with pytest.raises(TypeError, match=r"Empty has no forward\(image\) that returns a scalar: write one"):
+        type("Empty", (ObjectPrior,), {})()(rough())
+
+
+class OfWrongShape:
+    def __call__(self, image):
+        return (image**2).sum()
+
+    def gradient(self, image):
+        return 2 * image[:-1]
+
+
+@pytest.mark.parametrize(
+    ("prior", "words"),
+    [
+        (lambda image: image**2, r"returns a tensor of shape \(6, 7\) for an image: it must return a scalar"),
+        (lambda image: 1.0, "returns a float for an image"),
+        (lambda image: image.sum() * math.nan, "is nan at the mean frame: it must be finite there"),
+        (lambda image: -image.sum() / 0.0, "is -inf at the mean frame"),
+        (lambda image: image.detach().sum(), "does not depend on the image by operations that PyTorch differentiates"),
+        (lambda image: torch.tensor(3.0), "does not depend on the image"),
+        (lambda image: (image - image).sqrt().sum(), "is not finite: it must be finite, of shape"),
+        (lambda image: image[9, 9], r"fails on an image \(6, 7\): index 9 is out of bounds"),
+        (lambda image: (image @ image).sum(), r"fails on an image \(6, 7\)"),
+        (OfWrongShape(), r"has shape \(5, 7\) or is not finite"),
+    ],
+)
+def test_refuses_what_is_no_prior(prior, words):
+    with pytest.raises(ValueError, match=words):
+        check_prior(as_prior(prior), rough())
+
+
+@each_prior
+def test_accepts_every_prior_at_an_image_with_dark_parts(make):
+    image = rough()
+    image[:3] = 0
+    check_prior(as_prior(make()), image)

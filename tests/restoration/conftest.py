@@ -1,0 +1,112 @@
+"""What several tests of the restoration stand on: small problems to take apart, and one whole restoration."""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchmask.atmosphere.phase import TurbulencePhase
+from torchmask.grid import Grid
+from torchmask.observation import Observation
+from torchmask.optics.aperture import Aperture, SparseAperture
+from torchmask.optics.detector import Detector
+from torchmask.restoration.forward import ExposureModel
+from torchmask.restoration.myopic import MyopicDeconvolution
+from torchmask.restoration.result import RestorationResult
+from torchmask.simulation.exposures import simulate_observation
+
+R0, OUTER_SCALE, READOUT = 0.25, 20.0, 1.5
+N_MODES = 10  # so many that at this d/r0 what they leave out is below the noise
+
+
+class Exposures(NamedTuple):
+    """A model with an object, aberrations, frames and weights that have nothing to do with each other."""
+
+    model: ExposureModel
+    image: Tensor
+    z: Tensor
+    frames: Tensor
+    precision: Tensor
+
+
+@pytest.fixture(scope="session")
+def random_exposures() -> Callable[..., Exposures]:
+    def make(model: ExposureModel, n_frames: int = 3) -> Exposures:
+        generator = torch.Generator().manual_seed(0)
+        shape = (n_frames, *model.window.grid.shape)
+        image = torch.rand(model.window.field.shape, dtype=torch.float64, generator=generator)
+        z = 0.5 * torch.randn(n_frames, model.aberrations.n_parameters, dtype=torch.float64, generator=generator)
+        frames = torch.rand(shape, dtype=torch.float64, generator=generator).to(model.dtype)
+        precision = torch.rand(shape, dtype=torch.float64, generator=generator).to(model.dtype)
+        return Exposures(model, image, z, frames, precision)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def three_holes() -> SparseAperture:
+    return SparseAperture([[0.0, 0.3], [0.3, -0.2], [-0.3, -0.15]], 0.36, 1.0)
+
+
+@pytest.fixture(scope="session")
+def five_holes() -> SparseAperture:
+    """On a ring."""
+    angles = torch.arange(5, dtype=torch.float64) * 2 * math.pi / 5
+    return SparseAperture(torch.stack([angles.cos(), angles.sin()], -1) * 0.38, 0.22, 1.0)
+
+
+def satellite(shape: tuple[int, int], n_photons: float) -> Tensor:
+    """A body with two panels of different brightness and a glint."""
+    image = torch.zeros(shape, dtype=torch.float64)
+    row, column = shape[0] // 2, shape[1] // 2
+    image[row - 4 : row + 4, column - 3 : column + 3] = 3
+    image[row - 1 : row + 2, column - 11 : column - 3] = 1
+    image[row - 1 : row + 2, column + 3 : column + 10] = 1.5
+    image[row + 2, column + 1] = 20
+    return image * (n_photons / image.sum())
+
+
+@pytest.fixture(scope="session")
+def observe(five_holes) -> Callable[..., Observation]:
+    """Simulates end to end: no part of the model that is inverted has a share in it."""
+
+    def make(
+        aperture: Aperture | None = None, n_frames: int = 8, n_photons: float = 1e6, seed: int = 1, shape=(48, 48)
+    ) -> Observation:
+        return simulate_observation(
+            satellite(shape, n_photons),
+            aperture or five_holes,
+            Grid.nyquist(1.0, 550e-9, shape),
+            TurbulencePhase(R0, OUTER_SCALE),
+            Detector(READOUT),
+            n_frames,
+            generator=torch.Generator().manual_seed(seed),
+        )
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def observation(observe) -> Observation:
+    """Eight exposures of a satellite through five holes."""
+    return observe()
+
+
+@pytest.fixture(scope="session")
+def restoring(observation) -> Callable[..., MyopicDeconvolution]:
+    """The method for `observation`, which knows the turbulence and the noise unless told otherwise."""
+
+    def make(n_modes: int = N_MODES, **options) -> MyopicDeconvolution:
+        given = {"r0": R0, "outer_scale": OUTER_SCALE, "readout_noise": READOUT} | options
+        return MyopicDeconvolution(observation.aperture, observation.grid, n_modes, **given)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def restored(observation, restoring) -> RestorationResult:
+    """`observation`, restored by a method that knows the turbulence and the noise."""
+    return restoring().restore(observation.frames)

@@ -1,0 +1,76 @@
+"""A stack of frames: its unit, its weights, what changes from frame to frame, and how bright its border is."""
+
+import math
+
+import pytest
+import torch
+
+from torchmask.grid import Grid
+from torchmask.optics.aperture import FullAperture
+from torchmask.restoration.frames import FrameStack, border_brightness
+
+GRID = Grid.nyquist(1.0, 550e-9, 32)
+PUPIL = FullAperture(1.0)
+READOUT = 3.0
+
+
+def exposures(n_frames=4, level=50.0, seed=0):
+    """A block on dark ground with photon and read-out noise."""
+    generator = torch.Generator().manual_seed(seed)
+    expected = torch.zeros(n_frames, *GRID.shape, dtype=torch.float64)
+    expected[:, 10:20, 12:22] = level
+    noise = READOUT * torch.randn(expected.shape, dtype=torch.float64, generator=generator)
+    return torch.poisson(expected, generator=generator) + noise
+
+
+def test_a_stack_is_in_units_of_its_mean_pixel():
+    frames = exposures()
+    stack = FrameStack.of(frames, None, GRID, PUPIL, READOUT)
+    assert len(stack) == 4
+    assert stack.unit == pytest.approx(float(frames.mean()), rel=1e-12)
+    assert float(stack.frames.mean()) == pytest.approx(1, rel=1e-12)
+    torch.testing.assert_close(stack.frames * stack.unit, frames)
+    assert stack.variance == pytest.approx(float(frames.mean()) + READOUT**2, rel=1e-12)
+    assert stack.photon_share == pytest.approx(stack.unit / (stack.unit + READOUT**2), rel=1e-12)
+
+
+def test_precision_is_the_inverse_variance_of_valid_pixels():
+    frames, valid = exposures(), torch.ones(GRID.shape, dtype=torch.bool)
+    whole = FrameStack.of(frames, valid, GRID, PUPIL, READOUT)
+    expected = whole.unit**2 / whole.variance
+    assert whole.precision.shape == (1, 1, 1)  # one number for all spares a stack's memory
+    assert whole.precision.item() == pytest.approx(expected, rel=1e-12)
+    valid[3, 4] = False
+    partly = FrameStack.of(torch.where(valid, frames, math.nan), valid, GRID, PUPIL, READOUT)
+    assert partly.precision.shape == frames.shape
+    assert bool((partly.precision[:, 3, 4] == 0).all())
+    assert float(partly.precision[:, valid].min()) == pytest.approx(partly.unit**2 / partly.variance, rel=1e-12)
+    assert bool(torch.isfinite(partly.frames).all())
+
+
+def test_change_is_the_chi_square_against_the_mean_frame():
+    """Noise alone leaves 1 - 1/T of its variance; another brightness is no change."""
+    stack = FrameStack.of(exposures(n_frames=8), None, GRID, PUPIL, READOUT)
+    degrees = stack.frames.numel() * (1 - 1 / 8)
+    assert stack.change == pytest.approx(1 - 1 / 8, abs=4 * math.sqrt(2 / degrees))
+    frames = exposures()[:1] * torch.tensor([0.5, 1.0, 1.5]).double()[:, None, None]
+    scaled = FrameStack.of(frames, None, GRID, PUPIL, None)
+    assert scaled.change < 1e-20
+
+
+def test_a_stack_moves_to_another_precision():
+    stack = FrameStack.of(exposures(), None, GRID, PUPIL, READOUT)
+    single = stack.to(torch.float32, torch.device("cpu"))
+    assert single.frames.dtype == single.precision.dtype == torch.float32
+    assert (single.unit, single.variance) == (stack.unit, stack.variance)
+
+
+def test_border_brightness():
+    frames = torch.zeros(2, 4, 6)
+    frames[:, 1:3, 1:5] = torch.tensor([2.0, -8.0])[:, None, None]
+    assert border_brightness(frames + 10) == pytest.approx(10 / (10 - 3 / 3), rel=1e-6)
+
+
+def test_a_bright_border_is_noticed():
+    with pytest.warns(UserWarning, match="does the object reach beyond the field"):
+        FrameStack.of(exposures() + 100.0, None, GRID, PUPIL, None)
