@@ -37,7 +37,7 @@ def help_of(command, capsys):
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_shows_every_option(command, capsys):
     text = help_of(command, capsys)
-    positional = {"stack", "name" if command == "masks" else "", "path" if command == "view" else ""}
+    positional = {"stacks", "name" if command == "masks" else "", "path" if command == "view" else ""}
     for name, _ in leaves(options_of(command)):
         if name not in positional:
             assert f"--{name.replace('_', '-')}" in text

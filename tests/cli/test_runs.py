@@ -1,5 +1,6 @@
 """design, simulate, restore, codesign, small: what they write, that configs reproduce it, that nothing is lost."""
 
+import dataclasses
 import json
 import re
 
@@ -9,8 +10,10 @@ import torch
 import yaml
 from astropy.io import fits
 
+from torchmask.cli.config import load_config
 from torchmask.cli.main import main
 from torchmask.cli.report import draw_zones
+from torchmask.cli.restore import Options
 from torchmask.design.constraints import KeepOutDisc, KeepOutSegment, MinimumGap, check_mask
 from torchmask.design.criterion import AsymptoticMSE
 from torchmask.design.manufacture import load_mask
@@ -208,7 +211,10 @@ def test_bad_stacks_are_refused(runs, cube, tmp_path, capsys):
     refused(["restore", tmp_path / "four.fits", *full], tmp_path, capsys, r"shape \(2, 2, 8, 8\)")
     refused(["restore", tmp_path / "frames.npz"], tmp_path, capsys, "has no centers")
     refused(["restore", runs / "simulate/stack.npz", "--crop", "8"], tmp_path, capsys, "--crop is for FITS")
-    refused(["restore", *[runs / "simulate/stack.npz"] * 2], tmp_path, capsys, "2 stacks")
+    refused(["restore", *[runs / "simulate/stack.npz"] * 2, "--join"], tmp_path, capsys, "--join is for FITS")
+    two = [tmp_path / "none.npz", tmp_path / "cut.npz"]
+    refused(["restore", *two], tmp_path, capsys, r"2 of 2 stacks failed: none: there is no file.*; cut: .*cut\.npz")
+    refused(["restore", *two, "--workers", "0"], tmp_path, capsys, "2 of 2 stacks failed")
 
 
 def test_files_of_several_kinds_are_not_mixed(tmp_path, capsys):
@@ -216,8 +222,9 @@ def test_files_of_several_kinds_are_not_mixed(tmp_path, capsys):
     for name, cards in (("a", {"FILTER": "K"}), ("b", {"FILTER": "H"}), ("c", {"FILTER": "K", "PIXELSCL": 0.03})):
         header = fits.Header({"PIXELSCL": 0.02, "BUNIT": "electron"} | cards)
         fits.PrimaryHDU(np.ones((16, 16)), header).writeto(tmp_path / f"{name}.fits")
-    refused(["restore", tmp_path / "a.fits", tmp_path / "b.fits", *full], tmp_path, capsys, "mix filters")
-    refused(["restore", tmp_path / "a.fits", tmp_path / "c.fits", *full], tmp_path, capsys, "mix pixel scales")
+    for other, message in (("b", "mix filters"), ("c", "mix pixel scales")):
+        files = [tmp_path / "a.fits", tmp_path / f"{other}.fits"]
+        refused(["restore", *files, "--join", *full], tmp_path, capsys, message)
 
 
 def test_impossible_requests_are_refused_and_leave_nothing(tmp_path, capsys):
@@ -331,6 +338,95 @@ def test_an_interrupted_restoration_goes_on_to_the_same_result(runs, tmp_path, m
     (tmp_path / "rest/resume.npz").unlink()
     refused(["restore", "--resume", tmp_path / "rest"], tmp_path, capsys, "no .*resume.npz to go on from")
     refused(["restore", "--resume", tmp_path / "none"], tmp_path, capsys, "there is no config file .*none/config.yaml")
+
+
+def test_a_resumed_restoration_is_one(runs, tmp_path, capsys):
+    stacks = [runs / "simulate/stack.npz", tmp_path / "other.npz"]
+    refused(["restore", *stacks, "--resume", runs / "restore"], tmp_path, capsys, "--resume goes on with one stack")
+
+
+@pytest.fixture(scope="module")
+def several(runs):
+    """Two stacks of one name in two folders, and a damaged one between them, restored together."""
+    first = runs / "simulate/stack.npz"
+    (runs / "other").mkdir()
+    second, damaged = runs / "other/stack.npz", runs / "damaged.npz"
+    stack = Observation.load(first)
+    dataclasses.replace(stack, frames=stack.frames.flip(0)).save(second)
+    damaged.write_bytes(first.read_bytes()[:2000])
+    argv = ["restore", first, damaged, second, "--max-iterations", "12", "--out", runs / "several"]
+    assert main([str(word) for word in argv]) == 1
+    return runs / "several"
+
+
+def test_several_stacks_are_restored_each_as_by_itself_and_one_failure_harms_no_other(runs, several):
+    alone = RestorationResult.load(runs / "restore/restored.npz")
+    assert torch.equal(RestorationResult.load(several / "stack/restored.npz").object, alone.object)
+    other = Observation.load(runs / "other/stack.npz")
+    method = MyopicDeconvolution(
+        other.aperture, other.grid, r0=0.3, outer_scale=20.0, readout_noise=1.5, max_iterations=12
+    )
+    found = RestorationResult.load(several / "stack-2/restored.npz")
+    assert torch.equal(found.object, method.restore(other.frames).object)
+    with fits.open(several / "stack-2/restored.fits") as content:
+        history = "".join(content[0].header["HISTORY"])
+    assert str(runs / "other/stack.npz") in history
+    assert "damaged" not in history
+    table = json.loads((several / "metrics.json").read_text())
+    assert set(table) == {"stack", "stack-2", "damaged"}
+    assert table["stack-2"]["chi_square"] == pytest.approx(float(found.chi_square.mean()), rel=1e-12)
+    assert "damaged.npz" in table["damaged"]["error"]
+    assert {"stack_restored.png", "stack-2_restored.png"} <= {path.name for path in several.iterdir()}
+
+
+def test_what_failed_of_several_is_one_line_and_the_log_knows(several, capsys):
+    status = json.loads((several / "status.json").read_text())
+    assert status["status"] == "failed"
+    assert "1 of 3 stacks failed: damaged: " in status["error"]
+    config = str(several / "config.yaml")
+    assert main(["restore", "--config", config, "--max-iterations", "2", "--out", f"{several}-again"]) == 1
+    *summary, where, error = capsys.readouterr().err.splitlines()
+    assert error.startswith("torchmask restore: error: 1 of 3 stacks failed: damaged: ")
+    assert where == f"what was reached is in {several}-again"
+    assert any(line.startswith("stack-2: restored 32 x 32 pixels") for line in summary)
+
+
+def test_joined_fits_files_are_one_stack_and_others_one_each(runs, cube, tmp_path):
+    frames = fits.getdata(cube)
+    parts = [tmp_path / "first.fits", tmp_path / "second.fits"]
+    for path, part in zip(parts, (frames[:1], frames[1:]), strict=True):
+        fits.PrimaryHDU(part, fits.getheader(cube)).writeto(path)
+    scale = Grid.nyquist(1.0, 1e-6, 32).pixel_scale / ARCSEC
+    given = ["--mask", runs / "design/mask.json", "--wavelength", "1e-6", "--pixel-scale-arcsec", repr(scale)]
+    given += ["--r0", "0.3", "--readout-noise", "1.5", "--max-iterations", "3", "--workers", "1"]
+    run("restore", cube, *given, "--out", tmp_path / "cube")
+    run("restore", *parts, "--join", *given, "--out", tmp_path / "joined")
+    run("restore", *parts, *given, "--out", tmp_path / "each")
+    whole, joined = (RestorationResult.load(tmp_path / name / "restored.npz") for name in ("cube", "joined"))
+    assert torch.equal(whole.object, joined.object)
+    counts = [len(RestorationResult.load(tmp_path / f"each/{path.stem}/restored.npz").model) for path in parts]
+    assert counts == [1, 2]
+
+
+def test_an_interruption_keeps_the_stacks_that_are_done(runs, tmp_path, monkeypatch, capsys):
+    interrupt_at(monkeypatch, "stacks", 2)
+    stack = str(runs / "simulate/stack.npz")
+    argv = ["restore", stack, stack, stack, "--max-iterations", "2", "--workers", "1", "--out", str(tmp_path / "run")]
+    assert main(argv) == 130
+    assert f"what was reached is in {tmp_path / 'run'}" in capsys.readouterr().err
+    assert sorted(path.parent.name for path in (tmp_path / "run").glob("*/restored.npz")) == ["stack"]
+
+
+def test_a_config_of_version_0_1_still_says_the_same(runs, cube, tmp_path):
+    """There, files were one stack; the key was stack."""
+    stack = runs / "simulate/stack.npz"
+    (tmp_path / "one.yaml").write_text(f"command: restore\nstack: [{stack}]\nmax_iterations: 12\n")
+    run("restore", "--config", tmp_path / "one.yaml", "--out", tmp_path / "one")
+    expected = RestorationResult.load(runs / "restore/restored.npz")
+    assert torch.equal(RestorationResult.load(tmp_path / "one/restored.npz").object, expected.object)
+    (tmp_path / "two.yaml").write_text(f"command: restore\nstack: [{cube}, {cube}]\n")
+    options = load_config(tmp_path / "two.yaml", Options, "restore")
+    assert (options.stacks, options.join) == ((cube, cube), True)
 
 
 @pytest.mark.filterwarnings("default::UserWarning")

@@ -33,7 +33,7 @@ def save_config(path: str | Path, command: str, options: Any) -> None:
 
 
 def load_config(path: str | Path, options: type[T], command: str) -> T:
-    """Read what `save_config` wrote, or part of it.
+    """Read what `save_config` wrote, or part of it; `options.from_v01`, if there is one, translates old keys.
 
     Raises
     ------
@@ -55,6 +55,8 @@ def load_config(path: str | Path, options: type[T], command: str) -> T:
         made_for = values.pop(_COMMAND, command)
         if made_for != command:
             raise ValueError(f"it is for {made_for}, not for {command}")
+        if hasattr(options, "from_v01"):
+            values = typing.cast(Any, options).from_v01(values)
         return _build(options, values)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error

@@ -1,77 +1,49 @@
-"""`torchmask restore`: the image behind a stack of short exposures."""
+"""`torchmask restore`: the image behind a stack of short exposures, or the images behind several."""
 
 from __future__ import annotations
 
-import dataclasses
 import shutil
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import tyro
 
 from torchmask import __version__
 from torchmask.cli.config import stored
-from torchmask.cli.options import MaskOptions, RunOptions, load_aperture
+from torchmask.cli.options import RunOptions, WorkerOptions
 from torchmask.cli.report import restored_figure
-from torchmask.cli.run import Run, new_run
-from torchmask.data.observe import read_observation
+from torchmask.cli.run import new_run
+from torchmask.cli.stacks import StackOptions, group_files, read_stack
 from torchmask.data.restored import save_restored
-from torchmask.grid import ARCSEC, Grid
-from torchmask.io import write_json
+from torchmask.io import new_folder, write_json
 from torchmask.metrics import relative_error, ssim
 from torchmask.observation import Observation
+from torchmask.restoration.many import restore_in_turn
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.priors import TotalVariation
 from torchmask.restoration.result import RestorationResult
+from torchmask.tracking import RunLogger
 from torchmask.viz import figures as viz
 
 CHECKPOINT = "resume.npz"  # of a run: from here it can go on
 
 
-@dataclass(frozen=True)
-class FITSOptions:
-    """What the header of a FITS file may lack, and calibration. What is given wins over the header."""
-
-    unit: str | None = None
-    """Such as "adu", "electron / s" or "250 electron"; None: BUNIT, else adu if a gain is known, else electron."""
-    gain: float | None = None
-    """Electrons per adu; None: from the header (EGAIN, GAIN)."""
-    exposure_time: float | None = None
-    """Of one frame [s], for units per second; None: from the header."""
-    dark: Path | None = None
-    """FITS image that is subtracted, in the units of the files."""
-    flat: Path | None = None
-    """FITS image to divide by, of any scale."""
-    bad_pixels: Path | None = None
-    """FITS image, not 0 where a pixel is bad."""
-    crop: int | None = None
-    """Side of the field that is cut out around the target [pixels]; None: all of the image."""
-    target: tuple[int, int] | None = None
-    """Pixel of the target in every file: row column, counted from 0; None: where the mean frame is brightest."""
-    keep: float | None = None
-    """Fraction of the frames to keep, the best ones; None: all."""
-    keep_by: Literal["sharpness", "flux"] = "sharpness"
-    """What makes a frame good."""
-
-
 @dataclass(frozen=True, kw_only=True)
-class Options(MaskOptions, FITSOptions, RunOptions):
+class Options(StackOptions, WorkerOptions, RunOptions):
     """Restore the image behind a stack of short exposures with unknown aberrations (myopic deconvolution).
 
-    A stack is one .npz file (`torchmask simulate` writes such), or FITS files: cubes or images, of one filter and
-    orientation. FITS files need --mask. Writes restored.fits (with the sky coordinates of the input, and in HISTORY
-    what was done), restored.npz, figures, metrics.json, config.yaml and the log to a new folder.
+    A stack is an .npz file (`torchmask simulate` writes such) or a FITS cube; several are restored side by side, each
+    by itself. With --join the FITS files, cubes or images of one filter and orientation, are one stack. FITS files need
+    --mask. Writes restored.fits (with the sky coordinates of the input, and in HISTORY what was done), restored.npz,
+    figures, metrics.json, config.yaml and the log to a new folder, of several stacks to a folder in it for each.
     """
 
-    stack: tyro.conf.Positional[tuple[Path, ...]] = ()
-    """Stack of exposures, .npz or .fits."""
-    wavelength: float | None = None
-    """Of the observation [m]; None: as the file says."""
-    pixel_scale_arcsec: float | None = None
-    """Angle on the sky of one pixel [arcsec]; None: as the file says."""
-    readout_noise: float | None = None
-    """Electrons rms per pixel and frame; None: as the file says, or else measured on the frames."""
+    stacks: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """Stacks of exposures, .npz or .fits."""
+    join: tyro.conf.FlagCreatePairsOff[bool] = False
+    """All FITS files together are one stack."""
     r0: float | None = None
     """Fried parameter of the turbulence at the wavelength [m]; None: as a simulated stack says, or else estimated."""
     outer_scale: float | None = None
@@ -97,14 +69,93 @@ class Options(MaskOptions, FITSOptions, RunOptions):
     resume: Path | None = None
     """Folder of an interrupted run: go on with its options from its checkpoint, of every 100th iteration."""
 
+    @staticmethod
+    def from_v01(values: Mapping[str, Any]) -> dict[str, Any]:
+        """What a config of version 0.1 says, where all files were one stack."""
+        values = dict(values)
+        if "stack" in values:
+            values["stacks"] = values.pop("stack")
+            values["join"] = isinstance(values["stacks"], list) and len(values["stacks"]) > 1
+        return values
+
 
 def run(options: Options) -> None:
-    """Restore, and write the image."""
-    observation = load_observation(options)
+    """Restore, and write the images."""
+    stacks = group_files(options.stacks, options.join)
+    if not stacks:
+        raise ValueError("there is no stack to restore: give .npz or FITS files")
+    if len(stacks) == 1:
+        (files,) = stacks.values()
+        restore_one(files, options)
+    elif options.resume is not None:
+        raise ValueError(f"--resume goes on with one stack, and {len(stacks)} are given")
+    else:
+        restore_several(stacks, options)
+
+
+def restore_one(files: Sequence[Path], options: Options) -> None:
+    """One stack, on all cores, with a checkpoint to go on from."""
+    observation = read_stack(files, options)
     checkpoint = None if options.resume is None else options.resume / CHECKPOINT
     if checkpoint is not None and not checkpoint.is_file():
         raise ValueError(f"there is no {checkpoint} to go on from: it is written at the 100th iteration")
-    inversion = MyopicDeconvolution(
+    method = deconvolution(observation, options)
+    with new_run("restore", options) as output:
+        state = output.directory / CHECKPOINT
+        if checkpoint is not None:
+            shutil.copyfile(checkpoint, state)
+        result = method.restore(
+            observation.frames,
+            valid=observation.valid,
+            n_samples=options.n_samples,
+            checkpoint=state,
+            callback=output.callback,
+        )
+        table = write(output.directory, files, observation, result, options)
+        log(observation, result, table, output.logger)
+        output.summary.append(result.summary())
+
+
+def restore_several(stacks: Mapping[str, Sequence[Path]], options: Options) -> None:
+    """Each stack on a core, and what was found in a folder of its name; failures are told when all have ended."""
+    observations: dict[str, Observation] = {}
+    methods: list[MyopicDeconvolution] = []
+    failures: dict[str, Exception] = {}
+    for name, files in stacks.items():
+        try:
+            observations[name] = read_stack(files, options)
+            methods.append(deconvolution(observations[name], options))
+        except (ValueError, OSError) as error:
+            observations.pop(name, None)
+            failures[name] = error
+    if not observations:
+        raise _failed(failures, len(stacks))
+    with new_run("restore", options) as output:
+        names, seen = list(observations), list(observations.values())
+        keywords = options.keywords(output.callback)
+        tables: dict[str, Any] = {}
+        for number, result in restore_in_turn(methods, seen, n_samples=options.n_samples, **keywords):
+            name = names[number]
+            if isinstance(result, Exception):
+                failures[name] = result
+                continue
+            tables[name] = write(new_folder(output.directory / name), stacks[name], seen[number], result, options)
+            log(seen[number], result, tables[name], output.logger, f"{name}/")
+            output.summary.append(f"{name}: {result.summary()}")
+        tables |= {name: {"error": str(error)} for name, error in failures.items()}
+        write_json(output.directory / "metrics.json", tables)
+        if failures:
+            raise _failed(failures, len(stacks))
+
+
+def _failed(failures: Mapping[str, Exception], n_stacks: int) -> ValueError:
+    told = "; ".join(f"{name}: {error}" for name, error in failures.items())
+    return ValueError(f"{len(failures)} of {n_stacks} stacks failed: {told}")
+
+
+def deconvolution(observation: Observation, options: Options) -> MyopicDeconvolution:
+    """The method for a stack. Raises ValueError for settings that it does not allow."""
+    return MyopicDeconvolution(
         observation.aperture,
         observation.grid,
         options.n_modes,
@@ -119,64 +170,17 @@ def run(options: Options) -> None:
         max_iterations=options.max_iterations,
         tolerance=options.tolerance,
     )
-    with new_run("restore", options) as output:
-        state = output.directory / CHECKPOINT
-        if checkpoint is not None:
-            shutil.copyfile(checkpoint, state)
-        result = inversion.restore(
-            observation.frames,
-            valid=observation.valid,
-            n_samples=options.n_samples,
-            checkpoint=state,
-            callback=output.callback,
-        )
-        result.save(output.directory / "restored.npz")
-        save_restored(output.directory / "restored.fits", result, observation, history(options, result))
-        table = metrics(observation, result)
-        write_json(output.directory / "metrics.json", table)
-        _log(observation, result, table, output)
-        output.summary.append(result.summary())
 
 
-def load_observation(options: Options) -> Observation:
-    """The stack, with what the options say in place of what its file says. Raises ValueError for what is missing."""
-    stack = list(options.stack)
-    if not stack:
-        raise ValueError("there is no stack to restore: give an .npz file or FITS files")
-    if stack[0].suffix.lower() != ".npz":
-        return _from_fits(stack, options)
-    if len(stack) > 1:
-        raise ValueError(f"{len(stack)} stacks are given: of .npz files one is restored at a time")
-    for item in dataclasses.fields(FITSOptions):
-        if getattr(options, item.name) != item.default:
-            raise ValueError(f"--{item.name.replace('_', '-')} is for FITS files; {stack[0]} is none")
-    observation = Observation.load(stack[0])
-    grid, scale = observation.grid, options.pixel_scale_arcsec
-    changes: dict[str, Any] = {
-        "grid": Grid(
-            grid.n_pixels, scale * ARCSEC if scale else grid.pixel_scale, options.wavelength or grid.wavelength
-        )
-    }
-    if options.mask is not None:
-        changes["aperture"] = load_aperture(options)
-    if options.readout_noise is not None:
-        changes["readout_noise"] = options.readout_noise
-    return dataclasses.replace(observation, **changes)
-
-
-def _from_fits(stack: list[Path], options: Options) -> Observation:
-    """Read FITS files; what their header lacks is named as the option of the command line that supplies it."""
-    aperture = load_aperture(options)
-    scale = options.pixel_scale_arcsec
-    given = {item.name: getattr(options, item.name) for item in dataclasses.fields(FITSOptions)}
-    given |= {"wavelength": options.wavelength, "readout_noise": options.readout_noise}
-    try:
-        return read_observation(stack, aperture, pixel_scale=None if scale is None else scale * ARCSEC, **given)
-    except ValueError as error:
-        message = str(error).replace("give pixel_scale [rad]", "give --pixel-scale-arcsec [arcsec]")
-        for name in given:
-            message = message.replace(f"give {name}", f"give --{name.replace('_', '-')}")
-        raise ValueError(message) from error
+def write(
+    folder: Path, files: Sequence[Path], observation: Observation, result: RestorationResult, options: Options
+) -> dict[str, Any]:
+    """The result, the image on the sky, and the numbers, which come back."""
+    result.save(folder / "restored.npz")
+    save_restored(folder / "restored.fits", result, observation, history(files, result, options))
+    table = metrics(observation, result)
+    write_json(folder / "metrics.json", table)
+    return table
 
 
 def metrics(observation: Observation, result: RestorationResult) -> dict[str, Any]:
@@ -201,29 +205,31 @@ def metrics(observation: Observation, result: RestorationResult) -> dict[str, An
     return table
 
 
-def _log(observation: Observation, result: RestorationResult, table: dict[str, Any], output: Run) -> None:
-    """Figures, and the final metrics for TensorBoard."""
-    logger, scale = output.logger, observation.grid.pixel_scale
+def log(
+    observation: Observation, result: RestorationResult, table: Mapping[str, Any], logger: RunLogger, prefix: str = ""
+) -> None:
+    """Figures, and the final metrics for TensorBoard; `prefix` tells stacks apart."""
+    scale = observation.grid.pixel_scale
     logger.figure(
-        "restored",
+        f"{prefix}restored",
         restored_figure(result.object, observation.frames, result.residuals, scale, deviation=result.object_std),
     )
-    logger.figure("cost", viz.history_figure({"restoration": result.cost.tolist()}, "cost"))
+    logger.figure(f"{prefix}cost", viz.history_figure({"restoration": result.cost.tolist()}, "cost"))
     if observation.object is not None:
         cutoff = observation.grid.cutoff(observation.aperture.mask_diameter)
         pictures = {"stack": (observation.frames[0], result.object)}
-        logger.figure("comparison", viz.comparison_figure(observation.object, pictures, cutoff, scale))
+        logger.figure(f"{prefix}comparison", viz.comparison_figure(observation.object, pictures, cutoff, scale))
     for name, value in table.items():
-        logger.scalar(f"comparison/restored/{name}", float(value))
+        logger.scalar(f"comparison/{prefix}restored/{name}", float(value))
 
 
-def history(options: Options, result: RestorationResult) -> list[str]:
+def history(files: Sequence[Path], result: RestorationResult, options: Options) -> list[str]:
     """What was done, for a FITS header: version, files, options that are not at their default, and what came out."""
     default = stored(Options())
-    changed = {name: value for name, value in stored(options).items() if name != "stack" and value != default[name]}
+    changed = {name: value for name, value in stored(options).items() if value != default[name]}
     return [
         f"torchmask {__version__}",
-        *(f"stack {path}" for path in options.stack),
-        *(f"{name} = {value}" for name, value in changed.items()),
+        *(f"stack {path}" for path in files),
+        *(f"{name} = {value}" for name, value in changed.items() if name not in ("stacks", "join")),
         *result.summary().splitlines(),
     ]

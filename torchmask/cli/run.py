@@ -51,6 +51,7 @@ def new_run(command: str, options: RunOptions, seed: int | None = None) -> Itera
 
     Raises ValueError if the folder exists or cannot be made.
     """
+    run: Run | None = None
     directory = options.out or free_name(Path("runs") / datetime.now().strftime(f"{command}-%Y%m%d-%H%M%S"))
     parents = [parent for parent in directory.parents if not parent.exists()]
     useless = False  # until the folder is ours, and again once it holds results
@@ -76,5 +77,7 @@ def new_run(command: str, options: RunOptions, seed: int | None = None) -> Itera
             shutil.rmtree(directory)
             for parent in parents:
                 parent.rmdir()
+        elif run is not None:
+            print(*run.summary, f"what was reached is in {directory}", sep="\n", file=sys.stderr)
         raise
     print(*run.summary, f"written to {directory}", sep="\n")

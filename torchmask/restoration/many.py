@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 
 from torch import Tensor
@@ -65,6 +65,24 @@ def restore_many(
     >>> one.object.shape, other
     (torch.Size([32, 32]), ValueError('frames [0, 1, 2, 3] hold no light: leave them out'))
     """
+    turns = restore_in_turn(
+        method, stacks, n_samples=n_samples, seed=seed, backend=backend, n_workers=n_workers, callback=callback
+    )
+    results = dict(turns)
+    return [results[number] for number in range(len(stacks))]
+
+
+def restore_in_turn(
+    method: MyopicDeconvolution | Sequence[MyopicDeconvolution],
+    stacks: Sequence[Tensor | Observation],
+    *,
+    n_samples: int = 0,
+    seed: int = 0,
+    backend: str = "loky",
+    n_workers: int | None = None,
+    callback: Callback | None = None,
+) -> Iterator[tuple[int, RestorationResult | Exception]]:
+    """The same as `restore_many`, stack by stack as they end: their numbers, and what they came to."""
     require_backend(backend, n_workers)
     if isinstance(stacks, Tensor):
         raise ValueError(
@@ -78,13 +96,11 @@ def restore_many(
         )
     restore = partial(_restore, n_samples=n_samples, seed=seed)
     tasks = dict(enumerate(zip(methods, stacks, strict=True)))
-    results: dict[int, RestorationResult | Exception] = {}
-    for outcome in run_side_by_side(restore, tasks, backend, n_workers):
+    for step, outcome in enumerate(run_side_by_side(restore, tasks, backend, n_workers), 1):
         result = outcome.value if outcome.error is None else outcome.error
-        results[outcome.key] = result
         if callback is not None:
-            callback(Record("stacks", len(results), len(tasks), _numbers(outcome.key, result)))
-    return [results[number] for number in range(len(tasks))]
+            callback(Record("stacks", step, len(tasks), _numbers(outcome.key, result)))
+        yield outcome.key, result
 
 
 def _restore(task: tuple[MyopicDeconvolution, Tensor | Observation], n_samples: int, seed: int) -> RestorationResult:

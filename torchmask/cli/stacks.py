@@ -1,0 +1,103 @@
+"""Reading a stack of exposures, with what the options say in place of what its files say."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from torchmask.cli.options import MaskOptions, load_aperture
+from torchmask.data.observe import read_observation
+from torchmask.grid import ARCSEC, Grid
+from torchmask.observation import Observation
+
+
+@dataclass(frozen=True)
+class FITSOptions:
+    """What the header of a FITS file may lack, and calibration. What is given wins over the header."""
+
+    unit: str | None = None
+    """Such as "adu", "electron / s" or "250 electron"; None: BUNIT, else adu if a gain is known, else electron."""
+    gain: float | None = None
+    """Electrons per adu; None: from the header (EGAIN, GAIN)."""
+    exposure_time: float | None = None
+    """Of one frame [s], for units per second; None: from the header."""
+    dark: Path | None = None
+    """FITS image that is subtracted, in the units of the files."""
+    flat: Path | None = None
+    """FITS image to divide by, of any scale."""
+    bad_pixels: Path | None = None
+    """FITS image, not 0 where a pixel is bad."""
+    crop: int | None = None
+    """Side of the field that is cut out around the target [pixels]; None: all of the image."""
+    target: tuple[int, int] | None = None
+    """Pixel of the target in every file: row column, counted from 0; None: where the mean frame is brightest."""
+    keep: float | None = None
+    """Fraction of the frames to keep, the best ones; None: all."""
+    keep_by: Literal["sharpness", "flux"] = "sharpness"
+    """What makes a frame good."""
+
+
+@dataclass(frozen=True)
+class StackOptions(MaskOptions, FITSOptions):
+    """What an observer may know better than the files."""
+
+    wavelength: float | None = None
+    """Of the observation [m]; None: as the file says."""
+    pixel_scale_arcsec: float | None = None
+    """Angle on the sky of one pixel [arcsec]; None: as the file says."""
+    readout_noise: float | None = None
+    """Electrons rms per pixel and frame; None: as the file says, or else measured on the frames."""
+
+
+def group_files(files: Sequence[Path], join: bool) -> dict[str, list[Path]]:
+    """Stacks and their files, by names that differ: those of the (first) file, with a number if it stands twice."""
+    groups = [list(files)] if join and files else [[file] for file in files]
+    named: dict[str, list[Path]] = {}
+    for group in groups:
+        name, number = group[0].stem, 1
+        while name in named:
+            number += 1
+            name = f"{group[0].stem}-{number}"
+        named[name] = group
+    return named
+
+
+def read_stack(files: Sequence[Path], options: StackOptions) -> Observation:
+    """One stack: an .npz file, or FITS files that belong together. Raises ValueError for what is missing or wrong."""
+    if files[0].suffix.lower() != ".npz":
+        return _from_fits(files, options)
+    if len(files) > 1:
+        raise ValueError(f"--join is for FITS files; {files[0]} is a stack by itself")
+    for item in dataclasses.fields(FITSOptions):
+        if getattr(options, item.name) != item.default:
+            raise ValueError(f"--{item.name.replace('_', '-')} is for FITS files; {files[0]} is none")
+    observation = Observation.load(files[0])
+    grid, scale = observation.grid, options.pixel_scale_arcsec
+    changes: dict[str, Any] = {
+        "grid": Grid(
+            grid.n_pixels, scale * ARCSEC if scale else grid.pixel_scale, options.wavelength or grid.wavelength
+        )
+    }
+    if options.mask is not None:
+        changes["aperture"] = load_aperture(options)
+    if options.readout_noise is not None:
+        changes["readout_noise"] = options.readout_noise
+    return dataclasses.replace(observation, **changes)
+
+
+def _from_fits(files: Sequence[Path], options: StackOptions) -> Observation:
+    """Read FITS files; what their header lacks is named as the option of the command line that supplies it."""
+    aperture = load_aperture(options)
+    scale = options.pixel_scale_arcsec
+    given = {item.name: getattr(options, item.name) for item in dataclasses.fields(FITSOptions)}
+    given |= {"wavelength": options.wavelength, "readout_noise": options.readout_noise}
+    try:
+        return read_observation(files, aperture, pixel_scale=None if scale is None else scale * ARCSEC, **given)
+    except ValueError as error:
+        message = str(error).replace("give pixel_scale [rad]", "give --pixel-scale-arcsec [arcsec]")
+        for name in given:
+            message = message.replace(f"give {name}", f"give --{name.replace('_', '-')}")
+        raise ValueError(message) from error
