@@ -14,7 +14,8 @@ import torch
 from torch import Tensor, nn
 
 import torchmask
-from torchmask.atmosphere.phase import TurbulencePhase
+from torchmask.atmosphere.phase import LayeredPhase, TurbulencePhase
+from torchmask.atmosphere.profiles import named_layers
 from torchmask.design.criterion import AsymptoticMSE
 from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture, FullAperture, SparseAperture
@@ -69,7 +70,7 @@ def blurred(module: PSF, dtype: torch.dtype) -> Tensor:
     return module(random(2, *module.samples().weights.shape, dtype=dtype)).abs()
 
 
-def turbulent(module: TurbulencePhase, dtype: torch.dtype) -> Tensor:
+def turbulent(module: TurbulencePhase | LayeredPhase, dtype: torch.dtype) -> Tensor:
     pupil = mask().to(dtype).samples(GRID)
     return module(pupil, 2, generator=seeded())
 
@@ -91,6 +92,7 @@ MODULES: dict[str, Entry] = {
     ),
     "turbulence": Entry(lambda: TurbulencePhase(0.15, 20.0), turbulent),
     "frozen flow": Entry(lambda: TurbulencePhase(0.15, 20.0, wind=(3.0, 1.0), frame_interval=0.01), turbulent),
+    "turbulence in layers": Entry(lambda: LayeredPhase(named_layers("hv57", 2), 550e-9, 20.0), turbulent),
     "PSF": Entry(lambda: PSF(mask(), GRID), blurred, lambda: PSF(moved(), GRID)),
     "OTF": Entry(lambda: OTF(mask(), GRID), blurred, lambda: OTF(moved(), GRID)),
     "criterion": Entry(criterion, lambda module, dtype: module(mask().to(dtype)), lambda: criterion(1e6)),

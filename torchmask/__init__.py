@@ -3,7 +3,9 @@
 mask -> pupil field -> PSF / OTF -> short exposures -> restored object
 """
 
-from torchmask.atmosphere.phase import TurbulencePhase
+from torchmask.atmosphere.layers import Layers
+from torchmask.atmosphere.phase import LayeredPhase, TurbulencePhase
+from torchmask.atmosphere.profiles import named_layers
 from torchmask.data.observe import read_observation
 from torchmask.data.restored import save_restored
 from torchmask.design.constraints import check_mask
@@ -44,6 +46,8 @@ __all__ = [
     "EdgePreserving",
     "FullAperture",
     "Grid",
+    "LayeredPhase",
+    "Layers",
     "MyopicDeconvolution",
     "NoisePSD",
     "Observables",
@@ -66,6 +70,7 @@ __all__ = [
     "load_mask",
     "make_scene",
     "multiframe_wiener",
+    "named_layers",
     "read_observation",
     "refine_mask",
     "restore_many",

@@ -100,6 +100,25 @@ def test_wind_to_the_right_carries_the_phase_to_the_right():
     torch.testing.assert_close(later[target], first[source], rtol=0, atol=1e-5 * float(first.std()))
 
 
+def test_a_star_moves_its_image_and_its_rays_the_same_way():
+    """A star to the right: its image is at positive columns, and it shines through what lies to the right."""
+    direction = 5 * GRID.pixel_scale
+    samples = tm.FullAperture(1.0).samples(GRID)
+    x = (samples.index[0] % 64 + 32) % 64 - 32
+    height = 4 * samples.step[1] / direction  # there the star's rays are four samples to the right
+    layers = tm.Layers([height], [1e-13])
+    stars = torch.tensor([[0.0, 0.0], [direction, 0.0]], dtype=torch.float64)
+    middle, right = tm.LayeredPhase(layers, 550e-9, 20.0)(samples, 1, torch.Generator().manual_seed(0), stars)[:, 0, 0]
+    tilt = 2 * math.pi * direction / GRID.wavelength * x * samples.step[1]  # the star's own wavefront
+    image = psf_from_samples(samples, tilt[None])
+    assert divmod(int(image.argmax()), 64) == (0, 5)
+    place = {int(i): k for k, i in enumerate(samples.index[0])}
+    row = samples.index[0] // 64 == 0
+    here, there = zip(*[(k, place[int(c) + 4]) for k, c in enumerate(x) if row[k] and 0 <= c < 12], strict=True)
+    torch.testing.assert_close(right[list(here)], middle[list(there)], rtol=0, atol=1e-9)
+    assert float((right - middle).abs().max()) > 0.1
+
+
 def test_the_sky_seen_through_a_phase_is_not_turned():
     """A quarter turn of pupil and phase is a quarter turn of the image: nothing is mirrored on the way."""
     generator = torch.Generator().manual_seed(1)

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import functools
+import itertools
 import math
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
-from torchmask.atmosphere.screens import frozen_flow, phase_screens, require_count
+from torchmask.atmosphere.endless import Screen, ScreenWindow
+from torchmask.atmosphere.layers import Layers, Vector
+from torchmask.atmosphere.screens import draw_seed, frozen_flow, phase_screens, require_count
 from torchmask.atmosphere.von_karman import require_turbulence
 from torchmask.optics.aperture import PupilSamples
 
@@ -57,8 +63,7 @@ class TurbulencePhase(nn.Module):
             raise ValueError("wind and frame_interval belong together: give both (frozen flow) or neither")
         if wind is not None and not (len(wind) == 2 and all(math.isfinite(v) for v in wind)):
             raise ValueError(f"wind is {wind}: it must be two finite numbers (vx, vy), in m/s")
-        if frame_interval is not None and not (math.isfinite(frame_interval) and frame_interval > 0):
-            raise ValueError(f"frame_interval is {frame_interval}: it must be finite and positive, in s")
+        _require_interval(frame_interval)
         self.r0: float = float(r0)
         self.outer_scale: float = float(outer_scale)
         self.wind = wind
@@ -79,6 +84,127 @@ class TurbulencePhase(nn.Module):
     def extra_repr(self) -> str:
         flow = "" if self.wind is None else f", wind={self.wind}, frame_interval={self.frame_interval}"
         return f"r0={self.r0:.6g}, outer_scale={self.outer_scale:.6g}{flow}"
+
+
+class LayeredPhase(nn.Module):
+    """Phase of turbulence in layers on the samples of a pupil, as a star in any direction shows it at any time.
+
+    Parameters
+    ----------
+    layers : Layers
+        Heights, strengths and winds.
+    wavelength : float
+        At which the phase is wanted [m].
+    outer_scale : float
+        Of all layers [m].
+    frame_interval : float, optional
+        Time between frames [s], for one stack of screens that the winds carry on (frozen flow). Without it every frame
+        has screens of its own, as frames far apart in time do.
+
+    Raises
+    ------
+    ValueError
+        If a length or the interval is not finite and positive.
+
+    Notes
+    -----
+    `forward(samples, n_frames, generator, direction)` returns (..., n_frames, N, P) [rad], dtype and device of the
+    samples (..., N, P). `direction` (..., 2), (x, y) [rad], tells where the star is: in the middle of the field without
+    it, or where its image is direction / pixel_scale pixels from there. Its leading axes come before all others. A ray
+    that goes to the point x of the pupil meets a layer of height h at x + h direction; all directions, and all masks of
+    a population, see the same screens. Frames are snapshots; for what happens within an exposure, see `draws`.
+
+    Examples
+    --------
+    >>> from torchmask.grid import Grid
+    >>> from torchmask.atmosphere.profiles import named_layers
+    >>> from torchmask.optics.aperture import FullAperture
+    >>> samples = FullAperture(1.0).samples(Grid.nyquist(1.0, 550e-9, 64))
+    >>> turbulence = LayeredPhase(named_layers("hv57", n_layers=3), wavelength=550e-9, outer_scale=20.0)
+    >>> stars = torch.tensor([[0.0, 0.0], [7e-6, 0.0]])  # a second one, an isoplanatic angle to the right
+    >>> turbulence(samples, n_frames=4, direction=stars).shape
+    torch.Size([2, 4, 1, 1225])
+    """
+
+    def __init__(
+        self, layers: Layers, wavelength: float, outer_scale: float, frame_interval: float | None = None
+    ) -> None:
+        super().__init__()
+        require_turbulence(layers.r0(wavelength), outer_scale)
+        _require_interval(frame_interval)
+        self.layers = layers
+        self.wavelength: float = float(wavelength)
+        self.outer_scale: float = float(outer_scale)
+        self.frame_interval = frame_interval
+
+    @property
+    def r0(self) -> float:
+        """Fried parameter of all layers [m]."""
+        return self.layers.r0(self.wavelength)
+
+    def forward(
+        self,
+        samples: PupilSamples,
+        n_frames: int,
+        generator: torch.Generator | None = None,
+        direction: Tensor | Vector = (0.0, 0.0),
+    ) -> Tensor:
+        require_count("n_frames", n_frames)
+        stars = torch.as_tensor(direction, dtype=torch.float64, device="cpu")
+        if stars.shape[-1:] != (2,):
+            raise ValueError(f"direction has shape {tuple(stars.shape)}: its last axis must be (x, y), in rad")
+        frames = itertools.islice(self.draws(samples, generator), n_frames)
+        phases = [[frame.phase(direction=(x, y)) for x, y in stars.view(-1, 2).tolist()] for frame in frames]
+        together = torch.stack([torch.stack(phase) for phase in phases], dim=-3)  # (direction, ..., frame, N, P)
+        return together.unflatten(0, stars.shape[:-1]) if stars.ndim > 1 else together[0]
+
+    def draws(self, samples: PupilSamples, generator: torch.Generator | None = None) -> Iterator[DrawnLayers]:
+        """The layers at the start of one frame after another, without end."""
+        place, shape = _window(samples)
+        weights = samples.weights
+        window = ScreenWindow(shape, samples.step, self.outer_scale, weights.dtype, weights.device)
+        strengths = self.layers.layer_r0(self.wavelength)
+
+        def draw() -> list[Screen]:
+            return [Screen(window, r0, draw_seed(generator)) for r0 in strengths]
+
+        if self.frame_interval is None:
+            while True:
+                yield DrawnLayers(self.layers, draw(), place, 0.0)
+        screens = draw()
+        for frame in itertools.count():
+            yield DrawnLayers(self.layers, screens, place, frame * self.frame_interval)
+
+    def extra_repr(self) -> str:
+        flow = "" if self.frame_interval is None else f", frame_interval={self.frame_interval}"
+        scales = f"wavelength={self.wavelength:.6g}, r0={self.r0:.6g}, outer_scale={self.outer_scale:.6g}"
+        return f"{len(self.layers.heights)} layers, {scales}{flow}"
+
+
+@dataclass(frozen=True)
+class DrawnLayers:
+    """The layers above a pupil as one frame finds them."""
+
+    layers: Layers
+    screens: list[Screen]
+    """One for each layer."""
+    place: Tensor
+    """Of the pupil's samples in the screens' window, flattened."""
+    time: float
+    """When the frame begins [s]."""
+
+    def phase(self, delay: float = 0.0, direction: Vector = (0.0, 0.0)) -> Tensor:
+        """The phase (..., N, P) [rad], `delay` [s] after the frame began, of a star in `direction` (x, y) [rad]."""
+        later, parts = self.time + delay, []
+        for screen, height, wind in zip(self.screens, self.layers.heights, self.layers.winds, strict=True):
+            x, y = (height * angle - speed * later for angle, speed in zip(direction, wind, strict=True))
+            parts.append(screen.at((x, y)))
+        return functools.reduce(torch.add, parts).flatten()[self.place]
+
+
+def _require_interval(frame_interval: float | None) -> None:
+    if frame_interval is not None and not (math.isfinite(frame_interval) and frame_interval > 0):
+        raise ValueError(f"frame_interval is {frame_interval}: it must be finite and positive, in s")
 
 
 def _window(samples: PupilSamples) -> tuple[Tensor, tuple[int, int]]:

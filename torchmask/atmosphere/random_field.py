@@ -11,6 +11,7 @@ is von Karman's to 0.3 %, 0.2 % for outer scales up to 20 times the field, from 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -49,11 +50,7 @@ def split_spectrum(
     sizes = [int(next_fast_len(math.ceil((e + margin) / s)) or 0) for e, s in zip(extent, step, strict=True)]
     # The spectrum is even, so one quadrant tells all.
     fy, fx = (torch.arange(n // 2 + 1, **_HOST) / (n * s) for n, s in zip(sizes, step, strict=True))
-    density = torch.full((len(fy), len(fx)), _beyond(step, r0, outer_scale), **_HOST)
-    for alias_y in range(-_ALIASES, _ALIASES + 1):
-        for alias_x in range(-_ALIASES, _ALIASES + 1):
-            f = torch.hypot(fy[:, None] + alias_y / step[0], fx + alias_x / step[1])
-            density += von_karman_psd(f, r0, outer_scale) * (1 - below(f, 0))
+    density = folded_density(fy, fx, step, r0, outer_scale, lambda f: 1 - below(f, 0))
     density /= sizes[0] * step[0] * sizes[1] * step[1]
     fy, fx = (torch.fft.fftfreq(n, s, **_HOST) for n, s in zip(sizes, step, strict=True))
     places = (torch.arange(n, device="cpu") for n in sizes)
@@ -70,6 +67,23 @@ def split_spectrum(
         density = von_karman_psd(f, r0, outer_scale) * share / (periods[0] * periods[1])
         bands.append(Band(fy, fx, density.sqrt()))
     return bands
+
+
+def folded_density(
+    fy: Tensor,
+    fx: Tensor,
+    step: tuple[float, float],
+    r0: float,
+    outer_scale: float,
+    share: Callable[[Tensor], Tensor],
+) -> Tensor:
+    """Spectrum [rad^2 m^2] times `share` of the frequency, as samples in steps of `step` hold it: with its aliases."""
+    density = torch.full((len(fy), len(fx)), _beyond(step, r0, outer_scale), **_HOST)
+    for alias_y in range(-_ALIASES, _ALIASES + 1):
+        for alias_x in range(-_ALIASES, _ALIASES + 1):
+            f = torch.hypot(fy[:, None] + alias_y / step[0], fx + alias_x / step[1])
+            density += von_karman_psd(f, r0, outer_scale) * share(f)
+    return density
 
 
 def _beyond(step: tuple[float, float], r0: float, outer_scale: float) -> float:
@@ -114,14 +128,6 @@ class RandomField:
             torch.randn(a.shape, generator=generator, dtype=self.kind["dtype"], device=source) for a in self.amplitudes
         ]
         return [n.to(a.device) * a for n, a in zip(noise, self.amplitudes, strict=True)]
-
-    def move(self, coefficients: list[Tensor], displacement: tuple[float, float]) -> list[Tensor]:
-        """Coefficients of the field moved by `displacement` (y, x) [m]."""
-        dy, dx = displacement
-        return [
-            c * _phasor(-dy * fy[:, None]).to(**self.kind) * _phasor(-dx * fx).to(**self.kind)
-            for c, (fy, fx, _) in zip(coefficients, self.bands, strict=True)
-        ]
 
     def sum(self, coefficients: list[Tensor]) -> Tensor:
         """The field on the raster, complex (rows, columns)."""

@@ -8,10 +8,9 @@ from numbers import Integral
 import torch
 from torch import Tensor
 
+from torchmask.atmosphere.endless import Screen, ScreenWindow
 from torchmask.atmosphere.random_field import COMPLEX, RandomField, split_spectrum
 from torchmask.atmosphere.von_karman import require_turbulence
-
-_MAX_SAMPLES = 2**24  # of a field: a quarter of a gigabyte in complex128, several times
 
 
 def phase_screens(
@@ -80,35 +79,19 @@ def frozen_flow(
 ) -> Tensor:
     """One screen moved as a whole: (n_frames, rows, columns) [rad], frame t being screen(x - displacements[t]).
 
-    `displacements` (n_frames, 2) [m], (x, y). Other arguments as for `phase_screens`. Every wave is moved exactly, by
-    any fraction of a sample, and the field is wide enough that no part of the path is seen twice.
-
-    Raises
-    ------
-    ValueError
-        As `phase_screens`; or if the field would be too large, with the number of frames that fit.
-    TypeError
-        As `phase_screens`.
+    `displacements` (n_frames, 2) [m], (x, y), as far and by as small a fraction of a sample as one likes: see
+    `torchmask.atmosphere.endless`. Other arguments and errors as for `phase_screens`.
     """
     shape, step, dtype, device = _resolve(shape, step, dtype, device)
     require_turbulence(r0, outer_scale)
-    path = displacements.detach().cpu().double().flip(-1)  # (y, x)
-    span = path.cummax(0).values - path.cummin(0).values  # up to each frame
-    own = (shape[0] * step[0], shape[1] * step[1])
-    margin = _margin(own, step)
-    extents = span + path.new_tensor(own)
-    fits = ((extents + margin) / path.new_tensor(step)).prod(-1) <= _MAX_SAMPLES
-    if not bool(fits.all()):
-        raise ValueError(
-            f"the wind carries the screen {float(span[-1, 1]):.4g} m by {float(span[-1, 0]):.4g} m (x, y) in "
-            f"{len(path)} frames, more than fits into memory: at most {int(fits.sum())} frames are possible here, more "
-            "with a shorter interval, a coarser grid or a wind along x or y"
-        )
-    extent = (float(extents[-1, 0]), float(extents[-1, 1]))
-    field = RandomField(split_spectrum(extent, margin, step, r0, outer_scale), shape, step, dtype, device)
-    coefficients = field.draw(generator)
-    # The raster is at one corner of the field, whose period takes care of the sign of the path.
-    return torch.stack([field.sum(field.move(coefficients, (dy, dx))).real for dy, dx in path.tolist()])
+    screen = Screen(ScreenWindow(shape, step, outer_scale, dtype, device), r0, draw_seed(generator))
+    return torch.stack([screen.at((-dx, -dy)) for dx, dy in displacements.detach().cpu().double().tolist()])
+
+
+def draw_seed(generator: torch.Generator | None) -> int:
+    """A seed for generators of another kind."""
+    device = "cpu" if generator is None else generator.device
+    return int(torch.randint(2**62, (1,), generator=generator, device=device))
 
 
 def _margin(extent: tuple[float, float], step: tuple[float, float]) -> float:
