@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from scipy.integrate import quad
+from scipy.special import j0
 from torch import Tensor
 
 from torchmask.atmosphere.phase import TurbulencePhase
@@ -18,6 +22,7 @@ from torchmask.grid import Grid
 from torchmask.observation import Observation
 from torchmask.optics.aperture import Aperture, SparseAperture
 from torchmask.optics.detector import Detector
+from torchmask.optics.otf import disc_otf
 from torchmask.optics.psf import psf_from_samples
 from torchmask.optics.zernike import ZernikePhase
 from torchmask.simulation.exposures import simulate_observation
@@ -84,15 +89,67 @@ def observe_satellite() -> Callable[..., Observation]:
     return observe
 
 
-@pytest.fixture(scope="session")
-def sky_matrix() -> Callable[[float, float], np.ndarray]:
-    """(2, 2) from pixels (x, y) to (east, north) [rad]: north `angle` [deg] from y, east to the left of it."""
+@pytest.fixture
+def fits_cube() -> np.ndarray:
+    """(3, 16, 20): no two pixels alike, a star on row 9, column 12."""
+    frames = np.arange(3 * 16 * 20, dtype=np.float32).reshape(3, 16, 20) + 100
+    frames[:, 9, 12] += 1e5
+    return frames
 
-    def matrix(angle: float, pixel_scale: float) -> np.ndarray:
-        c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
-        return pixel_scale * np.array([[-c, s], [s, c]])
+
+@pytest.fixture
+def write_fits(tmp_path: Path) -> Callable[..., Path]:
+    """Writes a FITS file and returns its path: pixels of 0.02 arcsec, 550 nm, electrons, but for other `cards`.
+
+    A card that is None is left out. With `sci`, the data are an extension SCI behind an empty primary one.
+    """
+
+    def write(
+        name: str,
+        data: np.ndarray | None,
+        *,
+        extensions: Sequence[tuple[str, np.ndarray]] = (),
+        sci: bool = False,
+        **cards: Any,
+    ) -> Path:
+        from astropy.io import fits
+
+        header = fits.Header()
+        for key, value in ({"PIXELSCL": 0.02, "WAVELEN": 550e-9, "BUNIT": "electron", "RDNOISE": 3.0} | cards).items():
+            if value is not None:
+                header[key] = value
+        primary = fits.PrimaryHDU(None if sci else data, header=header)
+        images = [("SCI", data)] * sci + list(extensions)
+        hdus = [primary, *(fits.ImageHDU(values, name=extension) for extension, values in images)]
+        fits.HDUList(hdus).writeto(tmp_path / name)
+        return tmp_path / name
+
+    return write
+
+
+@pytest.fixture(scope="session")
+def sky_matrix() -> Callable[..., np.ndarray]:
+    """(2, 2) from pixels (x, y) to (east, north), in units of `pixel_scale`: y is `angle` [rad] away from north, east
+    to the left, or to the right if mirrored."""
+
+    def matrix(angle: float, pixel_scale: float, mirrored: bool = False) -> np.ndarray:
+        c, s, parity = math.cos(angle), math.sin(angle), 1 if mirrored else -1
+        return pixel_scale * np.array([[parity * c, -parity * s], [s, c]])
 
     return matrix
+
+
+@pytest.fixture(scope="session")
+def sky_cards(sky_matrix: Callable[..., np.ndarray]) -> Callable[..., dict[str, Any]]:
+    """The FITS cards that say the same."""
+
+    def cards(angle: float, pixel_scale: float, mirrored: bool = False) -> dict[str, Any]:
+        matrix = sky_matrix(angle, math.degrees(pixel_scale), mirrored)
+        found = {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CUNIT1": "deg", "CUNIT2": "deg"}
+        found |= {"CRVAL1": 82.0, "CRVAL2": -65.0, "CRPIX1": 5.0, "CRPIX2": 9.0}
+        return found | {f"CD{i + 1}_{j + 1}": float(matrix[i, j]) for i in range(2) for j in range(2)}
+
+    return cards
 
 
 @pytest.fixture(scope="session")
@@ -140,3 +197,72 @@ def expose_binary(static_aberrations: Tensor) -> Callable[..., tuple[Tensor, Ten
         return image + noise * torch.randn(image.shape, dtype=torch.float64, generator=own), noise
 
     return expose
+
+
+@pytest.fixture(scope="session")
+def expose_points() -> Callable[..., Tensor]:
+    """Frames (T, H, W) of point sources (x, y, flux), pixels from [H // 2, W // 2], a random piston on every hole and
+    frame."""
+
+    def expose(
+        mask: Aperture,
+        grid: Grid,
+        stars: Sequence[tuple[float, float, float]] = ((0.0, 0.0, 1.0),),
+        *,
+        electrons: float = 1e6,
+        n_frames: int = 1,
+        oversampling: int = 8,
+        pistons: bool = True,
+    ) -> Tensor:
+        samples = mask.samples(grid, oversampling)
+        position = samples.offsets + mask.centers[:, None, :]
+        shape, generator = (n_frames, mask.n_subapertures, 1), torch.Generator().manual_seed(0)
+        phase = pistons * 2 * math.pi * torch.rand(shape, generator=generator, dtype=torch.float64)
+        frames = torch.zeros(n_frames, *grid.shape, dtype=torch.float64)
+        height, width = grid.shape
+        for x, y, flux in stars:
+            tilt = 2 * math.pi * grid.pixel_scale / grid.wavelength * position @ position.new_tensor([x, y])
+            psf = psf_from_samples(samples, tilt + phase)
+            frames += flux * psf.roll((height // 2, width // 2), (-2, -1))[:, :height, :width]
+        return frames * electrons / sum(flux for *_, flux in stars)
+
+    return expose
+
+
+@dataclass(frozen=True)
+class Binary:
+    """A star and a companion `contrast` as bright, (east, north) [rad] away; the star is the phase centre."""
+
+    east: float
+    north: float
+    contrast: float
+
+    def visibilities(self, baselines: Any, wavelength: float) -> np.ndarray:
+        """On baselines (B, 2) [m]."""
+        u, v = np.asarray(baselines).T / wavelength
+        return (1 + self.contrast * np.exp(-2j * math.pi * (u * self.east + v * self.north))) / (1 + self.contrast)
+
+    def closure_phases(self, baselines: Any, wavelength: float) -> np.ndarray:
+        """Of the triangles of all holes, in order."""
+        values, n = self.visibilities(baselines, wavelength), round((1 + math.sqrt(1 + 8 * len(baselines))) / 2)
+        number = {pair: index for index, pair in enumerate(itertools.combinations(range(n), 2))}
+        triangles = itertools.combinations(range(n), 3)
+        triple = [(values[number[i, j]], values[number[j, k]], values[number[i, k]]) for i, j, k in triangles]
+        return np.array([np.angle(one * two * np.conj(three)) for one, two, three in triple])
+
+    def dimming(self, grid: Grid, diameter: float) -> float:
+        """The share of the light by which holes of `diameter` dim a companion: the overlap of a disc's diffraction
+        pattern with itself, shifted."""
+        away = math.hypot(self.east, self.north) / grid.pixel_scale
+
+        def power(x: float) -> float:
+            return float(disc_otf(torch.tensor(x))) ** 2 * x
+
+        kept = quad(lambda x: power(x) * j0(2 * math.pi * x * grid.cutoff(diameter) * away), 0, 1)[0]
+        return self.contrast * (1 - kept / quad(power, 0, 1)[0])
+
+
+@pytest.fixture(scope="session")
+def binary() -> type[Binary]:
+    """The closed forms of a star and its companion."""
+    return Binary

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from torchmask.grid import Grid
-from torchmask.observation import Observation, check_frames
+from torchmask.observation import PHASE_OVERSAMPLING, Observation, check_frames
 from torchmask.optics.aperture import FullAperture, SparseAperture
 
 GRID = Grid((16, 20), 1e-7, 550e-9)
-IMAGES = ("frames", "object", "psfs", "valid", "errors")
+ARRAYS = ("frames", "object", "psfs", "phases", "valid", "errors")
 
 
 @pytest.fixture
@@ -23,12 +23,9 @@ def frames_of(n, seed=0):
     return torch.rand(n, *GRID.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
-def sky_cards(angle, parity=-1.0):
-    """North turned by `angle` [rad] from the rows; east to the left for parity -1."""
-    degrees = math.degrees(GRID.pixel_scale)
-    cards = {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CUNIT1": "deg", "CUNIT2": "deg"}
-    cards |= {"CD1_1": parity * degrees * math.cos(angle), "CD1_2": -parity * degrees * math.sin(angle)}
-    return cards | {"CD2_1": degrees * math.sin(angle), "CD2_2": degrees * math.cos(angle)}
+def phases_of(mask, n):
+    samples = mask.samples(GRID, PHASE_OVERSAMPLING).weights.shape
+    return torch.rand(n, *samples, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
 
 
 # --- the file
@@ -42,6 +39,7 @@ def test_everything_survives_the_file(tmp_path, mask):
         readout_noise=1.5,
         object=frames_of(1, 1)[0],
         psfs=frames_of(3, 2),
+        phases=phases_of(mask, 3),
         r0=0.15,
         outer_scale=20.0,
         n_photons=1e6,
@@ -51,7 +49,7 @@ def test_everything_survives_the_file(tmp_path, mask):
     )
     whole.save(tmp_path / "a.npz")
     back = Observation.load(tmp_path / "a.npz")
-    for name in IMAGES:
+    for name in ARRAYS:
         assert torch.equal(getattr(back, name), getattr(whole, name)), name
     for name in ("grid", "readout_noise", "r0", "outer_scale", "n_photons", "header"):
         assert getattr(back, name) == getattr(whole, name), name
@@ -68,7 +66,7 @@ def test_what_is_not_known_is_not_known_afterwards(tmp_path, dtype):
     assert isinstance(back.aperture, FullAperture)
     assert back.aperture.central_obstruction == 0.25
     assert back.frames.dtype == dtype
-    unknown = ("readout_noise", "object", "psfs", "r0", "outer_scale", "n_photons", "valid", "errors")
+    unknown = ("readout_noise", "object", "psfs", "phases", "r0", "outer_scale", "n_photons", "valid", "errors")
     assert all(getattr(back, name) is None for name in unknown)
     assert back.header == {}
 
@@ -117,11 +115,58 @@ def test_files_of_version_0_1_are_read(tmp_path):
             Observation.load(tmp_path / f"no_{name}.npz")
 
 
-def test_a_file_whose_parts_disagree_says_so(tmp_path, mask):
-    Observation(frames_of(2), mask, GRID, readout_noise=None).save(tmp_path / "a.npz")
-    parts = dict(np.load(tmp_path / "a.npz"))
-    np.savez(tmp_path / "b.npz", **parts | {"psfs": np.ones((3, 4, 4))})
-    with pytest.raises(ValueError, match=r"b\.npz holds no valid observation: psfs has shape \(3, 4, 4\)"):
+def test_files_of_another_program_are_read(shared_stack):
+    mask, full = (shared_stack(f"skylab_1e7_{kind}") for kind in ("mask", "full"))
+    assert isinstance(mask.aperture, SparseAperture)
+    assert isinstance(full.aperture, FullAperture)
+    assert mask.aperture.n_subapertures == 11
+    assert mask.aperture.fill_factor == pytest.approx(0.15, rel=1e-3)
+    assert full.aperture.mask_diameter == pytest.approx(mask.aperture.extent, rel=1e-9)
+    assert mask.frames.shape == (20, 128, 128)
+    assert mask.grid.cutoff(1.0) == pytest.approx(0.5)
+
+
+def test_a_file_is_never_replaced(tmp_path, mask):
+    observation = Observation(frames_of(2), mask, GRID, readout_noise=None)
+    with pytest.raises(ValueError, match=r"\.npz"):
+        observation.save(tmp_path / "a.fits")
+    observation.save(tmp_path / "a.npz")
+    before = (tmp_path / "a.npz").read_bytes()
+    with pytest.raises(ValueError, match="exists"):
+        observation.save(tmp_path / "a.npz")
+    assert (tmp_path / "a.npz").read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir()] == ["a.npz"]
+
+
+def test_files_that_are_none_are_refused(tmp_path, mask):
+    with pytest.raises(ValueError, match="no file"):
+        Observation.load(tmp_path / "missing.npz")
+    (tmp_path / "text.npz").write_text("no archive")
+    Observation(frames_of(2), mask, GRID, readout_noise=None).save(tmp_path / "good.npz")
+    whole = (tmp_path / "good.npz").read_bytes()
+    (tmp_path / "half.npz").write_bytes(whole[: len(whole) // 2])
+    for name in ("text.npz", "half.npz"):
+        with pytest.raises(ValueError, match=name):
+            Observation.load(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"frames": np.ones(5)},
+        {"frames": np.ones((2, 16, 32))},
+        {"centers": np.ones((4, 3))},
+        {"pixel_scale": np.float64(-1.0)},
+        {"wavelength": np.array([1.0, 2.0])},
+        {"psfs": np.ones((1, 16, 20))},
+        {"shape": np.array("blob")},
+    ],
+    ids=lambda change: next(iter(change)),
+)
+def test_a_file_whose_parts_disagree_says_so(tmp_path, mask, change):
+    Observation(frames_of(2), mask, GRID, readout_noise=None, psfs=frames_of(2, 1)).save(tmp_path / "a.npz")
+    np.savez(tmp_path / "b.npz", **dict(np.load(tmp_path / "a.npz")) | change)
+    with pytest.raises(ValueError, match=r"b\.npz holds no valid observation: "):
         Observation.load(tmp_path / "b.npz")
 
 
@@ -133,6 +178,8 @@ def test_a_file_whose_parts_disagree_says_so(tmp_path, mask):
         ({"valid": torch.ones(3, 16, 20)}, r"valid is torch.float32 of shape \(3, 16, 20\): it must be bool"),
         ({"valid": torch.ones(2, 16, 20, dtype=torch.bool)}, r"valid is torch.bool of shape \(2, 16, 20\)"),
         ({"errors": torch.ones(16, 20)}, r"errors has shape \(16, 20\): it must be \(3, 16, 20\)"),
+        ({"phases": torch.ones(3, 3, 7)}, r"phases has shape \(3, 3, 7\): it must be \(3, 3, \d+\)"),
+        ({"psfs": torch.ones(1, 16, 20)}, r"psfs has shape \(1, 16, 20\): it must be \(3, 16, 20\)"),
         ({"object": torch.ones(3, 16, 20)}, r"object has shape \(3, 16, 20\): it must be \(16, 20\)"),
         ({"readout_noise": -1.0}, r"readout_noise is -1.0"),
         ({"readout_noise": math.nan}, r"readout_noise is nan"),
@@ -146,12 +193,12 @@ def test_an_observation_of_parts_that_disagree_is_refused(mask, fields, message)
 # --- the sky
 
 
-@pytest.mark.parametrize("parity", [-1.0, 1.0])
-def test_the_sky_matrix_leads_from_pixels_to_east_and_north(mask, parity):
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_the_sky_matrix_leads_from_pixels_to_east_and_north(mask, sky_cards, mirrored):
     pytest.importorskip("astropy")
     angle = 0.3
-    observation = Observation(frames_of(1), mask, GRID, None, header=sky_cards(angle, parity))
-    c, s = math.cos(angle), math.sin(angle)
+    observation = Observation(frames_of(1), mask, GRID, None, header=sky_cards(angle, GRID.pixel_scale, mirrored))
+    c, s, parity = math.cos(angle), math.sin(angle), 1 if mirrored else -1
     expected = GRID.pixel_scale * torch.tensor([[parity * c, -parity * s], [s, c]], dtype=torch.float64)
     torch.testing.assert_close(observation.sky_matrix, expected, rtol=1e-12, atol=0)  # a card holds 13 digits
 

@@ -24,7 +24,9 @@ _NEEDED_NUMBERS = ("subaperture_diameter", "mask_diameter", "pixel_scale", "wave
 
 _NUMBERS = (*_NEEDED_NUMBERS, "readout_noise", "orientation", "central_obstruction", "r0", "outer_scale", "n_photons")
 
-_IMAGES = ("object", "psfs", "valid", "errors")
+_ARRAYS = ("object", "psfs", "phases", "valid", "errors")
+
+PHASE_OVERSAMPLING = 4  # of the pupil samples that the phases of an observation lie on
 
 _CELESTIAL = re.compile(
     r"WCSAXES|CRPIX[12]|CRVAL[12]|CTYPE[12]|CUNIT[12]|CDELT[12]|CROTA[12]|CD[12]_[12]|PC[12]_[12]|P[VS][12]_\d+"
@@ -42,13 +44,15 @@ class Observation:
     object : (H, W) the scene in expected electrons per frame, on the frames' pixels
     psfs : (T, H, W) centred on pixel [H // 2, W // 2] and cropped to the field, not renormalised: what is missing to a
         sum of 1 fell outside
+    phases : (T, N, P) [rad] of the wavefronts on the pupil samples `aperture.samples(grid, PHASE_OVERSAMPLING)`: what
+        `PSF` takes and `ZernikePhase` makes of coefficients, both with that oversampling
     r0, outer_scale : of the turbulence [m]
     n_photons : electrons per frame, before the field was cropped
     valid : (H, W) or (T, H, W) bool, False where a pixel is dead or saturated; None: all are valid
     errors : (T, H, W) electrons rms of each pixel, or None
     header : FITS cards that go with the frames: sky coordinates, target, telescope, filter, date
 
-    The truth (object, psfs, r0, outer_scale, n_photons) is None where nobody knows it, as in a real observation.
+    The truth (object, psfs, phases, r0, outer_scale, n_photons) is None where nobody knows it, as in a real one.
 
     Examples
     --------
@@ -71,6 +75,7 @@ class Observation:
     valid: Tensor | None = None
     errors: Tensor | None = None
     header: Mapping[str, str | int | float] = field(default_factory=dict)
+    phases: Tensor | None = None
 
     def __post_init__(self) -> None:
         if self.frames.ndim != 3 or self.frames.shape[-2:] != self.grid.shape or not len(self.frames):
@@ -81,7 +86,11 @@ class Observation:
         noise = self.readout_noise
         if noise is not None and not (math.isfinite(noise) and noise >= 0):
             raise ValueError(f"readout_noise is {noise}: it must be finite and not negative")
-        for name, shape in (("object", self.grid.shape), ("psfs", self.frames.shape), ("errors", self.frames.shape)):
+        shapes = {"object": self.grid.shape, "psfs": self.frames.shape, "errors": self.frames.shape}
+        if self.phases is not None:
+            samples = self.aperture.samples(self.grid, PHASE_OVERSAMPLING)
+            shapes["phases"] = (len(self.frames), *samples.weights.shape)
+        for name, shape in shapes.items():
             values = getattr(self, name)
             if values is not None and tuple(values.shape) != tuple(shape):
                 raise ValueError(f"{name} has shape {tuple(values.shape)}: it must be {tuple(shape)}")
@@ -119,7 +128,7 @@ class Observation:
             "orientation": aperture.orientation,
             "central_obstruction": aperture.central_obstruction,
         }
-        optional = {name: getattr(self, name) for name in ("readout_noise", *_IMAGES, "r0", "outer_scale", "n_photons")}
+        optional = {name: getattr(self, name) for name in ("readout_noise", *_ARRAYS, "r0", "outer_scale", "n_photons")}
         if self.header:
             optional["header"] = json.dumps(dict(self.header))
         save_npz(path, values | {name: value for name, value in optional.items() if value is not None})
@@ -154,7 +163,7 @@ class Observation:
         frames = torch.from_numpy(stored["frames"])
         height, width = frames.shape[-2:]
         grid = Grid(height if height == width else (height, width), number["pixel_scale"], number["wavelength"])
-        optional: dict[str, Any] = {name: torch.from_numpy(stored[name]) for name in _IMAGES if name in stored}
+        optional: dict[str, Any] = {name: torch.from_numpy(stored[name]) for name in _ARRAYS if name in stored}
         optional |= {name: number[name] for name in ("r0", "outer_scale", "n_photons") if name in number}
         if "header" in stored:
             optional["header"] = json.loads(str(stored["header"]))

@@ -3,7 +3,6 @@
 import dataclasses
 import math
 
-import numpy as np
 import pytest
 import torch
 
@@ -37,10 +36,7 @@ def aberrations(seed=0):
     return 0.3 * torch.randn(12, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
-def observation(mask, n, angle, sky_matrix, **changes):
-    degrees = np.degrees(sky_matrix(angle, GRID.pixel_scale))
-    header = {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CUNIT1": "deg", "CUNIT2": "deg"}
-    header |= {f"CD{i + 1}_{j + 1}": float(degrees[i, j]) for i in range(2) for j in range(2)}
+def observation(mask, n, header, **changes):
     frames = torch.rand(n, 24, 24, generator=torch.Generator().manual_seed(n))
     seen = Observation(frames, mask, GRID, None, valid=frames[0] > 0.1, errors=frames.sqrt(), header=header)
     return dataclasses.replace(seen, **changes)
@@ -49,15 +45,16 @@ def observation(mask, n, angle, sky_matrix, **changes):
 # --- exposures
 
 
-def test_exposures_are_the_frames_of_observations_with_their_north(mask, sky_matrix):
+def test_exposures_are_the_frames_of_observations_with_their_north(mask, sky_cards, sky_matrix):
     pytest.importorskip("astropy")
-    parts = [observation(mask, 2, 30.0, sky_matrix), observation(mask, 3, 172.0, sky_matrix, valid=None)]
+    north = [sky_cards(angle, GRID.pixel_scale) for angle in (0.5, 3.0)]
+    parts = [observation(mask, 2, north[0]), observation(mask, 3, north[1], valid=None)]
     exposures = Exposures.from_observations(parts)
     assert torch.equal(exposures.frames, torch.cat([part.frames for part in parts]).double())
     assert torch.equal(exposures.errors, torch.cat([part.errors for part in parts]).double())
     assert torch.equal(exposures.valid[:2], parts[0].valid.expand(2, -1, -1))
     assert exposures.valid[2:].all()
-    for t, angle in enumerate((30.0, 30.0, 172.0, 172.0, 172.0)):
+    for t, angle in enumerate((0.5, 0.5, 3.0, 3.0, 3.0)):
         # three pixels along x and minus one along y, said as east and north and back
         sky = torch.from_numpy(sky_matrix(angle, GRID.pixel_scale)) @ tensor(3.0, -1.0)
         torch.testing.assert_close(exposures.to_pixels[t] @ sky, tensor(-1.0, 3.0), rtol=1e-11, atol=0)
@@ -75,9 +72,10 @@ def test_exposures_are_the_frames_of_observations_with_their_north(mask, sky_mat
         ({"errors": None}, "observation 1 has no errors, such as an ERR extension gives"),
     ],
 )
-def test_observations_that_lack_something_are_refused(mask, sky_matrix, changes, message):
+def test_observations_that_lack_something_are_refused(mask, sky_cards, changes, message):
     pytest.importorskip("astropy")
-    parts = [observation(mask, 1, 0.0, sky_matrix), observation(mask, 1, 0.0, sky_matrix, **changes)]
+    north = sky_cards(0.0, GRID.pixel_scale)
+    parts = [observation(mask, 1, north), observation(mask, 1, **{"header": north} | changes)]
     with pytest.raises(ValueError, match=message):
         Exposures.from_observations(parts)
     with pytest.raises(ValueError, match="observations is empty: give at least one"):

@@ -158,7 +158,7 @@ def expose_stack(expose_binary, sky_matrix):
 
     def expose(companion, n=2):
         mask = SparseAperture.from_catalog("jwst_niriss_ami_7")
-        skies = [sky_matrix(172 + 0.4 * t, NIRISS.pixel_scale) for t in range(n)]
+        skies = [sky_matrix(math.radians(172 + 0.4 * t), NIRISS.pixel_scale) for t in range(n)]
         shots = [
             expose_binary(mask, NIRISS, skies[t], companion, (20.1 - 0.07 * t, 19.9 + 0.1 * t), wavelengths(5), t + 1)
             for t in range(n)

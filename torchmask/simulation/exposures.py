@@ -15,13 +15,12 @@ from torch import Tensor
 
 from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.grid import Grid
-from torchmask.observation import Observation
+from torchmask.observation import PHASE_OVERSAMPLING, Observation
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.detector import Detector, image_formation
 from torchmask.optics.psf import psf_from_samples
 from torchmask.record import Callback, Record
 
-_OVERSAMPLING = 4  # of the pupil: the field of the PSFs beside that of the image
 _CHUNK = 2**21  # pixels of unfolded PSFs held at once
 
 
@@ -34,6 +33,7 @@ def simulate_observation(
     n_frames: int,
     generator: torch.Generator | None = None,
     *,
+    keep_phases: bool = False,
     callback: Callback | None = None,
 ) -> Observation:
     """Draw short exposures of a scene, end to end.
@@ -53,13 +53,16 @@ def simulate_observation(
     generator : torch.Generator, optional
         Seeds one stream for the screens and one for the noise: another flux or read-out noise leaves the screens as
         they were.
+    keep_phases : bool
+        Whether the observation keeps the phase of every frame's wavefront (`Observation.phases`), to compare with a
+        restored one; flat ones for a perfect atmosphere.
     callback : callable, optional
         Receives a `Record` of stage "simulation" after each chunk of frames, with the frames so far.
 
     Returns
     -------
     Observation
-        Of the scene's dtype and device, detached.
+        Of the scene's dtype and device, detached; phases have the dtype of the aperture, in which they were drawn.
 
     Raises
     ------
@@ -70,6 +73,7 @@ def simulate_observation(
     Examples
     --------
     >>> from torchmask.optics.aperture import SparseAperture
+    >>> from torchmask.optics.zernike import ZernikePhase
     >>> mask = SparseAperture([[0.0, 0.3], [0.3, -0.2], [-0.3, -0.2]], 0.2, 1.0)
     >>> scene = torch.zeros(32, 32, dtype=torch.float64); scene[12:20, 14:18] = 1000.0
     >>> observation = simulate_observation(
@@ -77,6 +81,21 @@ def simulate_observation(
     ...     generator=torch.Generator().manual_seed(0))
     >>> observation.frames.shape
     torch.Size([4, 32, 32])
+
+    How far the phases of a restoration's coefficients are from the truth, both on the same samples, [rad] rms over the
+    open pupil and free of each frame's mean piston, which no image shows:
+
+    >>> observation = simulate_observation(
+    ...     scene, mask, Grid.nyquist(1.0, 550e-9, 32), TurbulencePhase(0.15, 20.0), Detector(1.5), n_frames=4,
+    ...     keep_phases=True)
+    >>> coefficients = torch.zeros(4, 3, 6, dtype=torch.float64)  # of a restoration: (frame, hole, mode)
+    >>> phase = ZernikePhase(mask, observation.grid, n_modes=6, oversampling=PHASE_OVERSAMPLING)
+    >>> wrong = phase(coefficients) - observation.phases
+    >>> weights = mask.samples(observation.grid, PHASE_OVERSAMPLING).weights
+    >>> wrong = wrong - (weights * wrong).sum((1, 2), keepdim=True) / weights.sum()
+    >>> rms = ((weights * wrong**2).sum((1, 2)) / weights.sum()).sqrt()
+    >>> rms.shape
+    torch.Size([4])
     """
     scene = scene.detach()
     _check(scene, aperture, grid, n_frames)
@@ -84,7 +103,7 @@ def simulate_observation(
     screens_seed, noise_seed = torch.randint(2**62, (2,), generator=generator, device=device).tolist()
     noise = torch.Generator().manual_seed(noise_seed)
     with torch.no_grad():
-        samples = aperture.samples(grid, _OVERSAMPLING)
+        samples = aperture.samples(grid, PHASE_OVERSAMPLING)
         phases = None
         if turbulence is not None:
             phases = turbulence(samples, n_frames, torch.Generator().manual_seed(screens_seed))
@@ -99,6 +118,8 @@ def simulate_observation(
             if callback is not None:
                 light = {"kept_light": float(frames[-1].sum() / (count * scene.sum()))}
                 callback(Record("simulation", first + count, n_frames, light, {"frames": torch.cat(frames)}))
+    if keep_phases and phases is None:
+        phases = samples.weights.new_zeros(n_frames, *samples.weights.shape)
     return Observation(
         frames=torch.cat(frames),
         aperture=copy.deepcopy(aperture).requires_grad_(False),  # a mask that trains on does not change the past
@@ -109,6 +130,7 @@ def simulate_observation(
         r0=None if turbulence is None else float(turbulence.r0),
         outer_scale=None if turbulence is None else float(turbulence.outer_scale),
         n_photons=float(scene.sum()),
+        phases=phases.to(scene.device) if keep_phases and phases is not None else None,
     )
 
 

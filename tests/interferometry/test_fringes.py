@@ -1,0 +1,163 @@
+"""Visibilities and closure phases from frames: closed forms, errors, dead pixels, and AB Dor."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from torchmask.data.observe import read_observation
+from torchmask.grid import ARCSEC, Grid
+from torchmask.interferometry.fringes import frame_observables
+from torchmask.observation import Observation
+from torchmask.optics.aperture import FullAperture, SparseAperture
+from torchmask.optics.psf import psf_from_samples
+
+CENTERS = [[0.0, 0.42], [0.38, -0.2], [-0.4, -0.15], [0.1, -0.05]]
+WAVELENGTH = 550e-9
+
+
+@pytest.fixture
+def mask():
+    return SparseAperture(CENTERS, 0.1, 1.0)
+
+
+@pytest.fixture
+def grid(mask):
+    return Grid.nyquist(mask.extent, WAVELENGTH, 48, 1.1)
+
+
+def wrapped(angle):
+    return (angle + math.pi) % (2 * math.pi) - math.pi
+
+
+@pytest.mark.parametrize("oversampling", [4, 8, 16])
+def test_a_point_source_has_full_visibility_whatever_the_pistons(mask, grid, oversampling, expose_points):
+    # The sampled holes differ from discs by the square of sample over diameter.
+    observation = Observation(expose_points(mask, grid, n_frames=3, oversampling=oversampling), mask, grid, 0.0)
+    observables = frame_observables(observation)
+    step = grid.period / (oversampling * grid.shape[0]) / mask.subaperture_diameter
+    assert float((observables.vis2 - 1).abs().max()) < step**2
+    assert float(observables.closure_phases.abs().max()) < step**2
+    assert float((observables.triple_amplitudes - 1).abs().max()) < 1.5 * step**2
+    assert step < 0.3
+
+
+def test_pistons_and_place_are_the_phase_of_a_visibility(mask, grid):
+    # V_ij of a point at (x, y) pixels is exp(-2 pi i nu . (x, y)) exp(i (p_i - p_j)).
+    shift, pistons = torch.tensor([1.3, -0.6], dtype=torch.float64), torch.tensor([0.3, -0.8, 1.1, 0.2])
+    samples = mask.samples(grid, 8)
+    tilt = 2 * math.pi * grid.pixel_scale / WAVELENGTH * (samples.offsets + mask.centers[:, None, :]) @ shift
+    psf = psf_from_samples(samples, tilt + pistons[:, None].double())
+    frame = 1e6 * psf.roll((24, 24), (-2, -1))[None, :48, :48]
+    observables = frame_observables(Observation(frame, mask, grid, 0.0))
+    i, j = observables.pairs.T
+    expected = -2 * math.pi * (mask.centers[j] - mask.centers[i]) / grid.period @ shift + pistons[i] - pistons[j]
+    assert float(wrapped(observables.visibilities.angle() - expected).abs().max()) < 0.02
+
+
+@pytest.mark.parametrize("diameter", [0.12, 0.06, 0.03])
+def test_a_binary_has_its_known_visibilities_and_closure_phases(diameter, expose_points, binary):
+    mask = SparseAperture(CENTERS, diameter, 1.0)
+    grid = Grid.nyquist(mask.extent, WAVELENGTH, 64, 1.1)
+    x, y, contrast = 2.0, -1.5, 0.3
+    frames = expose_points(mask, grid, ((0, 0, 1), (x, y, contrast)), n_frames=2, oversampling=8)
+    observables = frame_observables(Observation(frames, mask, grid, 0.0))
+    pair = binary(x * grid.pixel_scale, y * grid.pixel_scale, contrast)
+    expected = pair.visibilities(observables.baselines, WAVELENGTH)
+    closures = pair.closure_phases(observables.baselines, WAVELENGTH)
+    assert np.abs(closures).max() > 0.2
+    assert np.ptp(np.abs(expected)) > 0.2
+    # Star and companion are dimmed, one or the other, by no more than the companion off centre.
+    lost = pair.dimming(grid, diameter)
+    step = (grid.period / (8 * 64) / diameter) ** 2
+    assert np.abs(observables.vis2.numpy() - np.abs(expected) ** 2).max() < 2 * lost + step
+    phases = wrapped(observables.closure_phases.numpy() - closures)
+    assert np.abs(phases).max() < (3 * lost + step) / np.abs(expected).min()
+    assert lost < 0.02 * (diameter / 0.12) ** 2 + 1e-3
+
+
+def test_dead_pixels_do_no_harm(mask, grid, expose_points):
+    frames = expose_points(mask, grid, oversampling=16)
+    valid = torch.ones(grid.shape, dtype=torch.bool)
+    valid[24, 25] = valid[20, 21] = valid[:, 30] = False
+    spoilt = torch.where(valid, frames, 1e7)
+    observables = frame_observables(Observation(spoilt, mask, grid, 0.0, valid=valid))
+    assert float((observables.vis2 - 1).abs().max()) < 1e-2
+    assert float(observables.closure_phases.abs().max()) < 1e-3
+
+
+def test_errors_are_the_scatter_of_the_measurements(expose_points):
+    # Closure phases of a point source are 0 and |V|^2 is 1: mean square over error^2 is 1. Of the 4 triangles of
+    # 4 holes 3 are independent; the larger of two estimates makes errors rather too large.
+    mask = SparseAperture(CENTERS, 0.1, 1.0)
+    grid = Grid.nyquist(mask.extent, WAVELENGTH, 32, 1.1)
+    clean = expose_points(mask, grid, electrons=2e4, n_frames=20, oversampling=8).repeat(30, 1, 1)
+    noise = torch.Generator().manual_seed(5)
+    noisy = torch.poisson(clean, noise) + 2.0 * torch.randn(clean.shape, generator=noise, dtype=torch.float64)
+    for n_frames, low in ((1, 0.8), (12, 0.55)):
+        stacks = noisy.split(n_frames)
+        found = [frame_observables(Observation(stack, mask, grid, 2.0)) for stack in stacks]
+        independent = 3 * len(found)
+        slack = 5 * math.sqrt(2 / independent)
+        phases = torch.stack([(o.closure_phases / o.closure_errors) ** 2 for o in found]).mean()
+        squares = torch.stack([((o.vis2 - 1) / o.vis2_errors) ** 2 for o in found]).mean()
+        assert low - slack < phases < 1 + slack
+        assert low - slack < squares < 1 + slack
+        assert slack < 0.6
+
+
+def test_squared_visibilities_of_faint_frames_are_free_of_noise_bias(expose_points):
+    mask = SparseAperture(CENTERS, 0.1, 1.0)
+    grid = Grid.nyquist(mask.extent, WAVELENGTH, 32, 1.1)
+    clean = expose_points(mask, grid, electrons=500, n_frames=20, oversampling=8).repeat(30, 1, 1)
+    noise = torch.Generator().manual_seed(6)
+    noisy = torch.poisson(clean, noise) + 1.0 * torch.randn(clean.shape, generator=noise, dtype=torch.float64)
+    freed = frame_observables(Observation(noisy, mask, grid, 1.0))
+    assert float(((freed.vis2 - 1) / freed.vis2_errors).abs().max()) < 4
+    noiseless = torch.full_like(noisy, 1e-3)
+    biased = frame_observables(Observation(noisy, mask, grid, 0.0, errors=noiseless))
+    assert float(((biased.vis2 - 1) / freed.vis2_errors).mean()) > 4
+
+
+def test_baselines_that_cannot_be_told_apart_are_refused(mask, grid):
+    frames = torch.rand(1, *grid.shape, generator=torch.Generator().manual_seed(0))
+    with pytest.raises(ValueError, match=r"two holes are the least"):
+        frame_observables(Observation(frames, FullAperture(0.9), grid, 0.0))
+    square = SparseAperture([[0.3, 0.3], [0.3, -0.3], [-0.3, -0.3], [-0.3, 0.3]], 0.1, 1.0)
+    with pytest.raises(ValueError, match=r"cannot be told apart: those of holes .* lie 0 m apart"):
+        frame_observables(Observation(frames, square, grid, 0.0))
+    with pytest.raises(ValueError, match=r"frames \[0\] hold no light"):
+        frame_observables(Observation(0 * frames, mask, grid, 0.0))
+
+
+def test_closure_phases_of_ab_dor_show_its_companion(niriss):
+    # README of the observations: about 0.3 arcsec away, several magnitudes fainter; the calibrator shows none.
+    mask = SparseAperture.from_catalog("jwst_niriss_ami_7")
+    star, calibrator = (
+        frame_observables(read_observation(sorted(niriss.glob(name)), mask, gain=1.62, crop=48))
+        for name in ("ab-dor*.fits", "hd-37093*.fits")
+    )
+    assert float(star.closure_phases.rad2deg().abs().max()) > 2
+    assert float(calibrator.closure_phases.rad2deg().abs().max()) < 1
+    phases = wrapped(star.closure_phases - calibrator.closure_phases).numpy()
+    errors = torch.hypot(star.closure_errors, calibrator.closure_errors).numpy()
+    steps = np.arange(-0.5, 0.51, 0.02) * ARCSEC
+    u, v = star.baselines.numpy().T / 4.817e-6
+    waves = np.exp(-2j * math.pi * (u * steps[:, None, None] + v * steps[:, None]))  # (east, north, baseline)
+    first, second, third = (
+        [list(map(tuple, star.pairs.tolist())).index(pair) for pair in pairs]
+        for pairs in zip(*[((i, j), (j, k), (i, k)) for i, j, k in star.triangles.tolist()], strict=True)
+    )
+    found = []
+    for magnitude in np.arange(2.5, 7, 0.25):
+        contrast = 10 ** (-0.4 * magnitude)
+        values = (1 + contrast * waves) / (1 + contrast)
+        model = np.angle(values[..., first] * values[..., second] * values[..., third].conj())
+        chi = ((phases - model) ** 2 / errors**2).mean(-1)
+        east, north = np.unravel_index(chi.argmin(), chi.shape)
+        found.append((chi.min(), math.hypot(steps[east], steps[north]) / ARCSEC, magnitude))
+    chi, separation, magnitude = min(found)
+    assert chi < 0.1 * float((phases**2 / errors**2).mean())
+    assert 0.25 < separation < 0.4
+    assert 3.5 < magnitude < 5.5
