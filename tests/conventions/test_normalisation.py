@@ -82,10 +82,10 @@ def test_relative_mse_is_1_for_a_restoration_of_nothing():
 
 
 def test_tv_is_isotropic_and_its_corner_is_rounded_by_epsilon():
-    from torchmask.restoration.priors import total_variation
+    from torchmask.restoration.priors import TotalVariation
 
     image = torch.zeros(8, 8, dtype=torch.float64)
     image[3, 4] = 2.0
     # one diagonal step (2, 2), and one step of 2 to each of the pixels above and to the left
     expected = math.sqrt(8 + 1e-4) + 2 * math.sqrt(4 + 1e-4) - 3e-2
-    assert float(total_variation(image)[0]) == pytest.approx(expected, rel=1e-12)
+    assert float(TotalVariation()(image)) == pytest.approx(expected, rel=1e-12)
