@@ -7,6 +7,7 @@ nothing beyond the diffraction limit can. So an estimate is compared after a har
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -66,12 +67,20 @@ def shift(image: Tensor, offset: Tensor | tuple[float, float]) -> Tensor:
     [[2, 0]]
     """
     move = torch.as_tensor(offset, dtype=image.dtype, device=image.device)
-    if move.shape[-1:] != (2,):
-        raise ValueError(f"offset has shape {tuple(move.shape)}: its last axis must be (dy, dx), in pixels")
-    nu_y, nu_x = _frequencies(image.shape, image.dtype, image.device)
-    angle = -2 * math.pi * (nu_y * move[..., 0, None, None] + nu_x * move[..., 1, None, None])
-    turned = torch.fft.rfft2(image) * torch.polar(torch.ones_like(angle), angle)
-    return torch.fft.irfft2(turned, s=image.shape[-2:])
+    return torch.fft.irfft2(torch.fft.rfft2(image) * shift_transfer(image.shape, move), s=image.shape[-2:])
+
+
+def shift_transfer(shape: Sequence[int], offset: Tensor) -> Tensor:
+    """The factor (..., H, W // 2 + 1) by which a shift changes the transform `torch.fft.rfft2` of an image.
+
+    `shape` is the image's, (..., H, W), and `offset` (..., 2) the way it goes, (dy, dx) [pixels]. Differentiable;
+    raises ValueError as `shift` does.
+    """
+    if offset.shape[-1:] != (2,):
+        raise ValueError(f"offset has shape {tuple(offset.shape)}: its last axis must be (dy, dx), in pixels")
+    nu_y, nu_x = _frequencies(shape, offset.dtype, offset.device)
+    angle = -2 * math.pi * (nu_y * offset[..., 0, None, None] + nu_x * offset[..., 1, None, None])
+    return torch.polar(torch.ones_like(angle), angle)
 
 
 def align(estimate: Any, truth: Any, cutoff: float) -> Tensor:
@@ -156,7 +165,7 @@ def _checked(estimate: Any, truth: Any) -> tuple[Tensor, Tensor]:
     return images[0], images[1]
 
 
-def _frequencies(shape: torch.Size, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+def _frequencies(shape: Sequence[int], dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
     nu_y = torch.fft.fftfreq(shape[-2], dtype=dtype, device=device)
     nu_x = torch.fft.rfftfreq(shape[-1], dtype=dtype, device=device)
     return nu_y[:, None], nu_x

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from torchmask.grid import Grid
+from torchmask.metrics import shift_transfer
 from torchmask.observation import Observation
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.band import Band
@@ -191,7 +192,8 @@ class CompanionModel:
         contrast, offset = companion[0], to_pixels @ companion[1:]
         spread = torch.exp(-2 * math.pi**2 * (blur[0] * self._nu_y**2 + blur[1] * self._nu_x**2))
         transfer = torch.fft.rfft2(self.psf(aberrations)) * (flux * spread * self._pixel)
-        sky = self._shift(y, x) * (1 + contrast * self._shift(offset[0], offset[1]))
+        field = (_FIELD * self.grid.shape[0], _FIELD * self.grid.shape[1])
+        sky = shift_transfer(field, torch.stack([y, x])) * (1 + contrast * shift_transfer(field, offset))
         return self._window(transfer * sky) + background
 
     def images(self, parameters: Parameters, to_pixels: Tensor) -> Tensor:
@@ -211,15 +213,12 @@ class CompanionModel:
         """Images (H, W), dark outside, moved by each of `offsets` (M, 2) [pixel, (y, x)]: (M, H, W)."""
         rows, columns = (_FIELD * side for side in self.grid.shape)
         transfer = torch.fft.rfft2(images, s=(rows, columns))
-        return self._window(transfer * self._shift(*offsets.T[..., None, None]))
+        return self._window(transfer * shift_transfer((rows, columns), offsets))
 
     def root_weights(self, exposures: Exposures) -> Tensor:
         """One over the rms error of each pixel (T, H, W), 0 where it is not compared."""
         variance = exposures.errors**2 + (self.flux_error * exposures.frames.clamp(min=0)) ** 2
         return torch.where(exposures.valid & self.near, variance, torch.inf).rsqrt()
-
-    def _shift(self, y: Tensor, x: Tensor) -> Tensor:
-        return torch.exp(-2j * math.pi * (self._nu_y * y + self._nu_x * x))
 
     def _window(self, transfer: Tensor) -> Tensor:
         rows, columns = self.grid.shape

@@ -16,6 +16,7 @@ from torch import Tensor
 from torchmask.grid import ARCSEC, MAS
 from torchmask.interferometry.companion import CompanionModel, Exposures
 from torchmask.interferometry.companion_fit import CompanionFit, fit_companion
+from torchmask.metrics import shift
 from torchmask.record import Callback, Record
 
 MEASURED = ("separation", "position_angle", "magnitude_difference")
@@ -50,10 +51,7 @@ def inject_companion(exposures: Exposures, star: CompanionFit, companion: Tensor
     Bad pixels give the light of `star`, a fit without companion.
     """
     light = torch.where(exposures.valid, exposures.frames, star.images) - star.parameters.own[:, 1, None, None]
-    nu_y, nu_x = (torch.fft.fftfreq(n, dtype=torch.float64) for n in light.shape[1:])
-    move = (exposures.to_pixels @ companion[1:])[..., None, None]  # (T, 2, 1, 1)
-    phase = nu_y[:, None] * move[:, 0] + nu_x * move[:, 1]
-    moved = torch.fft.ifft2(torch.fft.fft2(light) * torch.exp(-2j * math.pi * phase)).real
+    moved = shift(light, exposures.to_pixels @ companion[1:])
     return replace(exposures, frames=exposures.frames + companion[0] * moved)
 
 

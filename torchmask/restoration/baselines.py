@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.grid import Grid
+from torchmask.metrics import shift
 from torchmask.observation import check_frames
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.psf import PSF
@@ -50,19 +51,16 @@ def shift_and_add(frames: Tensor) -> Tensor:
     >>> richardson_lucy((image / image.max()).numpy(), psf.numpy(), num_iter=10).shape
     (32, 32)
     """
-    from scipy.ndimage import fourier_shift
     from skimage.registration import phase_cross_correlation
 
     shape = (int(frames.shape[-2]), int(frames.shape[-1])) if frames.ndim >= 2 else (0, 0)
-    stack = check_frames(frames, None, Grid(shape, 1.0, 1.0))[0].cpu().numpy()
-    spectra = np.fft.fft2(stack)
+    stack = check_frames(frames, None, Grid(shape, 1.0, 1.0))[0].cpu()
     options: dict[str, Any] = {"upsample_factor": 10, "normalization": None}
     mean = stack[stack.std((1, 2)).argmax()]
     for _ in range(2):
-        shifts = [phase_cross_correlation(mean, frame, **options)[0] for frame in stack]
-        moved = [fourier_shift(spectrum, shift) for spectrum, shift in zip(spectra, shifts, strict=True)]
-        mean = np.fft.ifft2(np.mean(moved, axis=0)).real
-    return torch.from_numpy(mean)
+        offsets = [phase_cross_correlation(mean.numpy(), frame, **options)[0] for frame in stack.numpy()]
+        mean = shift(stack, torch.from_numpy(np.stack(offsets))).mean(0)
+    return mean
 
 
 def average_psf(
