@@ -18,7 +18,15 @@ export OMP_WAIT_POLICY ?= passive
 	$(BIN)/pip install --quiet -c constraints.txt -e '.[test]'
 	touch $@ .venv/.experiments
 
-.PHONY: demo test quick lint docs notebooks dist clean
+# All dependencies but torch at the lowest version that pyproject.toml allows, those of the extra `test` among them.
+.venv-oldest/.done: pyproject.toml constraints.txt .venv/.test
+	rm -rf .venv-oldest
+	$(BIN)/python -m venv .venv-oldest
+	.venv-oldest/bin/pip install --quiet uv -c constraints.txt torch
+	.venv-oldest/bin/uv pip install --quiet --python .venv-oldest/bin/python --resolution lowest-direct -c constraints.txt -e '.[test]'
+	touch $@
+
+.PHONY: demo test quick oldest lint docs notebooks dist clean
 demo: .venv/.experiments
 	OMP_NUM_THREADS=2 $(BIN)/python experiments/codesign.py
 
@@ -27,6 +35,9 @@ test: lint docs
 
 quick: .venv/.test
 	$(BIN)/pytest -n 2 -m 'not slow'
+
+oldest: .venv-oldest/.done
+	.venv-oldest/bin/python -m pytest -n 2 -m 'not slow'
 
 lint: .venv/.test
 	$(BIN)/ruff check .
@@ -45,4 +56,4 @@ dist: .venv/.test
 	$(BIN)/python -m build --no-isolation
 
 clean:
-	rm -rf .venv build dist *.egg-info docs/_build
+	rm -rf .venv .venv-oldest build dist *.egg-info docs/_build

@@ -24,8 +24,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Run:
-    """directory : of the results; logger : TensorBoard and metrics.jsonl; callback : for the algorithms; summary :
-    lines that are printed at the end, when no progress bar is in their way."""
+    """Where a program writes, and to whom its algorithms speak.
+
+    directory : of the results
+    logger : TensorBoard and metrics.jsonl
+    callback : for the algorithms
+    summary : lines that are printed at the end, when no progress bar is in their way
+    """
 
     directory: Path
     logger: RunLogger
