@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchmask.restoration.projected_lbfgs import AfterIteration, Cost, Minimum
+from torchmask.restoration.projected_lbfgs import AfterIteration, Cost, Minimum, require_finite, require_vectors
 
 OptimizerFactory = Callable[[Iterable[Tensor]], torch.optim.Optimizer]
 
@@ -55,17 +55,25 @@ class TorchMinimizer:
     def __call__(
         self, cost: Cost, start: Tensor, lower: Tensor, *, max_iterations: int, callback: AfterIteration | None = None
     ) -> Minimum:
-        """Lower `cost` by `max_iterations` times `steps` steps; the best point that was evaluated comes back."""
+        """Lower `cost` by `max_iterations` times `steps` steps; the best point that was evaluated comes back.
+
+        Raises ValueError if the shapes differ or the cost is not finite at the start.
+        """
+        require_vectors(start, lower)
         x = torch.maximum(start, lower).requires_grad_()
         optimizer = self.factory([x])
         best, least, evaluations = x.detach().clone(), float("inf"), 0
 
         def closure() -> float:
             nonlocal best, least, evaluations
-            value, x.grad = cost(x.detach())
+            point = torch.maximum(x.detach(), lower)  # a step of several evaluations leaves the bounds on its way
+            value, gradient = cost(point)
+            x.grad = gradient * (x.detach() >= lower)
+            if not evaluations:
+                require_finite(value)
             evaluations += 1
             if value < least:
-                best, least = x.detach().clone(), value
+                best, least = point, value
             return value
 
         for _ in range(max_iterations):

@@ -173,15 +173,11 @@ def minimize_bounded(
     >>> minimize_bounded(cost, torch.zeros(2).double(), torch.zeros(2).double(), max_iterations=20).x
     tensor([1., 0.], dtype=torch.float64)
     """
-    if start.ndim != 1 or start.shape != lower.shape:
-        raise ValueError(
-            f"start and lower have shapes {tuple(start.shape)} and {tuple(lower.shape)}: both must be (n,)"
-        )
+    require_vectors(start, lower)
     budget = max_evaluations or 4 * max_iterations
     x = torch.maximum(start, lower)
     value, gradient = cost(x)
-    if not value < float("inf"):
-        raise ValueError(f"the cost at the start is {value}: it must be finite")
+    require_finite(value)
     memory = Corrections(n_corrections, x)
     evaluations, iteration = 1, 0
 
@@ -226,6 +222,20 @@ def minimize_bounded(
             callback(x, value, evaluations)
         if decrease <= cost_tolerance * abs(value):
             return end(f"the last iteration lowered the cost by {decrease:.1e}", converged=True)
+
+
+def require_vectors(start: Tensor, lower: Tensor) -> None:
+    """Raise ValueError unless a start and its bounds are of one shape (n,)."""
+    if start.ndim != 1 or start.shape != lower.shape:
+        raise ValueError(
+            f"start and lower have shapes {tuple(start.shape)} and {tuple(lower.shape)}: both must be (n,)"
+        )
+
+
+def require_finite(value: float) -> None:
+    """Raise ValueError unless the cost at the start is a number below infinity."""
+    if not value < float("inf"):
+        raise ValueError(f"the cost at the start is {value}: it must be finite")
 
 
 def _shorter(slope: float, rise: float) -> float:

@@ -1,0 +1,222 @@
+"""The ways out of a local minimum, where the answer is known: frames that are lost, an object off its pixels."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchmask.grid import Grid
+from torchmask.metrics import shift
+from torchmask.optics.band import Band
+from torchmask.restoration.aberrations import AberrationBasis, turbulent_basis
+from torchmask.restoration.escapes import centre_on_pixels, restart_outlier_frames, tilt
+from torchmask.restoration.forward import ExposureModel
+from torchmask.restoration.objective import MyopicObjective
+from torchmask.restoration.priors import TotalVariation
+from torchmask.restoration.projected_lbfgs import Minimum, ProjectedLBFGS
+from torchmask.restoration.schedule import Schedule
+from torchmask.restoration.state import Calibration, State
+
+GRID = Grid.nyquist(1.0, 550e-9, 32, oversampling=1.2)
+FRAMES, LOST = 4, 2
+FIRST_INFLATION = 30.0
+SCHEDULE = Schedule()
+
+
+def block(shape):
+    """Edges that lie on the pixels."""
+    image = torch.zeros(shape, dtype=torch.float64)
+    image[10:19, 8:16], image[13:16, 16:25] = 6.0, 3.0
+    return image
+
+
+@pytest.fixture(scope="module")
+def basis(five_holes):
+    return turbulent_basis(five_holes, 3, 0, 0.25, 20.0)
+
+
+@pytest.fixture(scope="module")
+def truth(five_holes, basis):
+    """Objective and state of noisy frames that the true state explains: (objective, state)."""
+    return problem(ExposureModel(five_holes, GRID, basis))
+
+
+def problem(model, noise=0.03):
+    generator = torch.Generator().manual_seed(0)
+    image = block(model.window.field.shape)
+    basis = model.aberrations
+    z = torch.randn(FRAMES, basis.n_parameters, dtype=torch.float64, generator=generator)
+    z = basis.with_common_of(z, z[:1])
+    frames = model(image, z)
+    frames = frames + noise * torch.randn(frames.shape, dtype=torch.float64, generator=generator)
+    precision = torch.full((1, 1, 1), noise**-2, dtype=torch.float64)
+    objective = MyopicObjective(model, frames, precision, TotalVariation())
+    ones = torch.ones(FRAMES, dtype=torch.float64)
+    return objective, State(image, z, Calibration(ones, ones, 1.0))
+
+
+def with_lost(state, z):
+    """The state whose lost frame has the aberrations z (K,)."""
+    changed = state.z.clone()
+    changed[LOST] = z
+    return replace(state, z=changed)
+
+
+class Counting:
+    """A minimiser that counts the evaluations it is seen to spend."""
+
+    def __init__(self):
+        self.n_evaluations = 0
+        self.inner = ProjectedLBFGS()
+
+    def __call__(self, cost, start, lower, *, max_iterations, callback):
+        reported = []
+        found = self.inner(
+            cost,
+            start,
+            lower,
+            max_iterations=max_iterations,
+            callback=lambda x, value, evaluations: (reported.append(evaluations), callback(x, value, evaluations)),
+        )
+        self.n_evaluations += reported[-1]
+        return found
+
+
+def idle(cost, start, lower, *, max_iterations, callback):
+    """A minimiser that says it has evaluated seven times, in two iterations, and stays."""
+    callback(start, cost(start)[0], 3)
+    callback(start, cost(start)[0], 7)
+    return Minimum(start, cost(start)[0], 2, 7, False, "idle")
+
+
+# --- frames
+
+
+def test_a_lost_frame_is_found_again(truth):
+    """From aberrations of another frame; the residuals of the others tell that it is lost."""
+    objective, state = truth
+    lost = with_lost(state, -state.z[0])
+    minimizer = Counting()
+    found, n_evaluations = restart_outlier_frames(objective, lost, FIRST_INFLATION, SCHEDULE, minimizer, seed=1)
+    costs = [objective.frame_costs(one.image, one.z, one.calibration) for one in (lost, found, state)]
+    assert float(costs[0][LOST]) > 10 * float(costs[2][LOST])
+    assert float(costs[1][LOST]) < 1.001 * float(costs[2][LOST])  # the least cost is below that of the truth
+    others = [frame for frame in range(FRAMES) if frame != LOST]
+    assert torch.equal(found.z[others], lost.z[others])
+    assert torch.equal(found.image, lost.image)
+    assert found.calibration is lost.calibration
+    assert minimizer.n_evaluations > SCHEDULE.restarts * SCHEDULE.restart_rounds
+    assert n_evaluations == minimizer.n_evaluations // FRAMES  # in units of evaluations of the whole stack
+
+
+def test_frames_that_fit_are_left_alone_at_no_cost(truth):
+    objective, state = truth
+    found, n_evaluations = restart_outlier_frames(objective, state, FIRST_INFLATION, SCHEDULE, idle, seed=1)
+    assert found is state
+    assert n_evaluations == 0
+
+
+def test_a_frame_keeps_its_aberrations_unless_others_are_better(truth):
+    """Random ones that go nowhere are not; every evaluation counts, those in vain too."""
+    objective, state = truth
+    lost = with_lost(state, state.z[LOST] + 0.3)  # a poor fit, but no worse than a random one
+    found, n_evaluations = restart_outlier_frames(objective, lost, FIRST_INFLATION, SCHEDULE, idle, seed=1)
+    assert found is lost
+    assert n_evaluations == SCHEDULE.restarts * SCHEDULE.restart_rounds * 7 // FRAMES
+
+
+def test_what_is_outlying_is_a_number_of_the_schedule(truth):
+    objective, state = truth
+    lost = with_lost(state, state.z[LOST] + 0.3)
+    blind = replace(SCHEDULE, outlying=math.inf)
+    assert restart_outlier_frames(objective, lost, FIRST_INFLATION, blind, idle, seed=1) == (lost, 0)
+
+
+def test_restarts_are_those_of_the_seed(truth):
+    objective, state = truth
+    lost = with_lost(state, -state.z[0])
+    brief = replace(SCHEDULE, restarts=1, restart_rounds=1, restart_iterations=3)
+
+    def restarted(seed):
+        return restart_outlier_frames(objective, lost, FIRST_INFLATION, brief, ProjectedLBFGS(), seed)[0].z[LOST]
+
+    assert torch.equal(restarted(1), restarted(1))
+    assert not torch.equal(restarted(1), restarted(2))
+
+
+def test_what_all_frames_share_stays_when_one_starts_anew(five_holes, basis):
+    shared = AberrationBasis(basis.mixing, 3, n_common=6)
+    objective, state = problem(ExposureModel(five_holes, GRID, shared))
+    lost = state.z[LOST].clone()
+    lost[: shared.n_own] = -state.z[0, : shared.n_own]
+    found, _ = restart_outlier_frames(
+        objective, with_lost(state, lost), FIRST_INFLATION, SCHEDULE, ProjectedLBFGS(), seed=1
+    )
+    assert not torch.equal(found.z[LOST], lost)
+    torch.testing.assert_close(found.z[:, shared.n_own :], state.z[:, shared.n_own :], rtol=1e-14, atol=0)
+
+
+# --- the object between the pixels
+
+
+@pytest.mark.parametrize("band", [None, Band.of((540e-9, 580e-9))])
+@pytest.mark.parametrize("offset", [(2.0, -3.0), (0.4, -0.2)])
+def test_tilt_moves_every_image(offset, band, five_holes, basis):
+    model = ExposureModel(five_holes, GRID, basis, band)
+    z = torch.randn(2, basis.n_parameters, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    moved = model.psf(z + tilt(model, offset))
+    torch.testing.assert_close(moved, shift(model.psf(z), offset), rtol=0, atol=1e-9)
+
+
+def moved_away(objective, state, offset):
+    """The state whose object lies `offset` away and whose aberrations make up for it: nothing changes in the frames."""
+    image = shift(state.image, offset)
+    return replace(state, image=image, z=state.z - tilt(objective.model, offset))
+
+
+@pytest.mark.parametrize(
+    ("offset", "whole"),
+    [
+        ((0.0, -0.2), (0, 0)),
+        ((-0.4, 0.2), (0, 0)),
+        ((0.4, 0.0), (1, 0)),  # as near as (0, 0), and as good, for the steps are 0.4 and 0.2
+        ((0.6, -0.4), (1, 0)),
+        ((-0.2, -0.6), (0, 0)),
+    ],
+)
+def test_an_object_off_its_pixels_comes_back_to_them(offset, whole, truth):
+    """To its own or to the next, which no frame can tell; settled there it costs less than the truth itself."""
+    objective, state = truth
+    state = state.calibrated(aberration_weight=0.0)
+    away = moved_away(objective, state, offset)
+    torch.testing.assert_close(objective.model(away.image, away.z), objective.model(state.image, state.z))
+    found = centre_on_pixels(objective, away, SCHEDULE)
+    torch.testing.assert_close(found.z, state.z - tilt(objective.model, whole), rtol=0, atol=1e-9)
+    assert bool((found.image >= 0).all())
+    assert float((found.image - state.image.roll(whole, (0, 1))).norm()) < 0.5 * float(
+        (away.image - state.image).norm()
+    )
+    assert found.calibration is away.calibration
+    values = [objective.value_and_gradients(one.image, one.z, one.calibration).value for one in (found, state, away)]
+    assert values[0] < values[1] < values[2]
+
+
+def test_an_object_on_its_pixels_is_the_very_same_state(truth):
+    objective, state = truth
+    assert centre_on_pixels(objective, state, SCHEDULE) is state
+
+
+def test_a_prior_on_the_aberrations_that_holds_more_than_the_object_gains_keeps_it(truth):
+    objective, state = truth
+    away = moved_away(objective, state, (0.4, 0.0))
+    held = objective.with_changes(centre=away.z)
+    for weight, stays in ((1e9, True), (1e-9, False)):
+        begun = away.calibrated(aberration_weight=weight)
+        assert (centre_on_pixels(held, begun, SCHEDULE) is begun) == stays
+
+
+def test_places_are_those_of_the_schedule(truth):
+    objective, state = truth
+    away = moved_away(objective, state.calibrated(aberration_weight=0.0), (0.4, 0.0))
+    assert centre_on_pixels(objective, away, replace(SCHEDULE, pixel_steps=())) is away

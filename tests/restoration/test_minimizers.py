@@ -1,0 +1,110 @@
+"""Optimisers of `torch.optim` under bounds: within them, never worse than what was seen, every evaluation counted."""
+
+import math
+from functools import partial
+
+import pytest
+import torch
+
+from torchmask.restoration.minimizers import TorchMinimizer
+from torchmask.restoration.projected_lbfgs import minimize_bounded
+
+OPTIMIZERS = {
+    "Adam": partial(torch.optim.Adam, lr=0.2),
+    "SGD": partial(torch.optim.SGD, lr=0.02),
+    "wild SGD": partial(torch.optim.SGD, lr=2.0),  # leaps across the valley, further every time
+    "LBFGS": partial(torch.optim.LBFGS, max_iter=4),  # several evaluations a step, which the bounds do not interrupt
+    "LBFGS with line search": partial(torch.optim.LBFGS, max_iter=4, line_search_fn="strong_wolfe"),
+    "Rprop": torch.optim.Rprop,
+}
+each_optimizer = pytest.mark.parametrize("factory", OPTIMIZERS.values(), ids=OPTIMIZERS.keys())
+
+
+class Bowl:
+    """A quadratic whose least point lies beyond half of its bounds; it remembers where it was evaluated."""
+
+    def __init__(self, n=6, dtype=torch.float64):
+        generator = torch.Generator().manual_seed(0)
+        root = torch.randn(n, n, dtype=torch.float64, generator=generator)
+        self.hessian = (root @ root.T / n + torch.eye(n, dtype=torch.float64)).to(dtype)
+        self.middle = torch.tensor([1.5, -1.0] * (n // 2), dtype=dtype)
+        self.lower = torch.zeros(n, dtype=dtype)
+        self.lower[-1] = -math.inf
+        self.start = torch.full((n,), 0.5, dtype=dtype)
+        self.points, self.values = [], []
+
+    def __call__(self, x):
+        away = x - self.middle
+        gradient = self.hessian @ away
+        self.points.append(x.clone())
+        self.values.append(float(0.5 * away @ gradient))
+        return self.values[-1], gradient
+
+
+@each_optimizer
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_the_best_point_that_was_evaluated_comes_back_within_the_bounds(factory, dtype):
+    bowl = Bowl(dtype=dtype)
+    found = TorchMinimizer(factory, steps=3)(bowl, bowl.start, bowl.lower, max_iterations=4)
+    assert all(bool((point >= bowl.lower).all()) for point in bowl.points)
+    best = min(range(len(bowl.values)), key=bowl.values.__getitem__)
+    assert found.value == bowl.values[best]
+    assert torch.equal(found.x, bowl.points[best])
+    assert found.n_evaluations == len(bowl.values)
+    assert found.n_iterations == 4
+    assert not found.converged
+    assert found.x.dtype == dtype
+    assert not found.x.requires_grad
+    assert torch.equal(bowl.start, torch.full_like(bowl.start, 0.5))  # is left as it was
+
+
+@pytest.mark.parametrize("name", ["Adam", "SGD", "LBFGS", "LBFGS with line search", "Rprop"])
+def test_the_bounded_minimum_is_found(name):
+    bowl = Bowl()
+    expected = minimize_bounded(bowl, bowl.start, bowl.lower, max_iterations=200)
+    found = TorchMinimizer(OPTIMIZERS[name])(bowl, bowl.start, bowl.lower, max_iterations=300)
+    assert bool((expected.x == bowl.lower)[:-1].any())  # some bound holds
+    assert found.value == pytest.approx(expected.value, rel=1e-3)
+
+
+def test_every_iteration_is_reported_with_the_best_so_far():
+    bowl, seen = Bowl(), []
+    minimizer = TorchMinimizer(OPTIMIZERS["wild SGD"], steps=2)
+    found = minimizer(
+        bowl,
+        bowl.start,
+        bowl.lower,
+        max_iterations=5,
+        callback=lambda x, value, evaluations: seen.append((x.clone(), value, evaluations)),
+    )
+    assert [evaluations for _, _, evaluations in seen] == [2, 4, 6, 8, 10]
+    assert found.n_evaluations == 11  # the last point too
+    for x, value, evaluations in seen:
+        assert value == min(bowl.values[:evaluations])
+        assert torch.equal(x, bowl.points[bowl.values.index(value)])
+    assert bowl.values[9] > bowl.values[0]  # it was wild indeed
+
+
+def test_a_start_outside_the_bounds_is_put_on_them():
+    bowl = Bowl()
+    TorchMinimizer(OPTIMIZERS["SGD"])(bowl, torch.full((6,), -3.0).double(), bowl.lower, max_iterations=1)
+    assert bowl.points[0].tolist() == [0.0] * 5 + [-3.0]
+
+
+def test_every_descent_has_a_fresh_optimizer():
+    bowl = Bowl()
+    minimizer = TorchMinimizer(OPTIMIZERS["Adam"])
+    first, second = (minimizer(bowl, bowl.start, bowl.lower, max_iterations=5) for _ in range(2))
+    assert torch.equal(first.x, second.x)
+
+
+def test_refuses_nonsense():
+    with pytest.raises(ValueError, match="steps is 0: it must be at least 1"):
+        TorchMinimizer(OPTIMIZERS["Adam"], steps=0)
+    with pytest.raises(TypeError, match=r"factory makes a list: it must make an optimiser of torch\.optim"):
+        TorchMinimizer(list)
+    bowl = Bowl()
+    with pytest.raises(ValueError, match="start and lower have shapes"):
+        TorchMinimizer(OPTIMIZERS["Adam"])(bowl, bowl.start, bowl.lower[:-1], max_iterations=1)
+    with pytest.raises(ValueError, match="the cost at the start is nan: it must be finite"):
+        TorchMinimizer(OPTIMIZERS["Adam"])(lambda x: (math.nan, x), bowl.start, bowl.lower, max_iterations=1)
