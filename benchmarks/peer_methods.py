@@ -78,7 +78,7 @@ _MFBD_START = 0.1  # rms of the first coefficients [rad]
 
 def mfbd(observation: Observation, effort: Effort) -> Iterator[Candidate]:
     """torchmfbd, each setting with several cut-offs of its Fourier filter."""
-    if observation.aperture.n_subapertures > 1 or len(set(observation.grid.shape)) > 1:
+    if not observation.aperture.is_full or len(set(observation.grid.shape)) > 1:
         return
     for settings in MFBD_SETTINGS:
         started = time.perf_counter()
@@ -99,7 +99,7 @@ def _run_mfbd(observation: Observation, settings: MFBDSettings, iterations: int)
         {
             "telescope": {
                 "diameter": 100 * aperture.outer_diameter,  # [cm]
-                "central_obscuration": 100 * aperture.outer_diameter * aperture.central_obstruction,
+                "central_obscuration": 100 * aperture.outer_diameter * aperture.shape.parameters.get("obstruction", 0),
                 "spider": 0,
             },
             "images": {

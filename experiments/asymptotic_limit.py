@@ -34,7 +34,7 @@ from torchmask.design.sweep import run_tasks
 from torchmask.design.table import design_table
 from torchmask.grid import Grid
 from torchmask.optics.aperture import SparseAperture
-from torchmask.optics.otf import OTF, subaperture_otf
+from torchmask.optics.otf import OTF
 from torchmask.record import Callback
 from torchmask.spectra import NoisePSD, PowerLawPSD
 
@@ -87,7 +87,8 @@ class PistonOTFs:
         for baseline in [torch.zeros(2), *((mask.centers[self.first] - mask.centers[self.second]) / grid.period)]:
             dx, dy = nu_x - baseline[0], nu_y - baseline[1]
             shift = torch.stack(torch.broadcast_tensors(dx - dx.round(), dy - dy.round()), dim=-1)
-            columns.append(scipy.sparse.csc_array(subaperture_otf(shift * grid.period, mask).reshape(-1, 1).numpy()))
+            overlap = mask.shape.otf(shift * grid.period, mask.subaperture_diameter)
+            columns.append(scipy.sparse.csc_array(overlap.reshape(-1, 1).numpy()))
         self.alone = columns[0].toarray()
         self.pairs = scipy.sparse.hstack(columns[1:]).tocsr() / n
         self.shape = grid.shape

@@ -41,8 +41,10 @@ from torchmask.design.table import design_table
 from torchmask.grid import Grid
 from torchmask.metrics import relative_error
 from torchmask.observation import Observation
-from torchmask.optics.aperture import Aperture, FullAperture, PupilSamples, SparseAperture
+from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.detector import Detector
+from torchmask.optics.pupil import Aperture, PupilSamples
+from torchmask.optics.shapes import Disc
 from torchmask.optics.zernike import zernike_basis
 from torchmask.record import Callback
 from torchmask.restoration.myopic import MyopicDeconvolution
@@ -127,7 +129,7 @@ def choose_mask(options: Options, callback: Callback) -> SparseAperture:
     """The mask of --mask, or the one that a search finds for the reference case."""
     if options.mask is not None:
         mask = load_mask(options.mask)
-        if mask.shape != "disc" or not math.isclose(mask.mask_diameter, DIAMETER, rel_tol=1e-6):
+        if mask.shape != Disc() or not math.isclose(mask.mask_diameter, DIAMETER, rel_tol=1e-6):
             raise ValueError(
                 f"{options.mask} has {mask.shape} holes in {mask.mask_diameter:g} m: discs in {DIAMETER:g} m are needed"
             )

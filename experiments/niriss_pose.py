@@ -39,7 +39,7 @@ def placed_mask(pose: Pose, grid: Grid, to_pixels: Tensor) -> SparseAperture:
     turn = torch.tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]], dtype=torch.float64)
     pixel = torch.linalg.vector_norm(torch.linalg.inv(to_pixels[0]), dim=0).flip(0)  # sides along x and y [rad]
     centers = mask.centers @ turn.T * (pixel / grid.pixel_scale)
-    return SparseAperture(centers, pose.hole, mask.mask_diameter, "hexagon", mask.orientation + angle)
+    return mask.replace(centers, pose.hole, shape=mask.shape.turned(angle))
 
 
 def effective_wavelengths(pose: Pose, n: int) -> list[float]:

@@ -16,13 +16,13 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
-import math
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from rich.console import Console
 from rich.table import Table
 
@@ -37,6 +37,7 @@ from torchmask.grid import Grid
 from torchmask.io import atomic_write
 from torchmask.optics import catalog
 from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.shapes import Disc, Shape
 from torchmask.record import Callback, label_stage
 from torchmask.spectra import NoisePSD, PowerLawPSD
 from torchmask.viz.style import COLORS, FAINT, new_figure, styled
@@ -45,7 +46,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DIAMETER, WAVELENGTH, N_PHOTONS, N_FRAMES = 1.0, 550e-9, 1e7, 20
-SHAPE_AREA = {"disc": math.pi / 4, "hexagon": math.sqrt(3) / 2}  # of a hole of unit size
 HEADINGS = {
     "rank": "rank",
     "mask": "mask",
@@ -100,15 +100,14 @@ def largest_fill_factor(entry: catalog.CatalogEntry) -> float:
     centers = np.array(entry.centers)
     _, radius = catalog.smallest_enclosing_circle(centers)
     first, second = np.triu_indices(len(centers), 1)
-    difference = centers[first] - centers[second]
-    if entry.shape == "hexagon":
-        angles = entry.orientation + np.arange(3) * np.pi / 3
-        gap = np.abs(difference @ np.stack([np.cos(angles), np.sin(angles)])).max(axis=1).min()
-        outer = 2 / math.sqrt(3)
-    else:
-        gap, outer = np.linalg.norm(difference, axis=1).min(), 1.0
-    relative = gap / (2 * radius + outer * gap)
-    return float(len(centers) * relative**2 * SHAPE_AREA[entry.shape] / SHAPE_AREA["disc"])
+    gap = float(entry.shape.separation(torch.from_numpy(centers[first] - centers[second])).min())
+    relative = gap / (2 * radius + entry.shape.outer_diameter(gap))
+    return len(centers) * relative**2 * area_over_disc(entry.shape)
+
+
+def area_over_disc(shape: Shape) -> float:
+    """Area of a hole over that of a disc of the same diameter."""
+    return shape.area(1.0) / Disc().area(1.0)
 
 
 def lay_out(options: Options) -> tuple[dict[str, SparseAperture], dict[str, float]]:
@@ -120,7 +119,7 @@ def lay_out(options: Options) -> tuple[dict[str, SparseAperture], dict[str, floa
         if limit < options.fill_factor:
             crowded[name] = limit
             continue
-        fill = options.fill_factor * SHAPE_AREA["disc"] / SHAPE_AREA[entry.shape]
+        fill = options.fill_factor / area_over_disc(entry.shape)
         masks[name] = SparseAperture.from_catalog(name, DIAMETER, fill)
     return masks, crowded
 

@@ -9,6 +9,7 @@ import torch
 from torchmask.grid import Grid
 from torchmask.observation import PHASE_OVERSAMPLING, Observation, check_frames
 from torchmask.optics.aperture import FullAperture, SparseAperture
+from torchmask.optics.shapes import Annulus, Disc, Hexagon
 
 GRID = Grid((16, 20), 1e-7, 550e-9)
 ARRAYS = ("frames", "object", "psfs", "phases", "valid", "errors")
@@ -54,7 +55,7 @@ def test_everything_survives_the_file(tmp_path, mask):
     for name in ("grid", "readout_noise", "r0", "outer_scale", "n_photons", "header"):
         assert getattr(back, name) == getattr(whole, name), name
     assert torch.equal(back.aperture.centers, mask.centers)
-    for name in ("subaperture_diameter", "mask_diameter", "shape", "orientation", "central_obstruction"):
+    for name in ("subaperture_diameter", "mask_diameter", "shape"):
         assert getattr(back.aperture, name) == getattr(mask, name), name
 
 
@@ -100,19 +101,38 @@ def test_files_of_version_0_1_are_read(tmp_path):
     assert torch.equal(back.psfs, torch.from_numpy(old["psfs"]))
     assert back.valid.all()
     assert back.grid == Grid(8, 2.75e-7, 550e-9)
-    assert (back.aperture.shape, back.aperture.orientation) == ("hexagon", 0.1)
+    assert back.aperture.shape == Hexagon(0.1)
     assert (back.readout_noise, back.r0, back.outer_scale, back.n_photons) == (2.0, 0.15, 20.0, 1e5)
     assert back.header == {"OBJECT": "satellite"}
     # the least that such a file had to hold
     needed = ("frames", "centers", "subaperture_diameter", "mask_diameter", "pixel_scale", "wavelength")
     np.savez(tmp_path / "least.npz", **{name: old[name] for name in needed})
     least = Observation.load(tmp_path / "least.npz")
-    assert (least.aperture.shape, least.aperture.orientation) == ("disc", 0.0)
+    assert least.aperture.shape == Disc()
     assert least.readout_noise is None
     for name in needed:
         np.savez(tmp_path / f"no_{name}.npz", **{key: old[key] for key in needed if key != name})
         with pytest.raises(ValueError, match=f"has no {name}"):
             Observation.load(tmp_path / f"no_{name}.npz")
+
+
+def test_obstructed_pupils_of_version_0_1_are_read(tmp_path):
+    """They were discs, with the obstruction beside them."""
+    old = {
+        "frames": np.ones((2, 8, 8)),
+        "pixel_scale": 2.75e-7,
+        "wavelength": 550e-9,
+        "centers": np.zeros((1, 2), dtype=np.float32),
+        "subaperture_diameter": 1.0,
+        "mask_diameter": 1.0,
+        "shape": "disc",
+        "orientation": 0.0,
+        "central_obstruction": 0.25,
+    }
+    np.savez(tmp_path / "old.npz", **old)
+    pupil = Observation.load(tmp_path / "old.npz").aperture
+    assert isinstance(pupil, FullAperture)
+    assert (pupil.central_obstruction, pupil.shape, pupil.centers.dtype) == (0.25, Annulus(0.25), torch.float32)
 
 
 def test_files_of_another_program_are_read(shared_stack):

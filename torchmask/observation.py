@@ -17,12 +17,13 @@ from torch import Tensor
 
 from torchmask.grid import Grid
 from torchmask.io import load_npz, save_npz
-from torchmask.optics.aperture import Aperture, FullAperture, SparseAperture
+from torchmask.optics.aperture import Aperture
 from torchmask.optics.bad_pixels import fill_bad_pixels
+from torchmask.optics.records import aperture_record, read_aperture
 
 _NEEDED_NUMBERS = ("subaperture_diameter", "mask_diameter", "pixel_scale", "wavelength")
 
-_NUMBERS = (*_NEEDED_NUMBERS, "readout_noise", "orientation", "central_obstruction", "r0", "outer_scale", "n_photons")
+_NUMBERS = (*_NEEDED_NUMBERS, "readout_noise", "r0", "outer_scale", "n_photons")
 
 _ARRAYS = ("object", "psfs", "phases", "valid", "errors")
 
@@ -56,6 +57,7 @@ class Observation:
 
     Examples
     --------
+    >>> from torchmask.optics.aperture import SparseAperture
     >>> mask = SparseAperture([[0.0, 0.3], [0.3, -0.2], [-0.3, -0.2]], 0.2, 1.0)
     >>> frames = torch.rand(5, 32, 32)
     >>> observation = Observation(frames, mask, Grid.nyquist(1.0, 550e-9, 32), readout_noise=1.5)
@@ -116,17 +118,12 @@ class Observation:
 
         Raises ValueError if the file exists, its folder does not, or its name does not end in .npz.
         """
-        aperture, grid = self.aperture, self.grid
+        grid = self.grid
         values = {
             "frames": self.frames,
             "pixel_scale": grid.pixel_scale,
             "wavelength": grid.wavelength,
-            "centers": aperture.centers,
-            "subaperture_diameter": aperture.subaperture_diameter,
-            "mask_diameter": aperture.mask_diameter,
-            "shape": aperture.shape,
-            "orientation": aperture.orientation,
-            "central_obstruction": aperture.central_obstruction,
+            **aperture_record(self.aperture),
         }
         optional = {name: getattr(self, name) for name in ("readout_noise", *_ARRAYS, "r0", "outer_scale", "n_photons")}
         if self.header:
@@ -137,8 +134,8 @@ class Observation:
     def load(cls, path: str | Path) -> Observation:
         """Read what `save` wrote, or any .npz file with its keys.
 
-        Of an aperture, `shape`, `orientation` and `central_obstruction` may be missing, of an observation all that may
-        be None. One centred disc is a full pupil of its own diameter, whatever `mask_diameter` says.
+        Of an aperture, the `shape` of the holes may be missing (discs), of an observation all that may be None. One
+        centred disc is a full pupil of its own diameter, whatever `mask_diameter` says.
 
         Raises
         ------
@@ -154,12 +151,10 @@ class Observation:
     @classmethod
     def _from_arrays(cls, stored: dict[str, Any]) -> Observation:
         number = {name: float(stored[name].item()) for name in _NUMBERS if name in stored}
-        centers, diameter = torch.from_numpy(stored["centers"]), number["subaperture_diameter"]
-        shape, orientation = str(stored.get("shape", "disc")), number.get("orientation", 0.0)
-        if len(centers) == 1 and not centers.any() and shape == "disc":
-            aperture = FullAperture(diameter, number.get("central_obstruction", 0.0), dtype=centers.dtype)
-        else:
-            aperture = SparseAperture(centers, diameter, number["mask_diameter"], shape, orientation)
+        aperture = read_aperture(
+            {name: array.item() for name, array in stored.items() if array.size == 1}
+            | {"centers": torch.from_numpy(stored["centers"])}
+        )
         frames = torch.from_numpy(stored["frames"])
         height, width = frames.shape[-2:]
         grid = Grid(height if height == width else (height, width), number["pixel_scale"], number["wavelength"])

@@ -17,7 +17,7 @@ from torchmask.atmosphere.von_karman import (
     von_karman_structure_function,
 )
 from torchmask.optics.aperture import FullAperture, SparseAperture
-from torchmask.optics.zernike import aperture_modes, noll, quadrature
+from torchmask.optics.zernike import aperture_modes, noll
 
 # Variance [rad^2] of the modes over a pupil with (D/r0)^(5/3) = 1, by D/L0: all modes, piston, each tilt, each mode of
 # radial order 2, each of order 3. From the definition, by direct integration.
@@ -191,7 +191,7 @@ def test_tilts_along_and_across_the_baseline():
 def test_cross_covariances_against_the_double_integral(shape, orientation):
     """Two separate holes, all 6 x 6 modes, in the space of positions: there the covariance is smooth."""
     mask = pair(1.6, shape, 0.4, orientation)
-    nodes, weights = quadrature(mask, 24)
+    nodes, weights = mask.shape.quadrature(24, mask.subaperture_diameter)
     modes = weights[:, None] * aperture_modes(mask, nodes, 6)
     distance = torch.cdist(nodes, nodes + mask.centers[1])
     expected = modes.T @ von_karman_covariance(distance, 1.0, 8.0) @ modes
@@ -206,8 +206,8 @@ def test_cross_covariances_against_the_double_integral(shape, orientation):
 )
 def test_variances_of_other_shapes_against_the_double_integral(aperture):
     """In the space of positions the structure function has a cusp, so two sets of nodes and a tolerance to match."""
-    first, w = quadrature(aperture, 20)
-    second, v = quadrature(aperture, 27)
+    first, w = aperture.shape.quadrature(20, aperture.subaperture_diameter)
+    second, v = aperture.shape.quadrature(27, aperture.subaperture_diameter)
     left = w[:, None] * aperture_modes(aperture, first, 6)
     right = v[:, None] * aperture_modes(aperture, second, 6)
     structure = von_karman_structure_function(torch.cdist(first, second), 1.0, 20.0)

@@ -11,7 +11,8 @@ from astropy.io import fits
 
 from torchmask.cli.main import main
 from torchmask.cli.view import view_path
-from torchmask.design.manufacture import load_mask, save_dxf, save_fits, save_json
+from torchmask.design.drawing import save_dxf
+from torchmask.design.manufacture import load_mask, save_fits, save_json
 from torchmask.design.redundancy import analyse_redundancy
 from torchmask.grid import Grid
 from torchmask.io import save_npz
@@ -47,7 +48,7 @@ def test_the_list_has_every_mask_with_its_sizes(capsys):
     lines = {line.split()[0]: line.split() for line in said(capsys, "masks").splitlines() if line}
     for name in catalog.names():
         mask = catalog.entry(name)
-        assert lines[name][1:3] == [f"{mask.n_subapertures}", mask.shape]
+        assert lines[name][1:3] == [f"{mask.n_subapertures}", mask.shape.name]
         assert lines[name][3] == ("-" if mask.hole_diameter is None else f"{mask.hole_diameter:.4g}")
         assert lines[name][4] == ("-" if mask.pupil_diameter is None else f"{mask.pupil_diameter:.4g}")
 

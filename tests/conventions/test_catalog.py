@@ -26,7 +26,7 @@ def test_golay_arrays_stand_on_a_lattice_with_a_row_along_x():
 def test_hexagons_are_turned_by_the_normal_of_a_side():
     """Segments of the JWST have a flat side that faces +y."""
     mask = tm.SparseAperture.from_catalog("jwst_niriss_ami_7")
-    angles = mask.orientation + torch.arange(6, dtype=torch.float64) * math.pi / 3
+    angles = mask.shape.orientation + torch.arange(6, dtype=torch.float64) * math.pi / 3
     assert float((angles - math.pi / 2).abs().min()) < 1e-12
 
 

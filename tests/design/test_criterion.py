@@ -20,7 +20,9 @@ from torchmask.design import overlap
 from torchmask.design.criterion import AsymptoticMSE, wiener_mse
 from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture, SparseAperture
-from torchmask.optics.otf import analytic_otf, hexagon_otf
+from torchmask.optics.otf import analytic_otf
+from torchmask.optics.round import disc_constants, disc_patches
+from torchmask.optics.shapes import Disc
 from torchmask.spectra import NoisePSD, PowerLawPSD
 
 WAVELENGTH = 550e-9
@@ -40,13 +42,13 @@ def mask_of(centers: Tensor, shape: str = "disc", orientation: float = 0.3) -> S
 
 
 def squared_otf(mask: SparseAperture, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """|h|^2 at the displacements x, y [m]: the textbook formula, and the hexagon's in other coordinates."""
-    if mask.shape == "hexagon":
-        shift = torch.tensor(np.stack(np.broadcast_arrays(x, y), -1)) / mask.subaperture_diameter
-        otf = hexagon_otf(shift, mask.orientation).numpy()
-    else:
+    """|h|^2 at the displacements x, y [m]: the textbook formula, or the overlap of polygons in general."""
+    if mask.shape == Disc():
         rho = np.minimum(np.hypot(x, y) / mask.subaperture_diameter, 1)
         otf = 2 / np.pi * (np.arccos(rho) - rho * np.sqrt(1 - rho**2))
+    else:
+        shift = torch.tensor(np.stack(np.broadcast_arrays(x, y), -1))
+        otf = mask.shape.otf(shift, mask.subaperture_diameter).numpy()
     return (otf / mask.n_subapertures) ** 2
 
 
@@ -103,7 +105,7 @@ def psds(kind: str, shape: tuple[int, int], grid: Grid) -> tuple[Tensor, Tensor]
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-@pytest.mark.parametrize("shape", ["disc", "hexagon"])
+@pytest.mark.parametrize("shape", ["disc", "hexagon", "square"])
 @pytest.mark.parametrize("kind", ["power law", "tensors"])
 def test_equals_the_loop_over_its_equation(layout: str, shape: str, kind: str) -> None:
     mask = mask_of(layouts()[layout], shape)
@@ -115,14 +117,13 @@ def test_equals_the_loop_over_its_equation(layout: str, shape: str, kind: str) -
         assert value == pytest.approx(loop_mse(mask, grid, s_o, s_n, 5), rel=2e-12)
 
 
-@pytest.mark.parametrize("shape", ["disc", "hexagon"])
+@pytest.mark.parametrize("shape", ["disc", "hexagon", "square"])
 @pytest.mark.parametrize("n", [1, 2, 3])
 def test_largest_subapertures_fill_the_torus(shape: str, n: int) -> None:
     """c = 1/2: the OTF of one sub-aperture touches itself around the torus."""
     for n_pixels in (16, 17):
-        outer = 1.0 if shape == "disc" else 2 / math.sqrt(3)
-        grid = Grid.nyquist(outer * DIAMETER, WAVELENGTH, n_pixels)
         mask = mask_of((uniform(n, 2) - 0.5), shape)
+        grid = Grid.nyquist(mask.outer_diameter, WAVELENGTH, n_pixels)
         s_o, s_n = psds("tensors", grid.shape, grid)
         value = float(AsymptoticMSE(grid, s_o, s_n, 3)(mask))
         assert value == pytest.approx(loop_mse(mask, grid, s_o, s_n, 3), rel=2e-12)
@@ -176,15 +177,14 @@ def test_series_of_the_disc_is_as_exact_as_it_says() -> None:
     for dtype, tolerance in ((torch.float64, 5e-13), (torch.float32, 5e-8)):
         x = rho.to(dtype)[None, :]
         y = torch.zeros(1, 1, dtype=dtype)
-        constants = overlap.disc_constants(dtype, torch.device("cpu"))
-        value, _ = overlap.disc_patches(x, y, constants, differentiate=False)
+        value, _ = disc_patches(x, y, False, disc_constants(dtype, torch.device("cpu")))
         # rounding: of 1 - rho, thrice, and some operations more
         rounding = torch.finfo(dtype).eps * (10 + 3 / v)
         assert bool((abs(value[0].double().numpy() / exact**2 - 1) < tolerance + rounding).all())
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-@pytest.mark.parametrize("shape", ["disc", "hexagon"])
+@pytest.mark.parametrize("shape", ["disc", "hexagon", "square"])
 @pytest.mark.parametrize("kind", ["power law", "tensors"])
 def test_gradient_passes_gradcheck(layout: str, shape: str, kind: str) -> None:
     """Also where the formulas are singular: the kink of a cone's tip has derivative 0, as its central difference."""

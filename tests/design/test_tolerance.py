@@ -137,9 +137,7 @@ def test_small_errors_follow_the_gradient_of_the_criterion(seeded, name, dtype):
     criterion = AsymptoticMSE(Grid.nyquist(1.0, 550e-9, 96), PowerLawPSD(1.5, 1e7), NoisePSD(1e7), n_frames=20)
     criterion = criterion.to(dtype)
     mask = SparseAperture.from_catalog(name, 1.0, 0.15, dtype=dtype)
-    free = SparseAperture(
-        nn.Parameter(mask.centers.clone()), mask.subaperture_diameter, 1.0, mask.shape, mask.orientation
-    )
+    free = mask.replace(centers=nn.Parameter(mask.centers.clone()))
     value = criterion(free)
     value.backward()
     assert isinstance(free.centers.grad, torch.Tensor)

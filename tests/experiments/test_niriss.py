@@ -72,7 +72,7 @@ def observed(tmp_path_factory, write):
     mask = SparseAperture.from_catalog(niriss_pose.MASK, mirrored=True)
     turn = math.radians(0.7)
     rotation = torch.tensor([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]], dtype=torch.float64)
-    mask = SparseAperture(mask.centers @ rotation.T, 0.8, mask.mask_diameter, "hexagon", mask.orientation + turn)
+    mask = mask.replace(centers=mask.centers @ rotation.T, shape=mask.shape.turned(turn))
     angle = math.radians(100.0)
     companion = np.array([0.03, 0.35 * ARCSEC * math.sin(angle), 0.35 * ARCSEC * math.cos(angle)])
     write(folder, "pair", companion, mask, 2, seed=10)

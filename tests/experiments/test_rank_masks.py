@@ -10,6 +10,7 @@ from torchmask.design.constraints import InsideDisc, NoOverlap
 from torchmask.design.manufacture import load_mask
 from torchmask.optics import catalog
 from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.shapes import Disc, Hexagon
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +25,7 @@ def test_the_largest_fill_factor_is_where_holes_touch(name):
     entry = catalog.entry(name)
     largest = rank_masks.largest_fill_factor(entry)
     for factor, feasible in ((1 - 1e-9, True), (1 + 1e-6, False)):
-        fill = largest * factor * rank_masks.SHAPE_AREA["disc"] / rank_masks.SHAPE_AREA[entry.shape]
+        fill = largest * factor * (math.pi / 4) / entry.shape.area(1.0)
         mask = SparseAperture.from_catalog(name, 1.0, fill)
         assert bool((NoOverlap().margins(mask) >= 0).all()) == feasible
         assert bool((InsideDisc().margins(mask) >= -1e-12).all())
@@ -36,7 +37,7 @@ def test_all_ranked_masks_collect_the_same_light():
     assert not set(known) & set(crowded)
     for name, mask in known.items():
         assert mask.area == pytest.approx(0.15 * math.pi / 4, rel=1e-12), name
-    assert {mask.shape for mask in known.values()} == {"disc", "hexagon"}
+    assert {type(mask.shape) for mask in known.values()} == {Disc, Hexagon}
 
 
 def test_the_table_is_in_order_and_the_same_in_all_files(finished):

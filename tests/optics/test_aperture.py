@@ -9,6 +9,7 @@ from torch import nn
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture, FullAperture, SparseAperture
+from torchmask.optics.shapes import Annulus, Disc, Hexagon
 
 WAVELENGTH = 550e-9
 GRID = Grid.nyquist(1.0, WAVELENGTH, 64)
@@ -132,6 +133,37 @@ def test_extent_reaches_from_outer_edge_to_outer_edge():
     assert FullAperture(0.7).extent == 0.7
 
 
+def test_reach_is_the_distance_of_the_outermost_edge():
+    assert SparseAperture([[0.1, 0.0], [0.3, 0.4]], 0.1, 1.0).reach == pytest.approx(0.55, rel=1e-15)
+    hexagon = SparseAperture([[0.3, 0.0]], 0.1, 1.0, "hexagon", math.pi / 6)  # a corner on +x
+    assert hexagon.reach == pytest.approx(0.3 + 0.1 / math.sqrt(3), rel=1e-15)
+
+
+def test_shapes_have_names_and_are_objects():
+    named, given = SparseAperture(TRIANGLE, 0.1, 1.0, "hexagon", 0.2), SparseAperture(TRIANGLE, 0.1, 1.0, Hexagon(0.2))
+    assert named.shape == given.shape == Hexagon(0.2)
+    assert SparseAperture(TRIANGLE, 0.1, 1.0).shape == Disc()
+    assert SparseAperture(TRIANGLE, 0.1, 1.0, "disc", 0.2).shape == Disc()  # a disc has no orientation
+    assert (FullAperture(1.0).shape, FullAperture(1.0, 0.2).shape) == (Disc(), Annulus(0.2))
+
+
+def test_a_full_pupil_is_a_single_opening():
+    assert FullAperture(1.0).is_full
+    assert SparseAperture([[0.1, 0.0]], 0.1, 1.0).is_full
+    assert not SparseAperture(TRIANGLE, 0.1, 1.0).is_full
+
+
+def test_the_same_mask_but_for_what_is_replaced():
+    mask = SparseAperture(TRIANGLE, 0.1, 1.0, "hexagon", 0.2)
+    other = torch.zeros(4, 3, 2)
+    for change in ({"centers": other}, {"subaperture_diameter": 0.2}, {"mask_diameter": 2.0}, {"shape": Disc()}):
+        replaced = mask.replace(**change)
+        for name in ("centers", "subaperture_diameter", "mask_diameter", "shape"):
+            assert getattr(replaced, name) is change.get(name, getattr(mask, name)), name
+    moving = nn.Parameter(mask.centers.clone())
+    assert mask.replace(moving).centers is moving
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_dtype_is_that_of_the_centers(dtype):
     aperture = SparseAperture(torch.tensor(TRIANGLE, dtype=dtype), 0.2, 1.0)
@@ -165,8 +197,10 @@ def test_state_dict_round_trip():
         (([[math.nan, 0.0]], 0.1, 1.0), "finite"),
         (([[0.0, 0.0]], -0.1, 1.0), "subaperture_diameter"),
         (([[0.0, 0.0]], 0.1, math.inf), "mask_diameter"),
-        (([[0.0, 0.0]], 0.1, 1.0, "square"), "disc, hexagon"),
+        (([[0.0, 0.0]], 0.1, 1.0, "star"), "known shapes are .*hexagon"),
+        (([[0.0, 0.0]], 0.1, 1.0, "annulus"), "needs obstruction"),
         (([[0.0, 0.0]], 0.1, 1.0, "hexagon", math.nan), "orientation"),
+        (([[0.0, 0.0]], 0.1, 1.0, Hexagon(0.1), 0.1), "has its own"),
     ],
 )
 def test_bad_masks_are_refused(arguments, message):

@@ -10,7 +10,7 @@ from torch import nn
 from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.psf import PSF, psf_from_samples
-from torchmask.optics.zernike import ZernikePhase, aperture_modes, noll, quadrature, zernike, zernike_basis
+from torchmask.optics.zernike import ZernikePhase, aperture_modes, noll, zernike, zernike_basis
 
 WAVELENGTH = 550e-9
 
@@ -108,7 +108,7 @@ def test_mean_square_of_the_phase_is_the_sum_of_squares(coefficients, obstructio
     """Parseval, by a quadrature finer than the one the modes were made with."""
     aperture = one_hole(shape, obstruction if shape == "disc" else 0.0, 0.3)
     a = torch.tensor(coefficients, dtype=torch.float64)
-    nodes, weights = quadrature(aperture, 40)
+    nodes, weights = aperture.shape.quadrature(40, aperture.subaperture_diameter)
     phase = aperture_modes(aperture, nodes, len(a)) @ a
     assert float((weights * phase**2).sum()) == pytest.approx(float((a**2).sum()), rel=1e-10, abs=1e-12)
 
@@ -119,16 +119,16 @@ def test_mean_square_of_the_phase_is_the_sum_of_squares(coefficients, obstructio
 def test_quadrature_knows_the_moments():
     """Means of x^2 and of r^4: (1 + e^2) R^2 / 4 and (1 + e^2 + e^4) R^4 / 3 on a ring, (5/24) R^2 on a hexagon."""
     for obstruction in (0.0, 0.3):
-        nodes, weights = quadrature(FullAperture(2.0, obstruction), 4)
+        nodes, weights = FullAperture(2.0, obstruction).shape.quadrature(4, 2.0)
         e2 = obstruction**2
         assert float(weights.sum()) == pytest.approx(1)
         assert float((weights * nodes[:, 0] ** 2).sum()) == pytest.approx((1 + e2) / 4)
         assert float((weights * (nodes**2).sum(-1) ** 2).sum()) == pytest.approx((1 + e2 + e2**2) / 3)
     hexagon = one_hole("hexagon", diameter=math.sqrt(3))  # circumradius 1
-    nodes, weights = quadrature(hexagon, 4)
+    nodes, weights = hexagon.shape.quadrature(4, hexagon.subaperture_diameter)
     assert float((weights * nodes[:, 0] ** 2).sum()) == pytest.approx(5 / 24)
     # All nodes lie within the six sides, whose normals point along the orientation.
-    angle = hexagon.orientation + torch.arange(6, dtype=torch.float64) * math.pi / 3
+    angle = hexagon.shape.orientation + torch.arange(6, dtype=torch.float64) * math.pi / 3
     assert float((nodes @ torch.stack([angle.cos(), angle.sin()])).max()) < math.sqrt(3) / 2
 
 
@@ -292,6 +292,6 @@ def test_coefficients_must_fit_the_mask():
 
 
 def test_a_thin_ring_has_few_modes():
-    with pytest.raises(ValueError, match=r"66 modes are not independent .* 0\.999"):
+    with pytest.raises(ValueError, match=r"66 modes are not independent .*0\.999"):
         aperture_modes(FullAperture(1.0, 0.999), torch.zeros(1, 2, dtype=torch.float64), 66)
     assert aperture_modes(FullAperture(1.0, 0.999), torch.zeros(1, 2, dtype=torch.float64), 6).shape == (1, 6)

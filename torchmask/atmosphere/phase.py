@@ -15,7 +15,7 @@ from torchmask.atmosphere.endless import Screen, ScreenWindow
 from torchmask.atmosphere.layers import Layers, Vector
 from torchmask.atmosphere.screens import draw_seed, frozen_flow, phase_screens, require_count
 from torchmask.atmosphere.von_karman import require_turbulence
-from torchmask.optics.aperture import PupilSamples
+from torchmask.optics.pupil import PupilSamples
 
 
 class TurbulencePhase(nn.Module):

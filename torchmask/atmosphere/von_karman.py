@@ -14,8 +14,8 @@ import torch
 from scipy import special
 from torch import Tensor
 
-from torchmask.optics.aperture import Aperture
-from torchmask.optics.zernike import aperture_modes, noll, quadrature
+from torchmask.optics.pupil import Aperture
+from torchmask.optics.zernike import aperture_modes, noll
 
 STRUCTURE_CONSTANT = 2 * (24 / 5 * math.gamma(6 / 5)) ** (5 / 6)  # 6.883877
 PSD_CONSTANT = STRUCTURE_CONSTANT * math.gamma(11 / 6) ** 2 * math.sin(5 * math.pi / 6) / (2 * math.pi ** (11 / 3))
@@ -126,7 +126,7 @@ def modal_covariance(aperture: Aperture, n_modes: int, r0: float, outer_scale: f
         )
     centers = aperture.centers.detach().cpu().double()
     bend = math.pi * aperture.outer_diameter / outer_scale + 2 * noll(n_modes)[0]
-    shared, highest = _SHARED + bend, (_HIGHEST + bend) / (1 - aperture.central_obstruction)  # rings have finer modes
+    shared, highest = _SHARED + bend, (_HIGHEST + bend) / aperture.shape.fineness
     total = _gram(aperture, n_modes, r0, outer_scale, centers, 0.0, shared)
     own = _gram(aperture, n_modes, r0, outer_scale, torch.zeros_like(centers[:1]), shared, highest)
     total = total + torch.kron(torch.eye(len(centers), dtype=own.dtype, device=own.device), own)
@@ -138,14 +138,14 @@ def _gram(
 ) -> Tensor:
     """What frequencies `start` <= pi |f| outer_diameter < `stop` add to the covariance of holes at `places` (N, 2)."""
     order, diameter = noll(n_modes)[0], aperture.outer_diameter
-    points, weights = quadrature(aperture, math.ceil(stop) + order + 16)
+    points, weights = aperture.shape.quadrature(math.ceil(stop) + order + 16, aperture.subaperture_diameter)
     modes = weights[:, None] * aperture_modes(aperture, points, n_modes)  # (Q, J)
     reach = float(torch.cdist(places, places).max()) + diameter
     total = modes.new_zeros(len(places) * n_modes, len(places) * n_modes)
     for frequency, area in _panels(start / (math.pi * diameter), stop / (math.pi * diameter), outer_scale, reach):
         turns = math.pi * float(frequency[-1])
         n_angles = math.ceil(turns * reach) + 2 * order + 24  # on half a turn: the other half is the conjugate
-        n_known = math.ceil(turns * diameter) + order + 20 if aperture.shape == "hexagon" else order + 2
+        n_known = order + 2 if aperture.shape.is_round else math.ceil(turns * diameter) + order + 20
         transform = _mode_transforms(points, modes, frequency, n_known, n_angles)  # (R, A, J)
         weight = 2 * math.pi / n_angles * area * von_karman_psd(frequency, r0, outer_scale)
         transform = weight.sqrt()[:, None, None] * transform
@@ -159,7 +159,7 @@ def _mode_transforms(points: Tensor, modes: Tensor, frequency: Tensor, n_known: 
     """Fourier transforms of `modes` (Q, J) at `frequency` (R,) and `n_angles` angles on half a turn: (R, A, J).
 
     In angle they are trigonometric polynomials: evaluated at `n_known` angles, they are interpolated to the many that a
-    baseline needs. Discs need no more than the azimuthal order of the modes.
+    baseline needs. Round shapes need no more than the azimuthal order of the modes.
     """
     half = _phasor(frequency[:, None, None] * (_directions(n_known) @ points.T)) @ modes.to(torch.complex128)
     series = torch.fft.fft(torch.cat([half, half.conj()], dim=1), dim=1, norm="forward")

@@ -15,7 +15,8 @@ from torchmask.cli.run import new_run
 from torchmask.design.constraint_base import Constraint, project
 from torchmask.design.constraints import InsideDisc, KeepOutDisc, KeepOutSegment, MinimumGap, NoOverlap
 from torchmask.design.criterion import AsymptoticMSE
-from torchmask.design.manufacture import save_json, save_svg
+from torchmask.design.drawing import save_svg
+from torchmask.design.manufacture import save_json
 from torchmask.design.redundancy import analyse_redundancy
 from torchmask.design.search import SearchResult, search_mask
 from torchmask.grid import Grid

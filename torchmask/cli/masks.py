@@ -10,7 +10,8 @@ from pathlib import Path
 import tyro
 
 from torchmask.cli.options import DebugOptions
-from torchmask.design.manufacture import save_dxf, save_fits, save_json, save_svg
+from torchmask.design.drawing import save_dxf, save_svg
+from torchmask.design.manufacture import save_fits, save_json
 from torchmask.design.redundancy import analyse_redundancy
 from torchmask.io import atomic_write
 from torchmask.optics import catalog
@@ -53,7 +54,7 @@ def listing() -> str:
         mask = catalog.entry(name)
         hole, pupil = ("-" if size is None else f"{size:.4g}" for size in (mask.hole_diameter, mask.pupil_diameter))
         note = textwrap.shorten(mask.note, 60, placeholder=" ...")
-        rows.append((name, f"{mask.n_subapertures}", mask.shape, hole, pupil, note))
+        rows.append((name, f"{mask.n_subapertures}", mask.shape.name, hole, pupil, note))
     widths = [max(len(row[column]) for row in rows) for column in range(5)]
     align = ("<", ">", "<", ">", ">")
     lines = [
@@ -82,9 +83,8 @@ def show(name: str, options: Options) -> None:
 
 def describe(aperture: SparseAperture, mask: catalog.CatalogEntry | None = None) -> str:
     """Size, holes and baselines of a mask, and what the catalogue says of it."""
-    what = "discs" if aperture.shape == "disc" else "hexagons (flat to flat)"
     lines = [
-        f"{'mask' if mask is None else mask.name}: {aperture.n_subapertures} {what} of "
+        f"{'mask' if mask is None else mask.name}: {aperture.n_subapertures} {aperture.shape.plural} of "
         f"{aperture.subaperture_diameter:.4g} m in {aperture.mask_diameter:.4g} m, fill factor "
         f"{aperture.fill_factor:.4g}",
     ]

@@ -26,13 +26,6 @@ class Infeasible(ValueError):
     """No mask obeys the rules, or none was found."""
 
 
-def with_centers(aperture: SparseAperture, centers: Tensor) -> SparseAperture:
-    """The same holes elsewhere."""
-    return SparseAperture(
-        centers, aperture.subaperture_diameter, aperture.mask_diameter, aperture.shape, aperture.orientation
-    )
-
-
 class Constraint(ABC):
     """A rule on the positions of the holes."""
 
@@ -164,15 +157,15 @@ def project(aperture: SparseAperture, constraints: Sequence[Constraint]) -> Spar
     """
     require_constraints(constraints)
     centers = aperture.centers.detach()
-    double = with_centers(aperture, centers.double().cpu())
+    double = aperture.replace(centers=centers.double().cpu())
     subspace = Subspace(aperture.n_subapertures, constraints)
     # What is returned is rounded to the dtype of the aperture, and must still hold.
     slack = aperture.mask_diameter * (1e-12 if centers.dtype == torch.float64 else 8 * torch.finfo(centers.dtype).eps)
     masks = [
-        _project_one(with_centers(double, one), subspace, constraints, slack)
+        _project_one(double.replace(centers=one), subspace, constraints, slack)
         for one in double.centers.reshape(-1, *centers.shape[-2:])
     ]
-    return with_centers(aperture, torch.stack(masks).reshape(centers.shape).to(centers))
+    return aperture.replace(centers=torch.stack(masks).reshape(centers.shape).to(centers))
 
 
 def _project_one(
@@ -242,7 +235,7 @@ def _margin_function(aperture: SparseAperture, subspace: Subspace, constraints: 
     scale = aperture.mask_diameter
 
     def margins(z: Tensor) -> Tensor:
-        return all_margins(with_centers(aperture, subspace.centers(z * scale)), constraints) / scale
+        return all_margins(aperture.replace(centers=subspace.centers(z * scale)), constraints) / scale
 
     def values(z: Array) -> Array:
         with torch.no_grad():

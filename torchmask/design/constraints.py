@@ -16,23 +16,7 @@ from torch import Tensor
 
 from torchmask.design.constraint_base import Constraint, Inequality, LinearEquality, require_constraints
 from torchmask.optics.aperture import SparseAperture
-
-
-def _length(vector: Tensor) -> Tensor:
-    """Length along the last axis; at zero, where any direction would do, the gradient is along the first axis."""
-    zero = (vector == 0).all(-1)
-    x, y = vector.unbind(-1)
-    return torch.where(zero, x, torch.hypot(torch.where(zero, 1.0, x), y))
-
-
-def _outer_radius(aperture: SparseAperture) -> float:
-    return aperture.subaperture_diameter / (2 if aperture.shape == "disc" else math.sqrt(3))
-
-
-def _directions(aperture: SparseAperture, count: int, first: float) -> Tensor:
-    """Unit vectors (count, 2), every 60 degrees from the angle `first` [rad]."""
-    angles = aperture.orientation + first + torch.arange(count, dtype=torch.float64) * math.pi / 3
-    return torch.stack([angles.cos(), angles.sin()], dim=-1).to(aperture.centers)
+from torchmask.optics.shape_base import safe_length
 
 
 @dataclass(frozen=True)
@@ -40,12 +24,7 @@ class InsideDisc(Inequality):
     """Every hole lies wholly inside the disc of diameter `mask_diameter`. N margins, one a hole."""
 
     def margins(self, aperture: SparseAperture) -> Tensor:
-        centers = aperture.centers
-        if aperture.shape == "disc":
-            radius = (aperture.mask_diameter - aperture.subaperture_diameter) / 2
-            return radius - torch.linalg.vector_norm(centers, dim=-1)
-        corners = centers[..., None, :] + _outer_radius(aperture) * _directions(aperture, 6, math.pi / 6)
-        return aperture.mask_diameter / 2 - torch.linalg.vector_norm(corners, dim=-1).amax(-1)
+        return aperture.shape.clearance(aperture.centers, aperture.subaperture_diameter, aperture.mask_diameter)
 
 
 @dataclass(frozen=True)
@@ -69,12 +48,7 @@ class MinimumGap(Inequality):
             aperture.centers.device
         )
         difference = aperture.centers[..., first, :] - aperture.centers[..., second, :]
-        if aperture.shape == "disc":
-            distance = _length(difference)
-        else:
-            # `max`, not `amax`: of equal ones it takes one, so that the gradient of coincident holes is not zero
-            distance = (difference @ _directions(aperture, 6, 0.0).T).max(-1).values
-        return distance - (aperture.subaperture_diameter + self.gap)
+        return aperture.shape.separation(difference) - (aperture.subaperture_diameter + self.gap)
 
 
 class NoOverlap(MinimumGap):
@@ -110,7 +84,7 @@ class KeepOutDisc(Inequality):
 
     def margins(self, aperture: SparseAperture) -> Tensor:
         difference = aperture.centers - aperture.centers.new_tensor(self.center)
-        return _length(difference) - self.diameter / 2 - _outer_radius(aperture)
+        return safe_length(difference) - self.diameter / 2 - aperture.outer_diameter / 2
 
 
 @dataclass(frozen=True)
@@ -150,7 +124,7 @@ class KeepOutSegment(Inequality):
         position = offset @ along
         across = offset[..., 1] * along[0] - offset[..., 0] * along[1]
         difference = torch.stack([across, position - position.clamp(min=0).minimum(length)], dim=-1)
-        return _length(difference) - self.width / 2 - _outer_radius(aperture)
+        return safe_length(difference) - self.width / 2 - aperture.outer_diameter / 2
 
 
 @dataclass(frozen=True)
@@ -182,7 +156,7 @@ class NonRedundancy(Inequality):
             ],
             dim=-2,
         )
-        return _length(pairs) - self.distance
+        return safe_length(pairs) - self.distance
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchmask.design.overlap import BaselineMSE, Geometry
+from torchmask.design.overlap import Geometry, baseline_mse
 from torchmask.grid import Grid
-from torchmask.optics.aperture import Aperture, FullAperture
+from torchmask.optics.aperture import FullAperture
+from torchmask.optics.pupil import Aperture
 from torchmask.spectra import PSD, evaluate_psd, resample_psd
 
 
@@ -47,8 +48,9 @@ class AsymptoticMSE(nn.Module):
     `forward(aperture)` returns (...), one value for each mask of the population `aperture.centers` (..., N, 2), in
     the dtype of the centres (float64 or float32) and differentiable once in them. Cost grows with the G^2 pixels of
     the grid and the 2 N^2 c^2 G^2 of the patches, c = diameter of a sub-aperture / grid.period; a large population is
-    treated in chunks, so that memory does not. It raises ValueError for an aperture without closed form (full or
-    obstructed) and for c > 1/2. On CUDA equal calls may differ by rounding (atomic sums).
+    treated in chunks, so that memory does not. It raises ValueError for a full pupil and for c > 1/2. Under
+    `torch.func.vmap` over centres, what is mapped over is one more axis of the population. On CUDA equal calls may
+    differ by rounding (atomic sums).
 
     Examples
     --------
@@ -110,7 +112,7 @@ class AsymptoticMSE(nn.Module):
         geometry = self._geometry(aperture)
         flat = centers.reshape(math.prod(centers.shape[:-2]), *centers.shape[-2:])
         weight, ratio = self._weight.to(centers.dtype), self._ratio.to(centers.dtype)
-        return BaselineMSE.apply(flat, weight, ratio, geometry).reshape(centers.shape[:-2])  # type: ignore[no-any-return]
+        return baseline_mse(flat, weight, ratio, geometry).reshape(centers.shape[:-2])
 
     def relative(self, aperture: Aperture) -> Tensor:
         """MSE_a over the mean of the object's PSD, (...): 0 is a perfect restoration, 1 none at all."""
@@ -137,25 +139,25 @@ class AsymptoticMSE(nn.Module):
         return other.to(self.object_psd.device, self.object_psd.dtype)
 
     def _geometry(self, aperture: Aperture) -> Geometry:
-        if isinstance(aperture, FullAperture) or aperture.central_obstruction > 0:
+        if isinstance(aperture, FullAperture):
             raise ValueError(
-                "MSE_a is defined for masks of clear sub-apertures (SparseAperture): a full or obstructed pupil has "
-                "aberrations that a piston per sub-aperture does not describe; take wiener_mse of drawn OTFs instead"
+                "MSE_a is defined for masks (SparseAperture): a full pupil has aberrations that a piston per "
+                "sub-aperture does not describe; take wiener_mse of drawn OTFs instead"
             )
-        centers, diameter = aperture.centers, aperture.subaperture_diameter
+        centers = aperture.centers
         if centers.dtype not in (torch.float32, torch.float64) or centers.device != self.object_psd.device:
             raise ValueError(
                 f"the centres are {centers.dtype} on {centers.device}, the criterion is on {self.object_psd.device}: "
                 "both must be on one device, and the centres float32 or float64"
             )
-        reach = diameter * (1.0 if aperture.shape == "disc" else 2 / math.sqrt(3))
+        reach = aperture.outer_diameter
         if reach > 0.5 * self.grid.period * (1 + 1e-9):
             needed = (1 - 1e-6) * self.grid.wavelength / (2 * reach)
             raise ValueError(
                 f"the OTF of a sub-aperture reaches {self.grid.cutoff(reach):.3f} cycles/pixel, above 1/2, and "
                 f"overlaps itself: pixel_scale must be at most {needed:.7g} rad"
             )
-        return Geometry(self.grid.shape, self.grid.period, aperture.shape, diameter, aperture.orientation, reach)
+        return Geometry(self.grid.shape, self.grid.period, aperture.shape, aperture.subaperture_diameter, reach)
 
     def extra_repr(self) -> str:
         return f"grid={self.grid}, n_frames={self.n_frames}"

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
-from torchmask.design.constraint_base import Constraint, Subspace, all_margins, project, with_centers
+from torchmask.design.constraint_base import Constraint, Subspace, all_margins, project
 from torchmask.optics.aperture import SparseAperture
 
 
@@ -44,7 +43,8 @@ class Holes:
     def __init__(self, template: SparseAperture, constraints: Sequence[Constraint]) -> None:
         self.template = template
         self.constraints: tuple[Constraint, ...] = tuple(constraints)
-        self.radius: float = center_radius(template) / template.mask_diameter
+        size = template.subaperture_diameter, template.mask_diameter
+        self.radius: float = template.shape.center_radius(*size) / template.mask_diameter
         self.subspace: Subspace = Subspace(template.n_subapertures, constraints, template.centers)
         pinned = self.subspace.origin.unflatten(-1, (-1, 2)) / template.mask_diameter
         self.subspace.origin = self._unroll(pinned, 1.0).flatten(-2)
@@ -61,7 +61,7 @@ class Holes:
         squared = (plane**2).sum(-1, keepdim=True)
         length = torch.where(squared > 0, squared, 1.0).sqrt() * (squared > 0)
         centers = plane * torch.sinc(length / (torch.pi * self.radius))
-        return with_centers(self.template, centers * self.template.mask_diameter)
+        return self.template.replace(centers=centers * self.template.mask_diameter)
 
     def coordinates(self, centers: Tensor) -> Tensor:
         """The coordinates of masks near `centers` (..., N, 2) [m] that obey the equalities; off the rim by 1e-3."""
@@ -78,15 +78,6 @@ class Holes:
     def feasible(self, x: Tensor) -> SparseAperture:
         """The mask nearest to x (F,) that obeys all rules, to rounding. Raises `Infeasible` if none is found."""
         return project(self.aperture(x.detach()), self.constraints)
-
-
-def center_radius(aperture: SparseAperture) -> float:
-    """Radius of the disc outside of which no centre can lie if the hole is to be inside the mask [m]."""
-    diameter = aperture.subaperture_diameter
-    if aperture.shape == "disc":
-        return (aperture.mask_diameter - diameter) / 2
-    # a hexagon that shows a side to the rim reaches farthest
-    return math.sqrt(max(0.0, aperture.mask_diameter**2 / 4 - diameter**2 / 12)) - diameter / 2
 
 
 class Evaluation(NamedTuple):

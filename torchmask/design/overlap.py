@@ -12,18 +12,16 @@ cache: it has the size of the centres, and nothing else needs to be kept for a b
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import torch
-from numpy.polynomial import Chebyshev, Polynomial
 from torch import Tensor
+
+from torchmask.optics.shape_base import Patches, Shape
 
 # pixels of patches in work at a time: what a cache holds, and what amortises the launches of kernels
 _CHUNK = {"cpu": 2**18, "cuda": 2**24}
-
-Pullback = Callable[[Tensor], Tensor]
 
 
 class Geometry(NamedTuple):
@@ -31,107 +29,9 @@ class Geometry(NamedTuple):
 
     grid: tuple[int, int]  # rows and columns of the frequency plane
     period: float  # length in the pupil of one cycle per pixel [m]
-    shape: str
+    shape: Shape
     diameter: float  # of a sub-aperture [m]
-    orientation: float
     reach: float  # radius of the support of a sub-aperture's OTF [m], at most half the period
-
-
-def _disc_series(degree: int) -> list[float]:
-    """Coefficients of S in OTF = v^(3/2) S(v), v = 1 - x, x in [0, 1] the distance in units of the cut-off.
-
-    OTF = (4/pi) integral_x^1 sqrt(1 - t^2) dt; expanding sqrt(1 - w/2) under the integral, w = 1 - t, gives the
-    power series 4 sqrt(2)/pi sum_k binom(1/2, k) (-1/2)^k v^k / (k + 3/2), which is economised on [0, 1].
-    """
-    terms, binomial = [], 4 * math.sqrt(2) / math.pi
-    for k in range(60):
-        terms.append(binomial / (k + 1.5))
-        binomial *= (k - 0.5) / (2 * (k + 1))
-    return Chebyshev.interpolate(Polynomial(terms), degree, domain=[0, 1]).convert(kind=Polynomial).coef.tolist()
-
-
-# OTF^2 has relative errors of 3e-13 and 5e-8 (float32) even at the edge, where the textbook form loses its
-# digits: acos x - x sqrt(1 - x^2) is a small difference there.
-_DISC_SERIES = {torch.float64: _disc_series(12), torch.float32: _disc_series(6)}
-
-
-def disc_constants(dtype: torch.dtype, device: torch.device) -> list[Tensor]:
-    """The coefficients of S and then 1, as the scalar tensors that addcmul takes."""
-    return list(torch.tensor([*_DISC_SERIES[dtype], 1.0], dtype=dtype, device=device).unbind())
-
-
-def disc_patches(x: Tensor, y: Tensor, constants: list[Tensor], differentiate: bool) -> tuple[Tensor, Pullback]:
-    """OTF^2 of a disc at the pixels x (..., 1, K) by y (..., K, 1), in units of the cut-off: (..., K, K).
-
-    `constants` are the `disc_constants`. The pullback takes the derivatives of a loss by the patches, (..., K, K), to
-    those by the common shift of each patch's (x, y), (..., 2); it may be called once, and only if `differentiate`.
-    """
-    # All arrays in one allocation: the heap keeps one block for the next call where it would return several.
-    work = x.new_empty(4 if differentiate else 3, *x.shape[:-2], y.shape[-2], x.shape[-1])
-    v, inverse, a = work[0], work[1], work[2]
-    *series, one = constants
-    tiny = torch.finfo(x.dtype).tiny * 1e3  # gives distance 0 a finite inverse, which x = y = 0 then multiplies
-    torch.add(x * x, y * y + tiny, out=v)
-    torch.rsqrt(v, out=inverse)  # twice as fast as sqrt
-    torch.addcmul(one, v, inverse, value=-1, out=v)
-    v.clamp_(min=0)  # 1 - distance, and 0 outside
-    torch.addcmul(series[-2], v, series[-1], out=a)
-    for c in series[-3::-1]:
-        torch.addcmul(c, v, a, out=a)
-    a.mul_(v)
-    value = work[-1]
-    torch.mul(a, a, out=value)
-    value.mul_(v)
-
-    def pullback(grad: Tensor) -> Tensor:
-        # d OTF^2 / d distance = -(8 / pi) a v sqrt(2 - v); the gradient points along (x, y)
-        slope = inverse.mul_(a).mul_(v)
-        torch.sub(2 * one, v, out=v)
-        torch.rsqrt(v, out=a)
-        slope.mul_(a.mul_(v)).mul_(grad)
-        along_x, along_y = slope.sum(-2).mul_(x[..., 0, :]).sum(-1), slope.sum(-1).mul_(y[..., 0]).sum(-1)
-        return torch.stack([along_x, along_y], dim=-1).mul_(-8 / math.pi)
-
-    return value, pullback
-
-
-def hexagon_patches(x: Tensor, y: Tensor, normals: Tensor, differentiate: bool) -> tuple[Tensor, Pullback]:
-    """OTF^2 of a regular hexagon, as `disc_patches`, x and y in units of its flat-to-flat width.
-
-    `normals` (3, 2) are the unit normals of its sides, 60 degrees apart.
-
-    The overlap of two hexagons is a hexagon of half-widths w_k = (1 - |n_k . shift|) / 2 along the normals n_k of the
-    sides. Of the three |n_k . shift| the largest is the sum of the others, M = p + m, p >= m: its area is then
-    (1 - p) (1 - M) if p >= 1/2 and 3/4 - M + p m otherwise. Its sides have lengths l_k = min(w_i + w_j - w_k, 2 w_i,
-    2 w_j), and the area grows with w_k by 2 l_k.
-    """
-    along = [x * normals[k, 0] + y * normals[k, 1] for k in range(3)]
-    t0, t1, t2 = (t.abs() for t in along)
-    largest = torch.maximum(torch.maximum(t0, t1), t2)
-    least = torch.minimum(torch.minimum(t0, t1), t2)
-    middle = largest - least
-    inner = torch.addcmul(0.75 - largest, middle, least)
-    outer = (1 - middle).mul_((1 - largest).clamp_(min=0))
-    otf = torch.where(middle < 0.5, inner, outer).mul_(4 / 3)
-    if not differentiate:
-        return otf.square_(), _no_pullback
-
-    def pullback(grad: Tensor) -> Tensor:
-        half = [(1 - t).clamp_(min=0).mul_(0.5) for t in (t0, t1, t2)]
-        weight = otf * grad
-        total = grad.new_zeros(*grad.shape[:-2], 2)
-        for k in range(3):
-            w, wi, wj = half[k], half[k - 1], half[k - 2]
-            side = torch.minimum(wi + wj - w, 2 * torch.minimum(wi, wj)).clamp_(min=0)
-            moved = side.mul_(torch.sign(along[k])).mul_(weight).sum((-2, -1))
-            total += moved[..., None] * normals[k]
-        return total.mul_(-8 / 3)
-
-    return otf.square(), pullback
-
-
-def _no_pullback(grad: Tensor) -> Tensor:
-    raise RuntimeError("the patches were made without what their derivatives need")
 
 
 class _Plan(NamedTuple):
@@ -140,7 +40,7 @@ class _Plan(NamedTuple):
     The plane has `above` rows before those of the half-plane and some below, and is flat.
     """
 
-    patches: Callable[..., tuple[Tensor, Pullback]]  # (x, y, differentiate)
+    patches: Patches
     one: Tensor
     first: Tensor  # (pairs,) sub-apertures of each pair; the zero baseline is pair 0
     second: Tensor
@@ -158,12 +58,6 @@ class _Plan(NamedTuple):
 
 def _make_plan(geometry: Geometry, n: int, dtype: torch.dtype, device: torch.device) -> _Plan:
     (rows, columns), period = geometry.grid, geometry.period
-    if geometry.shape == "disc":
-        patches = partial(disc_patches, constants=disc_constants(dtype, device))
-    else:
-        angles = [geometry.orientation + k * math.pi / 3 for k in range(3)]
-        normals = torch.tensor([[math.cos(t), math.sin(t)] for t in angles], dtype=dtype, device=device)
-        patches = partial(hexagon_patches, normals=normals)
     zero = torch.zeros(1, dtype=torch.long, device=device)
     first, second = (torch.cat([zero, i]) for i in torch.triu_indices(n, n, 1, device=device))
     # rounded up to a number that float32 holds exactly, so that every index below follows from the same one
@@ -176,7 +70,7 @@ def _make_plan(geometry: Geometry, n: int, dtype: torch.dtype, device: torch.dev
     mirrored = torch.where(outside <= 0, -outside, rows - outside).clamp(0, height - 1)
     every = torch.arange(columns, device=device)
     return _Plan(
-        patches,
+        geometry.shape.patches(dtype, device),
         torch.ones((), dtype=dtype, device=device),
         first,
         second,
@@ -196,39 +90,75 @@ def _make_plan(geometry: Geometry, n: int, dtype: torch.dtype, device: torch.dev
 _cached_plan = lru_cache(maxsize=32)(_make_plan)
 
 
-class BaselineMSE(torch.autograd.Function):
+def baseline_mse(centers: Tensor, weight: Tensor, ratio: Tensor, geometry: Geometry) -> Tensor:
     """MSE_a (B,) of masks with `centers` (B, N, 2) [m], differentiable once in them.
 
     `weight` and `ratio` (layers, H // 2 + 1, W) hold the PSDs: MSE_a is the sum of weight / (transfer + ratio) over the
     half-plane, with transfer = N^2 |h|^2 + sum_{m != n} |h(nu - nu_m + nu_n)|^2 and h the OTF over N.
     """
+    differentiate = centers.requires_grad and torch.is_grad_enabled()
+    return _BaselineMSE.apply(centers, weight, ratio, geometry, differentiate)[0]  # type: ignore[no-any-return]
+
+
+class _BaselineMSE(torch.autograd.Function):
+    """`baseline_mse` and, if asked for, its gradient, which the backward pass then only has to scale."""
 
     @staticmethod
-    def forward(ctx: Any, centers: Tensor, weight: Tensor, ratio: Tensor, geometry: Geometry) -> Tensor:
+    def forward(
+        centers: Tensor, weight: Tensor, ratio: Tensor, geometry: Geometry, differentiate: bool
+    ) -> tuple[Tensor, Tensor]:
         plan_of = _make_plan if torch.compiler.is_compiling() else _cached_plan
         plan = plan_of(geometry, centers.shape[-2], centers.dtype, centers.device)
-        differentiate = ctx.needs_input_grad[0]
         pixels = len(plan.first) * len(plan.row) * len(plan.column)
         masks = max(1, _CHUNK.get(centers.device.type, 2**24) // pixels)
         n_chunks = math.ceil(len(centers) / masks)
         chunks = centers.split(math.ceil(len(centers) / n_chunks)) if n_chunks > 1 else (centers,)
         parts = [_mse_and_gradient(chunk, weight, ratio, geometry, plan, differentiate) for chunk in chunks]
-        if differentiate:
-            ctx.save_for_backward(centers, torch.cat([gradient for _, gradient in parts if gradient is not None]))
-        return torch.cat([value for value, _ in parts])
+        return torch.cat([value for value, _ in parts]), torch.cat([gradient for _, gradient in parts])
 
     @staticmethod
-    def backward(ctx: Any, *grad: Tensor) -> tuple[Tensor, None, None, None]:
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
+        centers, gradient = inputs[0], output[1]
+        ctx.mark_non_differentiable(gradient)
+        ctx.save_for_backward(centers, gradient)
+
+    @staticmethod
+    def backward(ctx: Any, *grad: Tensor) -> tuple[Tensor, None, None, None, None]:
         centers, gradient = ctx.saved_tensors
-        return grad[0][:, None, None] * _DifferentiatedOnce.apply(gradient, centers), None, None, None
+        return grad[0][:, None, None] * _DifferentiatedOnce.apply(gradient, centers), None, None, None, None
+
+    @staticmethod
+    def vmap(
+        info: Any,
+        in_dims: tuple[int | None, ...],
+        centers: Tensor,
+        weight: Tensor,
+        ratio: Tensor,
+        geometry: Geometry,
+        differentiate: bool,
+    ) -> tuple[tuple[Tensor, Tensor], tuple[int, int]]:
+        """What is mapped over is one more axis of the population."""
+        if in_dims[0] is None or in_dims[1:3] != (None, None):
+            raise ValueError("torch.func.vmap over MSE_a runs over the centres: the PSDs must be the same for all")
+        rows = centers.movedim(in_dims[0], 0)
+        differentiate = differentiate or (rows.requires_grad and torch.is_grad_enabled())
+        found = _BaselineMSE.apply(rows.flatten(0, 1), weight, ratio, geometry, differentiate)
+        value, gradient = (part.reshape(len(rows), -1, *part.shape[1:]) for part in found)
+        return (value, gradient), (0, 0)
 
 
 class _DifferentiatedOnce(torch.autograd.Function):
     """A gradient that says so when it is differentiated: torch would take it for a constant, and Hessians for 0."""
 
+    generate_vmap_rule = True
+
     @staticmethod
-    def forward(ctx: Any, gradient: Tensor, centers: Tensor) -> Tensor:
+    def forward(gradient: Tensor, centers: Tensor) -> Tensor:
         return gradient.view_as(gradient)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
+        pass
 
     @staticmethod
     def backward(ctx: Any, *grad: Tensor) -> tuple[Tensor, Tensor]:
@@ -237,8 +167,8 @@ class _DifferentiatedOnce(torch.autograd.Function):
 
 def _mse_and_gradient(
     centers: Tensor, weight: Tensor, ratio: Tensor, geometry: Geometry, plan: _Plan, differentiate: bool
-) -> tuple[Tensor, Tensor | None]:
-    """MSE_a (B,) and, if asked for, its gradient by the centres (B, N, 2)."""
+) -> tuple[Tensor, Tensor]:
+    """MSE_a (B,) and its gradient by the centres (B, N, 2), or (0, N, 2) if it is not asked for."""
     (rows, columns), period = geometry.grid, geometry.period
     # baselines in cycles/pixel, the nearest image on the torus, and of the two opposite ones that with nu_y >= 0
     nu = (centers.index_select(1, plan.first) - centers.index_select(1, plan.second)).mul_(1 / period)
@@ -266,7 +196,7 @@ def _mse_and_gradient(
     error = inverse * weight.flatten(1)
     value = error.sum((1, 2))  # not a matmul, which autocast and TF32 would round
     if not differentiate:
-        return value, None
+        return value, centers.new_empty(0, *centers.shape[1:])
     slope = error.mul_(inverse).sum(1)  # of MSE_a by the transfer, but for its sign
     half.copy_(slope)
     plane[:, : plan.half.start].zero_()

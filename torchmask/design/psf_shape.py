@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 from scipy.optimize import minimize
-from scipy.special import j1
 
-from torchmask.optics.aperture import Aperture
+from torchmask.optics.pupil import Aperture
 
 Array = NDArray[np.float64]
 
@@ -23,31 +22,16 @@ _DIRECTIONS = 180  # in which the width is measured
 _BLOCK = 2**20  # array elements treated at a time
 
 
-def side_normals(aperture: Aperture, first: float = 0.0) -> Array:
-    """Directions (3, 2) at 60 degrees from each other, from the orientation of a hexagon plus `first`."""
-    angles = aperture.orientation + first + np.arange(3) * np.pi / 3
-    return np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-
-
-def hole_amplitude(frequency: Array, aperture: Aperture) -> Array:
-    """Transform of a hole, 1 at 0, at `frequency` (..., 2) [1/m]: the angle on the sky over the wavelength."""
-    d = aperture.subaperture_diameter
-    if aperture.shape == "disc":
-        x = np.pi * d * np.linalg.norm(frequency, axis=-1)
-        return np.where(x > 1e-6, 2 * j1(x) / np.where(x > 1e-6, x, 1), 1)
-    # Green's theorem gives one term for each pair of opposite sides; the weights cos^2 add up to 3/2.
-    across, along = frequency @ side_normals(aperture).T, frequency @ side_normals(aperture, math.pi / 2).T
-    squared = (frequency**2).sum(-1)[..., None]
-    weight = np.where(squared > 0, across**2 / np.where(squared > 0, squared, 1), 0.5)
-    product = weight * np.sinc(d * across) * np.sinc(d / math.sqrt(3) * along)
-    return product.sum(-1) / 1.5
-
-
 def mask_psf(frequency: Array, centers: Array, aperture: Aperture) -> Array:
     """PSF relative to its peak at `frequency` (..., 2) [1/m]."""
     phasors = np.exp(-2j * np.pi * (frequency @ centers.T)).mean(-1)
     intensity: Array = phasors.real**2 + phasors.imag**2
-    return hole_amplitude(frequency, aperture) ** 2 * intensity
+    return _hole_power(frequency, aperture) * intensity
+
+
+def _hole_power(frequency: Array, aperture: Aperture) -> Array:
+    """PSF of a single hole relative to its peak."""
+    return aperture.shape.amplitude(frequency, aperture.subaperture_diameter) ** 2
 
 
 def psf_widths(centers: Array, aperture: Aperture) -> Array:
@@ -91,7 +75,7 @@ def _grid_maxima(centers: Array, aperture: Aperture, step: float) -> Iterator[tu
         columns = np.exp(-2j * np.pi * x[:, None] * centers[:, 0])
         phasors = (np.exp(-2j * np.pi * y[:, None] * centers[:, 1]) @ columns.T) / len(centers)
         plane = np.stack(np.broadcast_arrays(x, y[:, None]), axis=-1)
-        psf = np.abs(phasors) ** 2 * hole_amplitude(plane, aperture) ** 2
+        psf = np.abs(phasors) ** 2 * _hole_power(plane, aperture)
         peak = (psf == maximum_filter(psf, size=3)) & (np.abs(plane) > step / 2).any(-1)
         peak[[0, -1]] = False
         found += zip(plane[peak], psf[peak].tolist(), strict=True)

@@ -1,8 +1,8 @@
 """What a mask samples: its baselines, their repetitions, the gaps between them, and the point-spread function.
 
 All lengths are metres in the pupil, where a baseline stands for the frequency it transmits. Two holes of diameter d
-transmit a patch of frequencies around their baseline, the support of the autocorrelation of a hole: a disc of radius d,
-or a hexagon twice as wide as the hole.
+transmit a patch of frequencies around their baseline, the support of the autocorrelation of a hole: what the hole's
+outer edge holds, twice as large.
 """
 
 from __future__ import annotations
@@ -11,12 +11,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, KDTree, Voronoi
 
-from torchmask.design.psf_shape import Array, peak_side_lobe, psf_widths, side_normals
-from torchmask.optics.aperture import Aperture
+from torchmask.design.psf_shape import Array, peak_side_lobe, psf_widths
+from torchmask.optics.pupil import Aperture
+from torchmask.optics.shape_base import Shape
 
 _LINES = 4096  # across half the u-v plane
 _BLOCK = 2**20  # array elements treated at a time
@@ -97,8 +99,8 @@ def analyse_redundancy(aperture: Aperture, tolerance: float = 0.02) -> Redundanc
     -----
     Areas come from the chords of all patches along 4096 lines (relative error below 1e-4), the PSF from its closed
     form: the transform of a hole times the sum of the holes' phasors. The side lobe is the highest within 2.5
-    wavelengths over hole diameter; beyond, the transform of a hole keeps any other below 0.42 % (disc) or 0.92 %
-    (hexagon).
+    wavelengths over hole diameter; beyond, the transform of a hole keeps any other below 0.42 % (disc), 0.92 %
+    (hexagon) or 1.62 % (square).
 
     Examples
     --------
@@ -121,16 +123,17 @@ def analyse_redundancy(aperture: Aperture, tolerance: float = 0.02) -> Redundanc
         raise ValueError("two holes lie at the same place: remove one")
     baselines = np.concatenate([half, -half])
     sites = np.concatenate([baselines, np.zeros((1, 2))])
-    strict = _smallest_separation(sites, aperture) / 2
+    shape, diameter = aperture.shape, aperture.subaperture_diameter
+    strict = _smallest_separation(sites, shape) / 2
     distinct = _count_distinct(baselines, tolerance * lengths.min()) // 2
-    area, reach = _covered_area(sites, aperture), _reach(sites, aperture)
+    area, reach = _covered_area(sites, shape, diameter), _reach(sites, shape, diameter)
     widths = aperture.mask_diameter * psf_widths(centers, aperture)
     return RedundancyReport(
         n_subapertures=len(centers),
         n_baselines=len(half),
         n_distinct=distinct,
         nonredundant=distinct == len(half),
-        strictly_nonredundant=strict >= aperture.subaperture_diameter * (1 - 1e-9),
+        strictly_nonredundant=strict >= diameter * (1 - 1e-9),
         strict_hole_diameter=strict,
         shortest_baseline=float(lengths.min()),
         longest_baseline=float(lengths.max()),
@@ -144,13 +147,14 @@ def analyse_redundancy(aperture: Aperture, tolerance: float = 0.02) -> Redundanc
     )
 
 
-def _smallest_separation(sites: Array, aperture: Aperture) -> float:
-    """Smallest distance of two sites: Euclidean for discs; across the sides for hexagons, whose patches part there."""
-    if aperture.shape == "hexagon":
-        distances, _ = KDTree(sites @ side_normals(aperture).T).query(sites @ side_normals(aperture).T, k=2, p=np.inf)
-    else:
-        distances, _ = KDTree(sites).query(sites, k=2)
-    return float(distances[:, 1].min())
+def _smallest_separation(sites: Array, shape: Shape) -> float:
+    """The diameter at which the first two of equal holes at the sites would touch [m]."""
+    points, smallest = torch.from_numpy(sites), math.inf
+    for rows in torch.arange(len(points)).split(max(1, _BLOCK // len(points))):
+        separation = shape.separation(points[rows, None] - points)
+        separation[torch.arange(len(rows)), rows] = math.inf
+        smallest = min(smallest, float(separation.min()))
+    return smallest
 
 
 def _count_distinct(baselines: Array, distance: float) -> int:
@@ -160,25 +164,21 @@ def _count_distinct(baselines: Array, distance: float) -> int:
     return int(connected_components(links, directed=False)[0])
 
 
-def _reach(sites: Array, aperture: Aperture) -> float:
+def _reach(sites: Array, shape: Shape, diameter: float) -> float:
     """Radius of the disc that just holds every patch [m]."""
-    if aperture.shape == "disc":
-        return float(np.linalg.norm(sites, axis=1).max()) + aperture.subaperture_diameter
-    corners = side_normals(aperture, math.pi / 6) * (2 / math.sqrt(3)) * aperture.subaperture_diameter
-    return float(np.linalg.norm(sites[:, None] + corners, axis=-1).max())  # sites come with both signs
+    return -float(shape.clearance(torch.from_numpy(sites), 2 * diameter, 0.0).min())
 
 
-def _covered_area(sites: Array, aperture: Aperture) -> float:
+def _covered_area(sites: Array, shape: Shape, diameter: float) -> float:
     """Area of the union of all patches [m^2]: on each of many lines, the length of a union of intervals."""
-    top = _reach(sites, aperture)
-    if aperture.shape == "hexagon":  # lines along no side keep the chords continuous
-        turn = math.pi / 12 - aperture.orientation
-        sites = sites @ np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
+    top, turn = _reach(sites, shape, diameter), shape.askew  # lines along no side keep the chords continuous
+    sites = sites @ np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
+    patch = shape.turned(turn)
     step = top / _LINES
     lines = (np.arange(_LINES) + 0.5) * step  # the other half of the plane is its point reflection
     length = 0.0  # of the union, summed over lines
     for y in np.array_split(lines, math.ceil(_LINES * len(sites) / _BLOCK)):
-        left, right = _chords(y[:, None] - sites[:, 1], aperture)
+        left, right = patch.chords(y[:, None] - sites[:, 1], 2 * diameter)
         left, right = left + sites[:, 0], right + sites[:, 0]
         order = np.argsort(left, axis=1)
         left, right = np.take_along_axis(left, order, 1), np.take_along_axis(right, order, 1)
@@ -186,23 +186,6 @@ def _covered_area(sites: Array, aperture: Aperture) -> float:
         new = right[:, 1:] - np.maximum(left[:, 1:], before)
         length += float((right[:, 0] - left[:, 0]).sum() + np.clip(new, 0, None).sum())
     return 2 * length * step
-
-
-def _chords(height: Array, aperture: Aperture) -> tuple[Array, Array]:
-    """Where a horizontal line at `height` above the centre of a patch enters and leaves it; both 0 if it does not.
-
-    Hexagons are turned to an orientation of 15 degrees.
-    """
-    d = aperture.subaperture_diameter
-    if aperture.shape == "disc":
-        half = np.sqrt(np.clip(d**2 - height**2, 0, None))
-        return -half, half
-    left, right = np.full_like(height, -np.inf), np.full_like(height, np.inf)
-    for angle in np.radians([15, 75, 135]):
-        middle, half = -np.tan(angle) * height, d / abs(np.cos(angle))
-        left, right = np.maximum(left, middle - half), np.minimum(right, middle + half)
-    empty = left >= right
-    return np.where(empty, 0, left), np.where(empty, 0, right)
 
 
 def _largest_empty_circle(sites: Array) -> float:

@@ -139,8 +139,9 @@ def refine_mask(
     require_constraints(constraints)
     if budget != int(budget) or budget < 1:
         raise ValueError(f"budget is {budget}: it must be a whole number of evaluations, at least 1")
-    holes = Holes(detached(aperture), (InsideDisc(), NoOverlap(), *constraints))
-    start = holes.coordinates(aperture.centers.detach())
+    still = aperture.replace(centers=aperture.centers.detach().clone())
+    holes = Holes(still, (InsideDisc(), NoOverlap(), *constraints))
+    start = holes.coordinates(still.centers)
     monitor = Monitor("design/refine", budget, holes, callback)
     best, evaluations = polish(criterion, holes, start[None], budget, monitor)
     return conclude(criterion, best, constraints, evaluations, monitor.history)
@@ -196,17 +197,6 @@ def _feasible(holes: Holes, x: Tensor) -> tuple[list[SparseAperture], Infeasible
         except Infeasible as error:
             failure = error
     return masks, failure
-
-
-def detached(aperture: SparseAperture) -> SparseAperture:
-    """A mask that shares no gradient with `aperture`."""
-    return SparseAperture(
-        aperture.centers.detach().clone(),
-        aperture.subaperture_diameter,
-        aperture.mask_diameter,
-        aperture.shape,
-        aperture.orientation,
-    )
 
 
 def conclude(

@@ -218,14 +218,13 @@ def _machined(
     position: Tensor,
     diameter: Tensor,
 ) -> MachiningErrors:
-    rest = (aperture.mask_diameter, aperture.shape, aperture.orientation)
     with torch.no_grad():
         nominal = float(criterion(aperture))
         centers = aperture.centers + position_rms * position
         if diameter_rms == 0:
-            mse = criterion(SparseAperture(centers, aperture.subaperture_diameter, *rest))
+            mse = criterion(aperture.replace(centers=centers))
         else:  # an aperture has one diameter for its whole population
             diameters = (aperture.subaperture_diameter + diameter_rms * diameter).tolist()
-            masks = [SparseAperture(c, d, *rest) for c, d in zip(centers, diameters, strict=True)]
+            masks = [aperture.replace(c, d) for c, d in zip(centers, diameters, strict=True)]
             mse = torch.stack([criterion(mask) for mask in masks])
     return MachiningErrors(position_rms, diameter_rms, nominal, mse)

@@ -17,7 +17,6 @@ from torchmask.interferometry.visibilities import (
 )
 from torchmask.observation import Observation, check_frames
 from torchmask.optics.aperture import Aperture
-from torchmask.optics.otf import subaperture_otf
 
 _FIELD = 4  # the envelope of the fringes is computed on a field this many times as wide, against its wrap-around
 _WORST_CONDITION = 1e6  # of the normal equations of the fringes
@@ -121,7 +120,7 @@ class _Envelope:
         self.wide = Grid((grid.shape[0] * _FIELD, grid.shape[1] * _FIELD), grid.pixel_scale, grid.wavelength)
         self.nu_y, self.nu_x = self.wide.frequencies(torch.float64)
         shift = torch.stack(torch.broadcast_tensors(self.nu_x, self.nu_y), -1) * grid.period
-        self.transfer = subaperture_otf(shift, aperture)
+        self.transfer = aperture.shape.otf(shift, aperture.subaperture_diameter)
 
     def at(self, x: float, y: float) -> Tensor:
         """(P,) the pattern around (x, y), pixels from [H // 2, W // 2]."""

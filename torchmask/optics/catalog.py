@@ -20,6 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from torchmask.optics.shapes import Shape, named_shape
+
 
 @dataclass(frozen=True)
 class CatalogEntry:
@@ -28,9 +30,8 @@ class CatalogEntry:
     name : canonical name, see `names`
     unit : "m", "lattice" (the pitch of a hexagonal lattice) or "outer radius"
     centers : (x, y) of each hole, in `unit`
-    shape : "disc" or "hexagon"
+    shape : of the holes
     hole_diameter : of a disc, or flat to flat [m]; None where no source gives it
-    orientation : for hexagons, the angle from +x to the normal of one side [rad]
     pupil_diameter : of the telescope or its stop [m]; None for arrays without a size of their own
     central_obstruction : diameter of the pupil's obstruction [m]; None where not given
     source, hole_source : where centres and hole diameter come from
@@ -40,9 +41,8 @@ class CatalogEntry:
     name: str
     unit: str
     centers: tuple[tuple[float, float], ...]
-    shape: str
+    shape: Shape
     hole_diameter: float | None
-    orientation: float
     pupil_diameter: float | None
     central_obstruction: float | None
     source: str
@@ -83,7 +83,7 @@ def entry(name: str) -> CatalogEntry:
     --------
     >>> mask = entry("JWST NIRISS AMI 7")
     >>> mask.n_subapertures, mask.shape, mask.hole_diameter
-    (7, 'hexagon', 0.8)
+    (7, Hexagon(orientation=0.5235987755982988), 0.8)
     """
     known = _lookup()
     key = _plain(name)
@@ -105,7 +105,7 @@ def layout(
     centers = np.array(mask.centers)
     if mask_diameter is not None and fill_factor is not None:
         hole = mask_diameter * math.sqrt(fill_factor / mask.n_subapertures)
-        centers = _fit(centers, mask_diameter, hole * (1 if mask.shape == "disc" else 2 / math.sqrt(3)))
+        centers = _fit(centers, mask_diameter, mask.shape.outer_diameter(hole))
     elif mask.pupil_diameter is None:
         raise ValueError(f"{mask.name} has no size of its own: give both mask_diameter and fill_factor (N d^2 / D^2)")
     else:
@@ -118,16 +118,13 @@ def layout(
             hole = scale * mask.hole_diameter
         else:
             raise ValueError(f"no source gives the hole diameter of {mask.name}: give fill_factor (N d^2 / D^2)")
-    orientation = mask.orientation
     if mirrored:
         centers = centers * [-1.0, 1.0]
-        orientation = (math.pi - orientation) % (math.pi / 3)
     return {
         "centers": centers,
         "subaperture_diameter": hole,
         "mask_diameter": mask_diameter,
-        "shape": mask.shape,
-        "orientation": orientation,
+        "shape": mask.shape.mirrored() if mirrored else mask.shape,
     }
 
 
@@ -215,9 +212,10 @@ def _read(name: str, record: dict[str, Any]) -> CatalogEntry:
         name=name,
         unit=record["unit"],
         centers=tuple((x, y) for x, y in centers.tolist()),
-        shape=record.get("shape", "disc"),
+        shape=named_shape(
+            record.get("shape", "disc"), {"orientation": math.radians(record.get("orientation_degrees", 0))}
+        ),
         hole_diameter=hole,
-        orientation=math.radians(record.get("orientation_degrees", 0)),
         pupil_diameter=record.get("pupil_diameter"),
         central_obstruction=record.get("central_obstruction"),
         source=_expand(record["source"]),

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from torchmask.grid import Grid
-from torchmask.optics.aperture import Aperture, PupilSamples
+from torchmask.optics.pupil import Aperture, PupilSamples
 
 
 def fold(images: Tensor, shape: tuple[int, int]) -> Tensor:

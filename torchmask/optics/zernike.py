@@ -10,12 +10,11 @@ from __future__ import annotations
 import math
 from numbers import Integral
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from torchmask.grid import Grid
-from torchmask.optics.aperture import Aperture, PupilSamples
+from torchmask.optics.pupil import Aperture, PupilSamples, can_be_read
 
 _INDEPENDENT = 1e-9  # rms of a mode, of unit rms over the disc, that the modes before it do not explain
 
@@ -74,47 +73,20 @@ def _jacobi(q: Tensor, m: int, degree: int) -> list[Tensor]:
     return p
 
 
-def quadrature(aperture: Aperture, degree: int) -> tuple[Tensor, Tensor]:
-    """Points (Q, 2) [m] and weights (Q,) of the mean over one sub-aperture centred at the origin.
-
-    Exact for polynomials up to `degree`, whatever the raster: a product of Gauss and uniform nodes on a (possibly
-    obstructed) disc, of Gauss nodes on the six triangles of a hexagon. float64, on the CPU.
-    """
-    nodes, weights = np.polynomial.legendre.leggauss(degree // 2 + 2)
-    nodes, weights = (nodes + 1) / 2, weights / 2  # on [0, 1]
-    if aperture.shape == "hexagon":
-        corners = aperture.orientation + math.pi / 6 + np.arange(7) * math.pi / 3
-        corner = np.stack([np.cos(corners), np.sin(corners)], axis=-1)
-        side = corner[:-1, None] + nodes[:, None] * (corner[1:] - corner[:-1])[:, None]  # (6, nodes, 2)
-        points = nodes[:, None, None, None] * side
-        weight = np.broadcast_to((2 * nodes * weights)[:, None, None] * weights / 6, points.shape[:-1])
-    else:
-        inner = aperture.central_obstruction**2
-        radius = np.sqrt(inner + (1 - inner) * nodes)  # uniform in area
-        angle = 2 * math.pi / (degree + 1) * np.arange(degree + 1)
-        points = radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-        weight = np.broadcast_to(weights[:, None] / (degree + 1), points.shape[:-1])
-    points = points.reshape(-1, 2) * (aperture.outer_diameter / 2)
-    return torch.from_numpy(points), torch.from_numpy(weight.reshape(-1).copy())
-
-
 def aperture_modes(aperture: Aperture, points: Tensor, n_modes: int) -> Tensor:
     """Modes of one sub-aperture at `points` (..., 2) [m] from its centre: (..., J), unit rms over its open area.
 
     Raises ValueError if `n_modes` is not a whole number of at least 1, or a ring is too thin to tell so many apart.
     """
-    radius = aperture.outer_diameter / 2
+    shape, radius = aperture.shape, aperture.outer_diameter / 2
     modes = zernike(points / radius, n_modes)
-    if aperture.shape == "disc" and aperture.central_obstruction == 0:
+    if shape.has_noll_modes:
         return modes
-    nodes, weights = quadrature(aperture, 2 * noll(n_modes)[0])
+    nodes, weights = shape.quadrature(2 * noll(n_modes)[0], aperture.subaperture_diameter)
     triangle = torch.linalg.qr(weights.sqrt()[:, None] * zernike(nodes / radius, n_modes)).R
     diagonal = triangle.diagonal()
     if float(diagonal.abs().min()) < _INDEPENDENT:
-        raise ValueError(
-            f"{n_modes} modes are not independent on a ring with central_obstruction "
-            f"{aperture.central_obstruction:.4g}: fewer modes are needed"
-        )
+        raise ValueError(f"{n_modes} modes are not independent on so thin a shape, {shape!r}: fewer modes are needed")
     combine = torch.linalg.inv(triangle * diagonal.sign()[:, None])
     return modes @ combine.to(modes)
 
@@ -187,7 +159,7 @@ class ZernikePhase(nn.Module):
                 f"modes) = {expected}"
             )
         centers = self.aperture.centers
-        moved = centers.requires_grad or not torch.equal(centers, self.basis_centers)
+        moved = centers.requires_grad or not can_be_read(centers) or not torch.equal(centers, self.basis_centers)
         basis = self._evaluate() if moved else self.basis
         if coefficients.ndim >= basis.ndim:
             basis = basis.unsqueeze(-4)

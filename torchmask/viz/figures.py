@@ -70,19 +70,19 @@ def mask_figure(aperture: Aperture, title: str | None = None) -> Figure:
     ax.add_patch(Circle((0, 0), radius, facecolor=drawing.PALE, edgecolor=drawing.FAINT, linewidth=0.8))
     for center in centers * scale:
         ax.add_patch(drawing.hole(aperture, center, scale, facecolor=drawing.COLORS[0], edgecolor="none"))
-        if aperture.central_obstruction > 0:
-            ax.add_patch(Circle(tuple(center), radius * aperture.central_obstruction, facecolor=drawing.PALE))
-    drawing.plane_axes(ax, 1.06 * max(radius, drawing.reach(aperture) * scale), f"x [{unit}]", f"y [{unit}]")
-    what = "disc" if aperture.shape == "disc" else "hexagon"
+        for blocked in aperture.shape.outline(aperture.subaperture_diameter * scale)[1:]:
+            ax.add_patch(drawing.edge(blocked, center, facecolor=drawing.PALE))
+    drawing.plane_axes(ax, 1.06 * max(radius, aperture.reach * scale), f"x [{unit}]", f"y [{unit}]")
     size = f"{aperture.subaperture_diameter * scale:.3g} {unit}"
     n = aperture.n_subapertures
-    ax.set_title(title or (f"{n} {what}s of {size}" if n > 1 else f"{what} of {size}"))
+    ax.set_title(title or (f"{aperture.shape} of {size}" if aperture.is_full else f"{n} {aperture.shape}s of {size}"))
     return figure
 
 
 @drawing.styled
 def uv_coverage_figure(aperture: Aperture, grid: Grid | None = None, title: str | None = None) -> Figure:
-    """The spatial frequencies an aperture transmits: one disc (or hexagon) around the baseline of each pair of holes.
+    """The spatial frequencies an aperture transmits: the form of a hole, twice as large, around the baseline of each
+    pair of holes.
 
     Darker where pairs overlap. Axes are baselines in metres; with a `grid` also frequencies in cycles/pixel, and the
     square that the grid samples, beyond which frequencies wrap around. Raises ValueError for a population of masks.
@@ -103,7 +103,7 @@ def uv_coverage_figure(aperture: Aperture, grid: Grid | None = None, title: str 
     ax.add_patch(
         Circle((0, 0), reach, fill=False, color=drawing.FAINT, linewidth=0.9, label="cut-off of the whole disc")
     )
-    half = max(reach, 2 * drawing.reach(aperture) * scale)
+    half = max(reach, 2 * aperture.reach * scale)
     if grid is not None:
         nyquist = grid.period / 2 * scale
         half = max(half, nyquist)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 import numpy as np
 
 from torchmask.grid import ARCSEC, MAS, Grid
 from torchmask.optics.aperture import Aperture
+from torchmask.optics.shape_base import Circle, Contour
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -130,22 +131,18 @@ def one_mask(aperture: Aperture) -> np.ndarray:
     return centers
 
 
-def reach(aperture: Aperture) -> float:
-    """Distance of the outermost edge from the origin, at most [m]."""
-    edge = aperture.subaperture_diameter / (2 if aperture.shape == "disc" else math.sqrt(3))
-    return float(np.linalg.norm(one_mask(aperture), axis=-1).max()) + edge
+def hole(aperture: Aperture, center: np.ndarray, scale: float, **style: Any) -> Patch:
+    """What the outer edge of a sub-aperture holds, `scale` times as large, around `center` (x, y), already scaled."""
+    return edge(aperture.shape.outline(aperture.subaperture_diameter * scale)[0], center, **style)
 
 
-def hole(aperture: Aperture, center: Iterable[float], scale: float, **style: Any) -> Patch:
-    """One sub-aperture, `scale` times as large, around `center` (x, y), already scaled."""
-    from matplotlib.patches import Circle, RegularPolygon
+def edge(contour: Contour, center: np.ndarray, **style: Any) -> Patch:
+    """What one edge of a hole holds, around `center` (x, y) in the unit of the contour."""
+    from matplotlib import patches
 
-    x, y = center
-    radius = scale * aperture.subaperture_diameter / 2
-    if aperture.shape == "disc":
-        return Circle((x, y), radius, **style)
-    # matplotlib turns a hexagon that has a corner on +y: its sides face the same way as ours for equal angles
-    return RegularPolygon((x, y), 6, radius=radius * 2 / math.sqrt(3), orientation=aperture.orientation, **style)
+    if isinstance(contour, Circle):
+        return patches.Circle((float(center[0]), float(center[1])), contour.radius, **style)
+    return patches.Polygon(contour.points + center, **style)
 
 
 def plane_axes(ax: Axes, half: float, x_label: str, y_label: str) -> None:

@@ -1,0 +1,175 @@
+"""Drawings of masks for the workshop: DXF and SVG, and DXF back again.
+
+Drawings are in millimetres on the plate, `scale` millimetres for each metre of the pupil: 1000 is life-size, and a mask
+for a re-imaged pupil of 10 mm on an 8 m telescope has scale 10 / 8. They show the mask as the pupil coordinates do, x
+to the right and y up.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchmask.io import atomic_write
+from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.shape_base import Array, Circle, Contour, Corners, Shape
+from torchmask.optics.shapes import outlined_shape
+
+_SCALE = "torchmask mm per m"
+_NANOMETRE = 1e-6  # [mm]: what rounding may change
+
+
+def save_dxf(path: str | Path, aperture: SparseAperture, scale: float = 1000.0) -> None:
+    """Write a DXF drawing: holes as circles or closed polylines on layer HOLES, the mask's rim on layer OUTLINE.
+
+    Parameters
+    ----------
+    path : str or Path
+    aperture : SparseAperture
+    scale : float
+        Millimetres on the plate for one metre of the pupil; the drawing remembers it for `load_mask`.
+
+    Raises
+    ------
+    ValueError
+        If `path` exists, its folder does not, the aperture is a population of masks, or `scale` is not finite and
+        positive.
+    """
+    import ezdxf
+    import ezdxf.units
+
+    centers = require_one_mask(aperture).double() * _checked(scale)
+    drawing = ezdxf.new("R2010", units=ezdxf.units.MM)  # pyright: ignore[reportPrivateImportUsage]
+    drawing.header.custom_vars.append(_SCALE, repr(float(scale)))
+    for layer in ("HOLES", "OUTLINE"):
+        drawing.layers.add(layer)
+    plate = drawing.modelspace()
+    plate.add_circle((0, 0), aperture.mask_diameter * scale / 2, dxfattribs={"layer": "OUTLINE"})
+    for x, y in centers.tolist():
+        for contour in aperture.shape.outline(aperture.subaperture_diameter * scale):
+            if isinstance(contour, Circle):
+                plate.add_circle((x, y), contour.radius, dxfattribs={"layer": "HOLES"})
+            else:
+                plate.add_lwpolyline((contour.points + [x, y]).tolist(), close=True, dxfattribs={"layer": "HOLES"})
+    text = io.StringIO()
+    drawing.write(text)
+    with atomic_write(path) as file:
+        file.write(text.getvalue().encode(drawing.output_encoding))
+
+
+def save_svg(path: str | Path, aperture: SparseAperture, scale: float = 1000.0) -> None:
+    """Write an SVG drawing in true size: user units are millimetres, the rim and the holes are hairlines.
+
+    SVG's y axis points down, so y is written with its sign reversed and the picture shows y up. Same arguments and
+    errors as `save_dxf`.
+    """
+    centers = require_one_mask(aperture).double() * _checked(scale)
+    width = 1.02 * scale * max(aperture.mask_diameter, 2 * aperture.reach)
+    svg = ElementTree.Element(
+        "svg",
+        xmlns="http://www.w3.org/2000/svg",
+        width=f"{width}mm",
+        height=f"{width}mm",
+        viewBox=f"{-width / 2} {-width / 2} {width} {width}",
+    )
+    ElementTree.SubElement(svg, "title").text = f"Aperture mask of {aperture.n_subapertures} holes"
+    ElementTree.SubElement(svg, "desc").text = f"Millimetres on the plate, {scale!r} for each metre of the pupil."
+    style = {"fill": "none", "stroke": "black", "stroke-width": f"{width / 2000}"}
+    radius = f"{aperture.mask_diameter * scale / 2}"
+    ElementTree.SubElement(svg, "circle", {"id": "outline", "cx": "0", "cy": "0", "r": radius, **style})
+    holes = ElementTree.SubElement(svg, "g", {"id": "holes", **style})
+    for x, y in centers.tolist():
+        for contour in aperture.shape.outline(aperture.subaperture_diameter * scale):
+            if isinstance(contour, Circle):
+                ElementTree.SubElement(holes, "circle", {"cx": f"{x}", "cy": f"{-y}", "r": f"{contour.radius}"})
+            else:
+                points = " ".join(f"{x + dx},{-(y + dy)}" for dx, dy in contour.points.tolist())
+                ElementTree.SubElement(holes, "polygon", points=points)
+    with atomic_write(path) as file:
+        ElementTree.ElementTree(svg).write(file, encoding="utf-8", xml_declaration=True)
+
+
+def load_dxf(path: Path) -> SparseAperture:
+    """Read a mask that `save_dxf` wrote, as it is drawn: holes moved in a CAD program come back moved. float64.
+
+    Raises
+    ------
+    ValueError
+        If the file is damaged, or shows no mask that this library knows.
+    """
+    import ezdxf
+
+    try:
+        drawing = ezdxf.readfile(path)  # pyright: ignore[reportPrivateImportUsage]
+    except (ezdxf.DXFError, StopIteration) as error:  # pyright: ignore[reportPrivateImportUsage]
+        raise ValueError(str(error) or "the drawing ends too early") from error
+    noted = drawing.header.custom_vars.get(_SCALE)
+    if noted is None:
+        raise ValueError("the drawing does not say how many millimetres stand for a metre of the pupil")
+    scale = _checked(float(noted))
+    plate = drawing.modelspace()
+    rims = list(plate.query('CIRCLE[layer=="OUTLINE"]'))
+    if len(rims) != 1:
+        raise ValueError(f"layer OUTLINE holds {len(rims)} circles: one is needed, the rim of the mask")
+    outlines = _drawn_holes(plate)
+    if not outlines:
+        raise ValueError("layer HOLES is empty: a mask has at least one hole")
+    holes = [outlined_shape(tuple(outline), _NANOMETRE) for _, outline in outlines]
+    shape, diameter = holes[0]
+    if not all(_alike(holes[0], hole) for hole in holes):
+        kinds = ", ".join(sorted({str(hole[0]) for hole in holes}))
+        raise ValueError(f"its holes differ by more than 1 nm or 1e-6 ({kinds}): one kind is needed, all equal")
+    centers = torch.tensor(np.stack([center for center, _ in outlines])) / scale
+    return SparseAperture(centers, diameter / scale, 2 * rims[0].dxf.radius / scale, shape)
+
+
+def _drawn_holes(plate: Any) -> list[tuple[Array, list[Contour]]]:
+    """Centre [mm] and outline of each hole: what is drawn around one centre belongs to one hole."""
+    holes: list[tuple[Array, list[Contour]]] = []
+    for entity in plate.query('CIRCLE LWPOLYLINE[layer=="HOLES"]'):
+        center, contour = _measured(entity)
+        same = [outline for other, outline in holes if np.abs(center - other).max() < _NANOMETRE]
+        if same:
+            same[0].append(contour)
+        else:
+            holes.append((center, [contour]))
+    return holes
+
+
+def _measured(entity: Any) -> tuple[Array, Contour]:
+    """Centre [mm] of a drawn circle or polyline, and what it is around that."""
+    if entity.dxftype() == "CIRCLE":
+        return np.array([entity.dxf.center.x, entity.dxf.center.y]), Circle(entity.dxf.radius)
+    corners = np.array([corner[:2] for corner in entity.vertices()])
+    return corners.mean(0), Corners(corners - corners.mean(0))
+
+
+def _alike(hole: tuple[Shape, float], other: tuple[Shape, float]) -> bool:
+    numbers, others = ([diameter, *shape.parameters.values()] for shape, diameter in (hole, other))
+    return hole[0].name == other[0].name and np.allclose(numbers, others, rtol=0, atol=_NANOMETRE)
+
+
+def require_one_mask(aperture: SparseAperture) -> Tensor:
+    """The centres (N, 2) of one mask, on the CPU. Raises TypeError or ValueError for anything else."""
+    if not isinstance(aperture, SparseAperture):
+        raise TypeError(f"a SparseAperture is needed, not {type(aperture).__name__}")
+    if aperture.centers.ndim != 2:
+        raise ValueError(
+            f"centers has shape {tuple(aperture.centers.shape)}: a file holds one mask, (n_subapertures, 2)"
+        )
+    return aperture.centers.detach().cpu()
+
+
+def _checked(scale: float) -> float:
+    if not (math.isfinite(scale) and scale > 0):
+        raise ValueError(
+            f"scale is {scale}: it must be finite and positive, in mm on the plate for a metre of the pupil"
+        )
+    return scale

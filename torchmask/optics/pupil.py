@@ -1,0 +1,136 @@
+"""What every aperture is, and its open part as samples of a raster that an FFT takes to the image.
+
+Each sub-aperture is sampled by its own small patch of the raster. A sample carries the fraction of its cell that is
+open, so the field follows a hole that moves by less than a sample, and autograd follows it too.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torchmask.grid import Grid
+from torchmask.optics.shape_base import Shape
+
+
+class PupilSamples(NamedTuple):
+    """The open part of a pupil as samples of an FFT raster, P per sub-aperture.
+
+    offsets : (..., N, P, 2) position (x, y) relative to the centre of the sub-aperture [m]
+    weights : (..., N, P) open fraction of the sample's cell
+    index : (..., N, P) position in the flattened raster, in FFT order
+    raster : (rows, columns) of the raster
+    step : (dy, dx) of the raster [m]
+    """
+
+    offsets: Tensor
+    weights: Tensor
+    index: Tensor
+    raster: tuple[int, int]
+    step: tuple[float, float]
+
+
+class Aperture(nn.Module):
+    """What every aperture offers: N equal sub-apertures at `centers` (..., N, 2) [m], (x, y).
+
+    `shape` is the form of a sub-aperture and `subaperture_diameter` its size, flat to flat for hexagons;
+    `mask_diameter` is the disc that holds them all [m].
+    """
+
+    centers: Tensor
+    subaperture_diameter: float
+    mask_diameter: float
+    shape: Shape
+
+    @property
+    def n_subapertures(self) -> int:
+        """Number of sub-apertures, N."""
+        return self.centers.shape[-2]
+
+    @property
+    def is_full(self) -> bool:
+        """Whether it is a full pupil, a single opening, and no mask: it has no pairs of holes, thus no fringes."""
+        return self.n_subapertures == 1
+
+    @property
+    def area(self) -> float:
+        """Collecting area [m^2], overlaps counted twice."""
+        return self.n_subapertures * self.shape.area(self.subaperture_diameter)
+
+    @property
+    def outer_diameter(self) -> float:
+        """Diameter of the circle around one sub-aperture [m]: that of a disc, corner to corner for a hexagon."""
+        return self.shape.outer_diameter(self.subaperture_diameter)
+
+    @property
+    def extent(self) -> float:
+        """Largest separation of two points of the aperture, outer edge to outer edge [m].
+
+        For hexagons an upper bound: their corners are taken to lie on the longest baseline. A full pupil of this
+        diameter reaches the same spatial frequencies.
+        """
+        centers = self.centers.detach()
+        separation = torch.linalg.vector_norm(centers[..., :, None, :] - centers[..., None, :, :], dim=-1)
+        return float(separation.max()) + self.outer_diameter
+
+    @property
+    def reach(self) -> float:
+        """Distance of the outermost edge from the origin, corners again taken to point outwards [m]."""
+        return float(torch.linalg.vector_norm(self.centers.detach(), dim=-1).max()) + self.outer_diameter / 2
+
+    def samples(self, grid: Grid, oversampling: int = 1) -> PupilSamples:
+        """Sample the aperture on the pupil raster of a field `oversampling` times as wide as `grid`.
+
+        The raster step is grid.period / (oversampling * n_pixels). Differentiable in `centers`.
+
+        Raises
+        ------
+        ValueError
+            If the image would be aliased, `oversampling` is not a positive whole number, or a sub-aperture is
+            narrower than two samples.
+        """
+        self.require_sampling(grid)
+        return _sample_holes(self.centers, self.shape, self.subaperture_diameter, grid, oversampling)
+
+    def require_sampling(self, grid: Grid) -> None:
+        """Raise ValueError if the grid aliases the image. Under `torch.func.vmap`, where no value can be seen, nothing
+        is checked."""
+        if can_be_read(self.centers):
+            grid.require_sampling(self.extent)
+
+
+def _sample_holes(centers: Tensor, shape: Shape, diameter: float, grid: Grid, oversampling: int) -> PupilSamples:
+    if oversampling != int(oversampling) or oversampling < 1:
+        raise ValueError(f"oversampling is {oversampling}: it must be a whole number of at least 1")
+    raster = (grid.shape[0] * oversampling, grid.shape[1] * oversampling)
+    step = (grid.period / raster[0], grid.period / raster[1])
+    if diameter < 2 * max(step):
+        needed = math.ceil(2 * grid.period / (diameter * min(grid.shape)))
+        raise ValueError(
+            f"a sub-aperture of {diameter:.4g} m spans {diameter / max(step):.2f} pupil samples of "
+            f"{max(step):.4g} m: at least 2 are needed, so take oversampling of at least {needed} or an image of more "
+            "pixels"
+        )
+    cell = centers.new_tensor([step[1], step[0]])
+    half = [math.ceil(shape.outer_diameter(diameter) / (2 * s)) + 1 for s in (step[1], step[0])]
+    patch = torch.cartesian_prod(
+        *(torch.arange(-h, h + 1, device=centers.device) for h in half)
+    )  # (P, 2) whole samples, (x, y)
+    nearest = torch.round(centers.detach() / cell).long()
+    position = nearest[..., None, :] + patch  # (..., N, P, 2)
+    offsets = position * cell - centers[..., None, :]
+    weights = shape.coverage(offsets, cell, diameter)
+    index = (position[..., 1] % raster[0]) * raster[1] + position[..., 0] % raster[1]
+    return PupilSamples(offsets, weights, index, raster, step)
+
+
+def can_be_read(tensor: Tensor) -> bool:
+    """Whether Python may look at the values of a tensor: not under `torch.func.vmap`."""
+    try:
+        bool(tensor.detach().sum() == 0)
+    except RuntimeError:
+        return False
+    return True

@@ -1,0 +1,68 @@
+"""The shapes that a hole may have, and how files and drawings name them.
+
+A shape of one's own, a subclass of `Shape` or `Polygon` with a name, is known from its definition on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
+
+from torchmask.optics.polygons import Hexagon, Polygon, Square
+from torchmask.optics.round import Annulus, Disc
+from torchmask.optics.shape_base import Circle, Contour, Corners, Shape
+
+__all__ = [
+    "Annulus",
+    "Circle",
+    "Contour",
+    "Corners",
+    "Disc",
+    "Hexagon",
+    "Polygon",
+    "Shape",
+    "Square",
+    "named_shape",
+    "outlined_shape",
+]
+
+
+def named_shape(name: str, parameters: Mapping[str, Any]) -> Shape:
+    """The shape called `name`, with those of `parameters` that it has; the others are for other shapes.
+
+    Raises
+    ------
+    ValueError
+        If no shape has this name, or a parameter is missing or of no use.
+
+    Examples
+    --------
+    >>> named_shape("hexagon", {"orientation": 0.2, "subaperture_diameter": 0.1})
+    Hexagon(orientation=0.2)
+    """
+    if name not in Shape.known:
+        raise ValueError(f"shape is {name!r}: known shapes are {', '.join(Shape.known)}")
+    kind = Shape.known[name]
+    needed = [field.name for field in fields(kind)]
+    given = {key: float(parameters[key]) for key in needed if key in parameters}
+    try:
+        return kind(**given)
+    except TypeError as error:
+        raise ValueError(f"shape {name!r} needs {', '.join(needed)}: {error}") from error
+
+
+def outlined_shape(outline: tuple[Contour, ...], tolerance: float) -> tuple[Shape, float]:
+    """The known shape, and its diameter [m], that has this outline about its centre, up to `tolerance` [m].
+
+    Raises
+    ------
+    ValueError
+        If it is the outline of no known shape.
+    """
+    for kind in Shape.known.values():
+        found = kind.from_outline(outline, tolerance)
+        if found is not None:
+            return found
+    parts = " and ".join("a circle" if isinstance(c, Circle) else f"{len(c.points)} corners" for c in outline)
+    raise ValueError(f"a hole whose outline is {parts} is none of the known shapes: {', '.join(Shape.known)}")
