@@ -22,8 +22,8 @@ from torchmask.grid import Grid
 from torchmask.observation import Observation
 from torchmask.optics.aperture import Aperture, SparseAperture
 from torchmask.optics.detector import Detector
-from torchmask.optics.otf import disc_otf
 from torchmask.optics.psf import psf_from_samples
+from torchmask.optics.round import disc_otf
 from torchmask.optics.zernike import ZernikePhase
 from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
