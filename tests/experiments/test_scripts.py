@@ -27,7 +27,7 @@ def ends(script, *argv):
 
 def test_help_shows_what_the_script_says_of_itself(script, capsys):
     assert ends(script, "--help") == 0
-    out = capsys.readouterr().out
+    out = " ".join(capsys.readouterr().out.split())
     assert f"usage: {script.__name__} " in out
     assert script.__doc__.splitlines()[0] in out
     assert "--debug" in out

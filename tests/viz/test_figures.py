@@ -285,6 +285,7 @@ def test_stretch_values():
     image = torch.tensor([[math.nan, -3.0, 0.0], [1.0, 4.0, math.inf]], requires_grad=True)
     np.testing.assert_allclose(viz.stretch(image, percentile=100), [[0, 0, 0], [0.5, 1, 1]])
     assert (viz.stretch(torch.zeros(3, 3)) == 0).all()
+    np.testing.assert_array_equal(viz.stretch(torch.tensor([[0.0, math.inf, -math.inf]])), [[0, 1, 0]])
     glint = torch.zeros(100, 100)
     glint[3, 4] = 2.0  # a single point brighter than the percentile is still seen
     assert viz.stretch(glint).max() == 1

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 def stretch(image: Any, percentile: float = 99.5, gamma: float = 0.5) -> np.ndarray:
     """Map an image to [0, 1] for display: 0 stays 0, `percentile` becomes 1, the power `gamma` lifts the faint parts.
 
-    Values below 0 and NaN are shown as 0. An image that is nowhere positive becomes 0 everywhere.
+    Values below 0 and NaN are shown as 0, infinite ones as 1. An image that is nowhere positive becomes 0 everywhere.
 
     Examples
     --------
@@ -35,7 +35,7 @@ def stretch(image: Any, percentile: float = 99.5, gamma: float = 0.5) -> np.ndar
     values = as_array(image).astype(float)
     values = np.where(values > 0, values, 0.0)
     peak = _peak(values, percentile)
-    return (np.minimum(values, peak) / peak) ** gamma if peak > 0 else values
+    return (np.minimum(values, peak) / peak) ** gamma if peak > 0 else np.where(values > 0, 1.0, 0.0)
 
 
 def _peak(values: np.ndarray, percentile: float = 99.5) -> float:
