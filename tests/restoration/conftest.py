@@ -13,9 +13,13 @@ from torchmask.grid import Grid
 from torchmask.observation import Observation
 from torchmask.optics.aperture import Aperture, SparseAperture
 from torchmask.optics.detector import Detector
+from torchmask.restoration.aberrations import AberrationBasis, turbulent_basis
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.myopic import MyopicDeconvolution
+from torchmask.restoration.objective import MyopicObjective
+from torchmask.restoration.priors import TotalVariation
 from torchmask.restoration.result import RestorationResult
+from torchmask.restoration.state import Calibration, State
 from torchmask.simulation.exposures import simulate_observation
 
 R0, OUTER_SCALE, READOUT = 0.25, 20.0, 1.5
@@ -56,6 +60,41 @@ def five_holes() -> SparseAperture:
     """On a ring."""
     angles = torch.arange(5, dtype=torch.float64) * 2 * math.pi / 5
     return SparseAperture(torch.stack([angles.cos(), angles.sin()], -1) * 0.38, 0.22, 1.0)
+
+
+@pytest.fixture(scope="session")
+def five_hole_basis(five_holes) -> AberrationBasis:
+    """Piston, tip and tilt of every hole, white under turbulence."""
+    return turbulent_basis(five_holes, 3, 0, R0, OUTER_SCALE)
+
+
+@pytest.fixture(scope="session")
+def explain(five_holes, five_hole_basis) -> Callable[..., tuple[MyopicObjective, State]]:
+    """Makes noisy frames of a block, whose edges lie on the pixels, and the state that explains them."""
+
+    def make(model: ExposureModel | None = None, n_frames: int = 4, noise: float = 0.03):
+        grid = Grid.nyquist(1.0, 550e-9, 32, oversampling=1.2)
+        model = model or ExposureModel(five_holes, grid, five_hole_basis)
+        image = torch.zeros(model.window.field.shape, dtype=torch.float64)
+        image[10:19, 8:16], image[13:16, 16:25] = 6.0, 3.0
+        generator, basis = torch.Generator().manual_seed(0), model.aberrations
+        z = torch.randn(n_frames, basis.n_parameters, dtype=torch.float64, generator=generator)
+        z = basis.with_common_of(z, z[:1])
+        frames = model(image, z)
+        frames = frames + noise * torch.randn(frames.shape, dtype=torch.float64, generator=generator)
+        precision = torch.full((1, 1, 1), noise**-2, dtype=torch.float64)
+        ones = torch.ones(n_frames, dtype=torch.float64)
+        return MyopicObjective(model, frames, precision, TotalVariation()), State(
+            image, z, Calibration(ones, ones, 1.0)
+        )
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def explained(explain) -> tuple[MyopicObjective, State]:
+    """Four frames and the state that explains them."""
+    return explain()
 
 
 def satellite(shape: tuple[int, int], n_photons: float) -> Tensor:

@@ -1,10 +1,211 @@
-"""Restorations that are interrupted and go on, and to what a checkpoint belongs."""
+"""Progress on disk: all of it comes back, nothing foreign or damaged is taken, and what goes on ends in the same."""
 
+from dataclasses import fields
+from functools import partial
+
+import numpy as np
 import pytest
 import torch
+from torch import nn
 
+from torchmask.grid import Grid
+from torchmask.optics.aperture import SparseAperture
 from torchmask.record import Record
+from torchmask.restoration.candidates import several
+from torchmask.restoration.checkpoint import Checkpoint, Ending, Progress, Status, fingerprint_of
+from torchmask.restoration.forward import ExposureModel
+from torchmask.restoration.minimizers import TorchMinimizer
 from torchmask.restoration.myopic import MyopicDeconvolution
+from torchmask.restoration.objective import Free, MyopicObjective
+from torchmask.restoration.priors import EdgePreserving, TotalVariation, as_prior
+from torchmask.restoration.projected_lbfgs import ProjectedLBFGS
+from torchmask.restoration.schedule import Schedule
+from torchmask.restoration.state import Calibration, State
+
+CPU = torch.device("cpu")
+
+
+def random_state(seed, n_frames=3):
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(*shape):
+        return torch.rand(*shape, dtype=torch.float64, generator=generator)
+
+    return State(uniform(4, 5), uniform(n_frames, 2), Calibration(uniform(n_frames), 1 + uniform(n_frames), 0.3 + seed))
+
+
+def progress_with(**changes):
+    """Nothing of it as it is by default."""
+    given = {
+        "costs": [9.0, 7.5, 7.25],
+        "n_evaluations": 17,
+        "status": Status.CONVERGED,
+        "decrease": 3e-5,
+        "escapes": 4,
+        "starts": 2,
+        "began": 1,
+        "rival": Ending(random_state(1), Status.START_LIMIT),
+        "alike": True,
+    }
+    return Progress(several(random_state(0), 4), **given | changes)
+
+
+def same_state(one, other):
+    assert torch.equal(one.image, other.image)
+    assert torch.equal(one.z, other.z)
+    for item in fields(Calibration):
+        a, b = getattr(one.calibration, item.name), getattr(other.calibration, item.name)
+        assert torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b, item.name
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"rival": None},
+        {"rival": Ending(random_state(2), Status.CONVERGED, 1e-6), "status": Status.ITERATION_LIMIT},
+        {"status": Status.RUNNING, "decrease": None, "alike": False, "costs": [], "began": 0},
+        {"costs": [1.0]},
+    ],
+)
+def test_everything_comes_back(changes, tmp_path):
+    """Several candidates and a rival among it."""
+    saved = progress_with(**changes)
+    file = Checkpoint(tmp_path / "state.npz", "mine")
+    file.save(saved)
+    back = file.load(CPU)
+    same_state(back.state, saved.state)
+    assert back.candidates.n_each == 4
+    for item in fields(Progress):
+        if item.name not in ("candidates", "rival"):
+            assert getattr(back, item.name) == getattr(saved, item.name), item.name
+    assert (back.rival is None) == (saved.rival is None)
+    if saved.rival is not None:
+        same_state(back.rival.state, saved.rival.state)
+        assert (back.rival.status, back.rival.decrease) == (saved.rival.status, saved.rival.decrease)
+
+
+def test_a_later_checkpoint_replaces_the_earlier(tmp_path):
+    file = Checkpoint(tmp_path / "state.npz", "mine")
+    file.save(progress_with())
+    file.save(progress_with(rival=None, n_evaluations=99))
+    assert file.load(CPU).n_evaluations == 99
+    assert file.load(CPU).rival is None
+    assert [path.name for path in tmp_path.iterdir()] == ["state.npz"]
+
+
+def test_no_file_is_no_progress(tmp_path):
+    assert Checkpoint(tmp_path / "state.npz", "mine").load(CPU) is None
+
+
+def test_a_foreign_checkpoint_is_refused(tmp_path):
+    Checkpoint(tmp_path / "state.npz", "mine").save(progress_with())
+    with pytest.raises(ValueError, match=r"state\.npz is the checkpoint of other frames or settings, or of another"):
+        Checkpoint(tmp_path / "state.npz", "yours").load(CPU)
+
+
+def test_a_damaged_checkpoint_is_refused(tmp_path):
+    """Cut short, overwritten, or without any one of its parts."""
+    file = Checkpoint(tmp_path / "state.npz", "mine")
+    file.save(progress_with(rival=Ending(random_state(1), Status.CONVERGED, 1e-6)))
+    whole, parts = file.path.read_bytes(), dict(np.load(file.path))
+    for damaged in (whole[: len(whole) // 2], b"", b"not at all"):
+        file.path.write_bytes(damaged)
+        with pytest.raises(ValueError, match=r"state\.npz"):
+            file.load(CPU)
+    optional = {"decrease", "rival_decrease"}  # where a start is not at its end
+    for name in parts.keys() - optional:
+        np.savez(file.path, **{key: value for key, value in parts.items() if key != name})
+        with pytest.raises(ValueError, match=rf"state\.npz has no {name}\b"):
+            file.load(CPU)
+    np.savez(file.path, **parts | {"status": "FINISHED"})
+    with pytest.raises(ValueError, match="'FINISHED'"):
+        file.load(CPU)
+
+
+def test_a_checkpoint_of_version_0_1_is_refused(tmp_path):
+    """The arrays that 0.1.0 wrote."""
+    old = {"image": np.ones((4, 5)), "z": np.zeros((3, 2)), "gains": np.ones(3), "prior": 1.0, "excess": np.ones(3)}
+    old |= {"costs": [2.0, 1.0], "n_evaluations": 3, "relocations": 0, "starts": 1, "began": 0}
+    old |= {"rival_message": "", "message": "", "fingerprint": "0" * 64}
+    np.savez(tmp_path / "old.npz", **old)
+    with pytest.raises(ValueError, match=r"or of another version: give another name or remove it"):
+        Checkpoint(tmp_path / "old.npz", "1" * 64).load(CPU)
+
+
+# --- to what a checkpoint belongs
+
+GRID = Grid((25, 25), 550e-9 / 2, 550e-9)  # with a field of 32 pixels: samples of the pupil are 1/16 m apart
+CENTRES = [[0.0, 0.3125], [0.3125, -0.1875], [-0.3125, -0.1875]]
+
+
+class Scaled(nn.Module):
+    def __init__(self, scale):
+        super().__init__()
+        self.scale = nn.Parameter(torch.tensor(scale))
+
+    def forward(self, image):
+        return self.scale * (image**2).sum()
+
+
+class Hidden(nn.Module):
+    """Its parameter stands neither in its repr nor anywhere else but in its state."""
+
+    def __init__(self, scale):
+        super().__init__()
+        self.register_buffer("scale", torch.tensor(scale))
+
+    def forward(self, image):
+        return self.scale * (image**2).sum()
+
+
+def fingerprint(centers=CENTRES, frames=None, prior=None, free=Free.OBJECT, settings=(True, False), known=(None,)):
+    model = ExposureModel(SparseAperture(centers, 0.25, 1.0), GRID, 3)
+    frames = torch.ones(2, 25, 25, dtype=torch.float64) if frames is None else frames
+    precision = torch.ones(1, 1, 1, dtype=torch.float64)
+    objective = MyopicObjective(model, frames, precision, as_prior(prior or TotalVariation()), free=free)
+    return fingerprint_of(objective, settings, known)
+
+
+def test_a_fingerprint_is_the_same_for_the_same():
+    assert fingerprint() == fingerprint()
+    assert fingerprint(prior=Hidden(2.0)) == fingerprint(prior=Hidden(2.0))
+
+
+def test_a_fingerprint_tells_frames_priors_settings_and_masks_apart():
+    moved = [
+        [0.0, 0.3125],
+        [0.3125, -0.125],
+        [-0.3125, -0.1875],
+    ]  # by one sample: each hole's own samples look the same
+    frames = torch.ones(2, 25, 25, dtype=torch.float64)
+    frames[1, 3, 4] = 1.5
+    prints = [
+        fingerprint(),
+        fingerprint(moved),
+        fingerprint(frames=frames),
+        fingerprint(prior=TotalVariation(2.0)),
+        fingerprint(prior=TotalVariation(1.0, 0.02)),
+        fingerprint(prior=EdgePreserving(1.0, 0.01)),
+        fingerprint(prior=Hidden(2.0)),
+        fingerprint(prior=Hidden(3.0)),
+        fingerprint(prior=Scaled(2.0)),
+        fingerprint(prior=torch.sum),
+        fingerprint(prior=torch.mean),
+        fingerprint(free=Free.OBJECT | Free.ABERRATIONS),
+        fingerprint(settings=(True, True)),
+        fingerprint(settings=(True, Schedule())),
+        fingerprint(settings=(True, Schedule(segment=99))),
+        fingerprint(settings=(True, ProjectedLBFGS())),
+        fingerprint(settings=(True, ProjectedLBFGS(5))),
+        fingerprint(known=(torch.ones(3),)),
+        fingerprint(known=(torch.zeros(3),)),
+        fingerprint(known=(None, None)),
+    ]
+    assert len(set(prints)) == len(prints)
+
+
+# --- whole restorations
 
 
 def test_interrupted_and_resumed_is_the_same(observation, restoring, tmp_path):
@@ -25,6 +226,7 @@ def test_interrupted_and_resumed_is_the_same(observation, restoring, tmp_path):
     assert torch.equal(resumed.coefficients, whole.coefficients)
     assert torch.equal(resumed.cost, whole.cost)
     assert resumed.n_evaluations == whole.n_evaluations
+    assert resumed.message == whole.message
     with pytest.raises(ValueError, match="other frames or settings"):
         method.restore(observation.frames * 1.1, checkpoint=path)
     spread = method.restore(observation.frames, checkpoint=path, n_samples=2)  # of what is there, without a step more
@@ -46,3 +248,37 @@ def test_a_checkpoint_belongs_to_what_was_known(observation, restored, restoring
     MyopicDeconvolution(*instrument, r0=None, max_iterations=2).restore(observation.frames, checkpoint=path)
     with pytest.raises(ValueError, match="other frames or settings"):  # the first guess, taken for known now
         MyopicDeconvolution(*instrument, r0=0.22, max_iterations=2).restore(observation.frames, checkpoint=path)
+
+
+def test_a_checkpoint_belongs_to_its_settings(observation, restoring, tmp_path):
+    path = tmp_path / "state.npz"
+    frames, mine = observation.frames, {"prior": Hidden(2.0)}
+    first = restoring(3, max_iterations=2, **mine).restore(frames, checkpoint=path)
+    for change in (
+        {"prior": Hidden(3.0)},
+        {"prior": TotalVariation()},
+        {"schedule": Schedule(segment=50)},
+        {"minimizer": ProjectedLBFGS(5)},
+        {"minimizer": TorchMinimizer(partial(torch.optim.Adam, lr=0.1))},
+        {"r0": 0.3},
+        {"aberration_prior": False},
+    ):
+        with pytest.raises(ValueError, match="other frames or settings"):
+            restoring(3, max_iterations=2, **mine | change).restore(frames, checkpoint=path)
+    with pytest.raises(ValueError, match="other frames or settings"):
+        restoring(3, max_iterations=2, **mine).restore(frames, checkpoint=path, seed=1)
+    again = restoring(3, max_iterations=2, **mine).restore(frames, checkpoint=path)
+    assert torch.equal(again.object, first.object)
+
+
+def test_more_iterations_than_before_go_on(observation, restoring, tmp_path):
+    path = tmp_path / "state.npz"
+    schedule = Schedule(segment=5)  # limits that lie between two segments leave no trace
+    whole = restoring(3, max_iterations=10, schedule=schedule).restore(observation.frames)
+    restoring(3, max_iterations=5, schedule=schedule).restore(observation.frames, checkpoint=path)
+    longer = restoring(3, max_iterations=10, schedule=schedule).restore(observation.frames, checkpoint=path)
+    assert len(longer.cost) == 10
+    assert torch.equal(longer.cost[:5], whole.cost[:5])
+    assert "max_iterations = 10" in longer.message
+    shorter = restoring(3, max_iterations=5, schedule=schedule).restore(observation.frames, checkpoint=path)
+    assert torch.equal(shorter.cost, longer.cost)  # what is done is done

@@ -9,51 +9,16 @@ import torch
 from torchmask.grid import Grid
 from torchmask.metrics import shift
 from torchmask.optics.band import Band
-from torchmask.restoration.aberrations import AberrationBasis, turbulent_basis
+from torchmask.restoration.aberrations import AberrationBasis
 from torchmask.restoration.escapes import centre_on_pixels, restart_outlier_frames, tilt
 from torchmask.restoration.forward import ExposureModel
-from torchmask.restoration.objective import MyopicObjective
-from torchmask.restoration.priors import TotalVariation
 from torchmask.restoration.projected_lbfgs import Minimum, ProjectedLBFGS
 from torchmask.restoration.schedule import Schedule
-from torchmask.restoration.state import Calibration, State
 
 GRID = Grid.nyquist(1.0, 550e-9, 32, oversampling=1.2)
-FRAMES, LOST = 4, 2
+FRAMES, LOST = 4, 2  # of `explained`
 FIRST_INFLATION = 30.0
 SCHEDULE = Schedule()
-
-
-def block(shape):
-    """Edges that lie on the pixels."""
-    image = torch.zeros(shape, dtype=torch.float64)
-    image[10:19, 8:16], image[13:16, 16:25] = 6.0, 3.0
-    return image
-
-
-@pytest.fixture(scope="module")
-def basis(five_holes):
-    return turbulent_basis(five_holes, 3, 0, 0.25, 20.0)
-
-
-@pytest.fixture(scope="module")
-def truth(five_holes, basis):
-    """Objective and state of noisy frames that the true state explains: (objective, state)."""
-    return problem(ExposureModel(five_holes, GRID, basis))
-
-
-def problem(model, noise=0.03):
-    generator = torch.Generator().manual_seed(0)
-    image = block(model.window.field.shape)
-    basis = model.aberrations
-    z = torch.randn(FRAMES, basis.n_parameters, dtype=torch.float64, generator=generator)
-    z = basis.with_common_of(z, z[:1])
-    frames = model(image, z)
-    frames = frames + noise * torch.randn(frames.shape, dtype=torch.float64, generator=generator)
-    precision = torch.full((1, 1, 1), noise**-2, dtype=torch.float64)
-    objective = MyopicObjective(model, frames, precision, TotalVariation())
-    ones = torch.ones(FRAMES, dtype=torch.float64)
-    return objective, State(image, z, Calibration(ones, ones, 1.0))
 
 
 def with_lost(state, z):
@@ -93,9 +58,9 @@ def idle(cost, start, lower, *, max_iterations, callback):
 # --- frames
 
 
-def test_a_lost_frame_is_found_again(truth):
+def test_a_lost_frame_is_found_again(explained):
     """From aberrations of another frame; the residuals of the others tell that it is lost."""
-    objective, state = truth
+    objective, state = explained
     lost = with_lost(state, -state.z[0])
     minimizer = Counting()
     found, n_evaluations = restart_outlier_frames(objective, lost, FIRST_INFLATION, SCHEDULE, minimizer, seed=1)
@@ -110,31 +75,31 @@ def test_a_lost_frame_is_found_again(truth):
     assert n_evaluations == minimizer.n_evaluations // FRAMES  # in units of evaluations of the whole stack
 
 
-def test_frames_that_fit_are_left_alone_at_no_cost(truth):
-    objective, state = truth
+def test_frames_that_fit_are_left_alone_at_no_cost(explained):
+    objective, state = explained
     found, n_evaluations = restart_outlier_frames(objective, state, FIRST_INFLATION, SCHEDULE, idle, seed=1)
     assert found is state
     assert n_evaluations == 0
 
 
-def test_a_frame_keeps_its_aberrations_unless_others_are_better(truth):
+def test_a_frame_keeps_its_aberrations_unless_others_are_better(explained):
     """Random ones that go nowhere are not; every evaluation counts, those in vain too."""
-    objective, state = truth
+    objective, state = explained
     lost = with_lost(state, state.z[LOST] + 0.3)  # a poor fit, but no worse than a random one
     found, n_evaluations = restart_outlier_frames(objective, lost, FIRST_INFLATION, SCHEDULE, idle, seed=1)
     assert found is lost
     assert n_evaluations == SCHEDULE.restarts * SCHEDULE.restart_rounds * 7 // FRAMES
 
 
-def test_what_is_outlying_is_a_number_of_the_schedule(truth):
-    objective, state = truth
+def test_what_is_outlying_is_a_number_of_the_schedule(explained):
+    objective, state = explained
     lost = with_lost(state, state.z[LOST] + 0.3)
     blind = replace(SCHEDULE, outlying=math.inf)
     assert restart_outlier_frames(objective, lost, FIRST_INFLATION, blind, idle, seed=1) == (lost, 0)
 
 
-def test_restarts_are_those_of_the_seed(truth):
-    objective, state = truth
+def test_restarts_are_those_of_the_seed(explained):
+    objective, state = explained
     lost = with_lost(state, -state.z[0])
     brief = replace(SCHEDULE, restarts=1, restart_rounds=1, restart_iterations=3)
 
@@ -145,9 +110,9 @@ def test_restarts_are_those_of_the_seed(truth):
     assert not torch.equal(restarted(1), restarted(2))
 
 
-def test_what_all_frames_share_stays_when_one_starts_anew(five_holes, basis):
-    shared = AberrationBasis(basis.mixing, 3, n_common=6)
-    objective, state = problem(ExposureModel(five_holes, GRID, shared))
+def test_what_all_frames_share_stays_when_one_starts_anew(five_holes, five_hole_basis, explain):
+    shared = AberrationBasis(five_hole_basis.mixing, 3, n_common=6)
+    objective, state = explain(ExposureModel(five_holes, GRID, shared))
     lost = state.z[LOST].clone()
     lost[: shared.n_own] = -state.z[0, : shared.n_own]
     found, _ = restart_outlier_frames(
@@ -162,9 +127,9 @@ def test_what_all_frames_share_stays_when_one_starts_anew(five_holes, basis):
 
 @pytest.mark.parametrize("band", [None, Band.of((540e-9, 580e-9))])
 @pytest.mark.parametrize("offset", [(2.0, -3.0), (0.4, -0.2)])
-def test_tilt_moves_every_image(offset, band, five_holes, basis):
-    model = ExposureModel(five_holes, GRID, basis, band)
-    z = torch.randn(2, basis.n_parameters, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+def test_tilt_moves_every_image(offset, band, five_holes, five_hole_basis):
+    model = ExposureModel(five_holes, GRID, five_hole_basis, band)
+    z = torch.randn(2, five_hole_basis.n_parameters, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     moved = model.psf(z + tilt(model, offset))
     torch.testing.assert_close(moved, shift(model.psf(z), offset), rtol=0, atol=1e-9)
 
@@ -185,9 +150,9 @@ def moved_away(objective, state, offset):
         ((-0.2, -0.6), (0, 0)),
     ],
 )
-def test_an_object_off_its_pixels_comes_back_to_them(offset, whole, truth):
+def test_an_object_off_its_pixels_comes_back_to_them(offset, whole, explained):
     """To its own or to the next, which no frame can tell; settled there it costs less than the truth itself."""
-    objective, state = truth
+    objective, state = explained
     state = state.calibrated(aberration_weight=0.0)
     away = moved_away(objective, state, offset)
     torch.testing.assert_close(objective.model(away.image, away.z), objective.model(state.image, state.z))
@@ -202,13 +167,13 @@ def test_an_object_off_its_pixels_comes_back_to_them(offset, whole, truth):
     assert values[0] < values[1] < values[2]
 
 
-def test_an_object_on_its_pixels_is_the_very_same_state(truth):
-    objective, state = truth
+def test_an_object_on_its_pixels_is_the_very_same_state(explained):
+    objective, state = explained
     assert centre_on_pixels(objective, state, SCHEDULE) is state
 
 
-def test_a_prior_on_the_aberrations_that_holds_more_than_the_object_gains_keeps_it(truth):
-    objective, state = truth
+def test_a_prior_on_the_aberrations_that_holds_more_than_the_object_gains_keeps_it(explained):
+    objective, state = explained
     away = moved_away(objective, state, (0.4, 0.0))
     held = objective.with_changes(centre=away.z)
     for weight, stays in ((1e9, True), (1e-9, False)):
@@ -216,7 +181,7 @@ def test_a_prior_on_the_aberrations_that_holds_more_than_the_object_gains_keeps_
         assert (centre_on_pixels(held, begun, SCHEDULE) is begun) == stays
 
 
-def test_places_are_those_of_the_schedule(truth):
-    objective, state = truth
+def test_places_are_those_of_the_schedule(explained):
+    objective, state = explained
     away = moved_away(objective, state.calibrated(aberration_weight=0.0), (0.4, 0.0))
     assert centre_on_pixels(objective, away, replace(SCHEDULE, pixel_steps=())) is away

@@ -79,6 +79,7 @@ class Progress:
 
 
 _NUMBERS = ("n_evaluations", "escapes", "starts", "began", "alike")
+_NEEDED = ("image", "z", "status", *(item.name for item in fields(Calibration)))  # of an ending
 
 
 @dataclass(frozen=True)
@@ -111,7 +112,10 @@ class Checkpoint:
                 f"{self.path} is the checkpoint of other frames or settings, or of another version: give another name "
                 "or remove it"
             )
-        missing = [name for name in ("z", "status", "costs", "n_candidates", *_NUMBERS) if name not in stored]
+        has_rival = any(name.startswith("rival_") for name in stored)
+        prefixes = ("", "rival_") if has_rival else ("",)
+        endings = [prefix + name for prefix in prefixes for name in _NEEDED]
+        missing = [name for name in ("costs", "n_candidates", *_NUMBERS, *endings) if name not in stored]
         if missing:
             raise ValueError(f"{self.path} has no {', '.join(missing)}: it is damaged, remove it to begin anew")
         now = _ending(stored, "", device)
@@ -120,7 +124,7 @@ class Checkpoint:
             np.atleast_1d(stored["costs"]).tolist(),
             status=now.status,
             decrease=now.decrease,
-            rival=_ending(stored, "rival_", device) if "rival_z" in stored else None,
+            rival=_ending(stored, "rival_", device) if has_rival else None,
             **{name: stored[name].item() for name in _NUMBERS},
         )
 
@@ -130,7 +134,7 @@ def fingerprint_of(objective: MyopicObjective, settings: Sequence[object], known
     prior = objective.prior
     digest = hashlib.sha256(repr((*settings, objective.free, repr(prior))).encode())
     samples = objective.model.pupil.samples()
-    tensors = [objective.frames, objective.precision, samples.basis, samples.weights, *prior.state_dict().values()]
+    tensors = [objective.frames, objective.precision, *samples, *prior.state_dict().values()]
     for tensor in [*tensors, *known]:
         digest.update(b"none" if tensor is None else as_array(tensor).tobytes())
     return digest.hexdigest()
