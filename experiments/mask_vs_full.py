@@ -40,10 +40,10 @@ from torchmask.design.sweep import run_tasks
 from torchmask.design.table import design_table
 from torchmask.grid import Grid
 from torchmask.metrics import relative_error
-from torchmask.observation import Observation
+from torchmask.observation import PHASE_OVERSAMPLING, Observation
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.detector import Detector
-from torchmask.optics.pupil import Aperture, PupilSamples
+from torchmask.optics.pupil import Aperture
 from torchmask.optics.shapes import Disc
 from torchmask.optics.zernike import zernike_basis
 from torchmask.record import Callback
@@ -52,24 +52,6 @@ from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
 
 TRUE_MODES = {"mask": 36, "full": 351}  # by which the true aberrations are given, per sub-aperture
-
-
-class RecordedTurbulence(TurbulencePhase):
-    """Turbulence that keeps the aberrations it draws: `coefficients` (T, N, J) of the aperture's own modes [rad]."""
-
-    def __init__(self, r0: float, outer_scale: float, aperture: Aperture, n_modes: int) -> None:
-        super().__init__(r0, outer_scale)
-        self.aperture, self.n_modes = aperture, n_modes
-        self.coefficients: Tensor | None = None
-
-    def forward(self, samples: PupilSamples, n_frames: int, generator: torch.Generator | None = None) -> Tensor:
-        phase = super().forward(samples, n_frames, generator)
-        basis = zernike_basis(samples, self.aperture, self.n_modes)
-        root = samples.weights.sqrt()[..., None]
-        # Weighted least squares: phases of all frames are the columns.
-        fit = torch.linalg.lstsq(root * basis, root * phase.permute(1, 2, 0), driver="gelsd").solution
-        self.coefficients = fit.permute(2, 0, 1).contiguous()
-        return phase
 
 
 def instrument(task: Mapping[str, Any]) -> Aperture:
@@ -86,14 +68,23 @@ def observe(task: Mapping[str, Any]) -> tuple[Observation, Tensor]:
     path, attitude = task["scene"]["path"], task["scene"]["attitude"]
     options = SceneOptions(Path(path) if path else None, tuple(attitude) if attitude else None, size=0.5)
     scene = make_scene(grid.shape, task["n_photons"] * aperture.area / mask.area, options)
-    turbulence = RecordedTurbulence(
-        DIAMETER / task["d_over_r0"], task["outer_scale"] * DIAMETER, aperture, TRUE_MODES[task["instrument"]]
+    turbulence = TurbulencePhase(DIAMETER / task["d_over_r0"], task["outer_scale"] * DIAMETER)
+    detector, generator = Detector(task["readout_noise"]), torch.Generator().manual_seed(task["seed"])
+    observation = simulate_observation(
+        scene, aperture, grid, turbulence, detector, task["n_frames"], generator, keep_phases=True
     )
-    generator = torch.Generator().manual_seed(task["seed"])
-    detector = Detector(task["readout_noise"])
-    observation = simulate_observation(scene, aperture, grid, turbulence, detector, task["n_frames"], generator)
-    assert turbulence.coefficients is not None
-    return observation, turbulence.coefficients
+    return observation, fit_modes(observation, TRUE_MODES[task["instrument"]])
+
+
+def fit_modes(observation: Observation, n_modes: int) -> Tensor:
+    """Zernike coefficients (T, N, J) [rad rms] of the phases of an observation, by weighted least squares."""
+    assert observation.phases is not None
+    samples = observation.aperture.samples(observation.grid, PHASE_OVERSAMPLING)
+    basis = zernike_basis(samples, observation.aperture, n_modes)
+    root = samples.weights.sqrt()[..., None]
+    # Phases of all frames are the columns.
+    fit = torch.linalg.lstsq(root * basis, root * observation.phases.permute(1, 2, 0), driver="gelsd").solution
+    return fit.permute(2, 0, 1).contiguous()
 
 
 def measure(task: dict[str, Any]) -> dict[str, Any]:

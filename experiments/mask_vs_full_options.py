@@ -40,8 +40,8 @@ class Options(SweepOptions):
     """Short exposures, T."""
     n_pixels: int = 96
     """Of the image, per side."""
-    iterations: int = 600
-    """At most, of every restoration."""
+    iterations: int = 2400
+    """At most, of all starts of a restoration."""
     restarts: int = 1
     """Restorations of the full pupil."""
     mask: Path | None = None
@@ -66,7 +66,7 @@ def with_presets(options: Options) -> Options:
         raise ValueError("full and smoke are both given: choose one")
     if options.full:
         whole = {"photons": (1e4, 1e5, 1e6, 1e7, 1e8), "d_over_r0": (3.0, 5.0, 7.0, 10.0, 15.0)}
-        whole |= {"seeds": (0, 1, 2, 3, 4), "n_frames": 20, "n_pixels": 128, "iterations": 1000, "restarts": 2}
+        whole |= {"seeds": (0, 1, 2, 3, 4), "n_frames": 20, "n_pixels": 128, "iterations": 4000, "restarts": 2}
         options = dataclasses.replace(options, **whole)
     if options.smoke:
         tiny: dict[str, Any] = {"photons": (1e5, 1e6), "d_over_r0": (3.0,), "seeds": (0, 1), "views": 1, "n_frames": 2}
