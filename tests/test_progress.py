@@ -75,6 +75,23 @@ def test_bars_on_a_terminal(clock):
     assert bar._bars is None
 
 
+def test_a_budget_that_grows_is_the_one_that_counts(clock):
+    """A restoration that starts again has the iterations of both starts."""
+    for terminal in (True, False):
+        out = io.StringIO()
+        with Progress(console=Console(file=out, force_terminal=terminal, width=120)) as bar:
+            run(bar, clock, "restoration", 10, 1.0)
+            for step in range(11, 22):
+                clock.now += 1.0
+                bar(Record("restoration", step, 40, {"cost": 1.0}))
+            if terminal:
+                (task,) = bar._bars.tasks
+                assert (task.completed, task.total) == (21, 40)
+                assert not task.finished
+        if not terminal:
+            assert "restoration 21/40 cost 1 20 s, 18 s left" in out.getvalue()  # 20 s (40 - 21) / 21
+
+
 def test_an_interruption_frees_the_terminal(clock):
     out = io.StringIO()
     bar = Progress(console=Console(file=out, force_terminal=True, width=120))

@@ -94,7 +94,8 @@ class Progress:
             self._bars.start()
         if record.stage not in self._tasks:
             self._tasks[record.stage] = self._bars.add_task(record.stage, total=record.n_steps, value="")
-        self._bars.update(self._tasks[record.stage], completed=record.step, value=_objective(record))
+        budget: dict[str, Any] = {"completed": record.step, "total": record.n_steps}  # a new start may raise it
+        self._bars.update(self._tasks[record.stage], **budget, value=_objective(record))
 
     def _print(self, record: Record, estimate: str = "") -> None:
         seconds = self._last_time - self._started[record.stage]
