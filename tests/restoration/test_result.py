@@ -23,3 +23,61 @@ def test_result_survives_the_disk(restored, tmp_path):
         RestorationResult.load(tmp_path / "foreign.npz")
     for words in ("48 x 48", "8 frames", "converged", "chi-square"):
         assert words in restored.summary()
+
+
+def result_of_version_0_1(n_frames=2):
+    """The arrays that 0.1.0 wrote, as numpy writes them: gains and a weight of total variation."""
+    frames = np.random.default_rng(0).random((n_frames, 8, 8))
+    return {
+        "object": 100 * frames[0],
+        "extended_object": np.ones((10, 10)),
+        "coefficients": np.zeros((n_frames, 3, 4)),
+        "gains": np.linspace(0.9, 1.1, n_frames),
+        "model": frames,
+        "residuals": frames - 0.5,
+        "chi_square": np.linspace(1.0, 1.5, n_frames),
+        "tv_weight": 0.5,
+        "r0": 0.2,
+        "noise": 21.3,
+        "cost": np.array([3.0, 2.0, 1.5]),
+        "converged": False,
+        "message": "stopped at max_iterations = 3",
+        "n_evaluations": 5,
+        "seconds": 0.7,
+    }
+
+
+@pytest.mark.parametrize("deviations", [{}, {"object_std": np.ones((8, 8)), "coefficients_std": np.ones((3, 4))}])
+def test_results_of_version_0_1_are_read(deviations, tmp_path):
+    old = result_of_version_0_1() | deviations
+    np.savez(tmp_path / "old.npz", **old)
+    back = RestorationResult.load(tmp_path / "old.npz")
+    same = old.keys() - {"gains", "tv_weight"}
+    for name in same:
+        found = getattr(back, name)
+        assert np.array_equal(found.numpy(), old[name]) if isinstance(found, torch.Tensor) else found == old[name], name
+    assert np.array_equal(back.transmission.numpy(), old["gains"])
+    assert back.prior == "TotalVariation(weight=0.5, epsilon=0.01)"
+    if not deviations:
+        assert back.object_std is None
+        assert back.coefficients_std is None
+    assert "prior TotalVariation(weight=0.5" in back.summary()
+    back.save(tmp_path / "new.npz")  # from now on under today's names
+    again = np.load(tmp_path / "new.npz")
+    assert "gains" not in again
+    assert np.array_equal(again["transmission"], old["gains"])
+
+
+@pytest.mark.parametrize("name", ["gains", "tv_weight", "object", "coefficients", "r0", "message", "seconds"])
+def test_a_file_that_lacks_something_is_refused(name, tmp_path):
+    old = result_of_version_0_1()
+    np.savez(tmp_path / "old.npz", **{key: value for key, value in old.items() if key != name})
+    with pytest.raises(ValueError, match=r"old\.npz has no"):
+        RestorationResult.load(tmp_path / "old.npz")
+
+
+def test_no_file_and_no_archive_are_refused(tmp_path):
+    (tmp_path / "text.npz").write_text("not at all")
+    for name in ("text.npz", "missing.npz"):
+        with pytest.raises(ValueError, match=name):
+            RestorationResult.load(tmp_path / name)

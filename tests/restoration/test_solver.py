@@ -1,6 +1,8 @@
 """The course of a restoration: why it ends, when it starts again, and what it reports."""
 
-from pathlib import Path
+import math
+from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -8,17 +10,311 @@ import torch
 from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.grid import Grid
 from torchmask.metrics import relative_error
-from torchmask.observation import Observation
+from torchmask.optics.aperture import FullAperture
 from torchmask.optics.detector import Detector
 from torchmask.record import Record
+from torchmask.restoration.calibration import calibrate, fit_of_frames, recalibrate, sharpen_noise_inflation
+from torchmask.restoration.candidates import Candidates, play_stage, with_candidates
+from torchmask.restoration.checkpoint import Ending, Progress, Status
+from torchmask.restoration.forward import ExposureModel
+from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.myopic import MyopicDeconvolution
+from torchmask.restoration.projected_lbfgs import Minimum, ProjectedLBFGS
 from torchmask.restoration.schedule import Schedule
+from torchmask.restoration.solver import Solver, Traits
+from torchmask.restoration.starts import Known
 from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
 
-STACKS = Path(__file__).parents[3] / "shared" / "stacks"
 ALL_MISSED = {"missed": -1.0, "chance": -1e9}  # no fit is good enough
+NONE_MISSED = {"missed": math.inf}
 PLAIN = {"sharp_after": 50, "escapes": 0}  # ends when a segment brings nothing more
+BRISK = {"segment": 5, "sharp_after": 3, "escapes": 0}
+UNIT = 500.0  # electrons
+
+
+def solver_of(objective, callback=None, minimizer=None, schedule=None, **traits):
+    """A solver of the frames of `objective`, for a mask and known turbulence unless told otherwise."""
+    variance = UNIT**2 / float(objective.precision.mean())
+    stack = FrameStack(objective.frames, torch.ones_like(objective.frames, dtype=torch.bool), UNIT, variance)
+    given = {"many_minima": False, "estimated": False, "prior_on_aberrations": True, "r0_is_open": False}
+    given |= {"max_iterations": 1000, "tolerance": 0.0, "seed": 0}
+    return Solver(
+        objective, stack, Traits(**given | traits), schedule or Schedule(), minimizer or ProjectedLBFGS(), callback
+    )
+
+
+def idle(cost, start, lower, *, max_iterations, callback):
+    """A minimiser that says it has evaluated seven times in two iterations, and stays."""
+    value = cost(start)[0]
+    callback(start, value, 3)
+    callback(start, value, 7)
+    return Minimum(start, value, 2, 7, False, "idle")
+
+
+def full_pupil(explain, n_modes=6):
+    grid = Grid.nyquist(1.0, 550e-9, 32, oversampling=1.2)
+    return explain(ExposureModel(FullAperture(1.0), grid, n_modes), n_frames=3)
+
+
+# --- why it ends
+
+
+def test_it_has_converged_when_a_segment_brings_little(explained):
+    objective, _ = explained
+    solver, states = solver_of(objective, tolerance=0.5, schedule=Schedule(**BRISK)), []
+    begun = solver.begin(Known(), None)
+    states.append(begun.state)
+    progress = solver.run(begun, False, lambda now: states.append(now.state))
+    assert progress.status is Status.CONVERGED
+    decreases = []
+    for state, after in zip(states[:-1], progress.costs[4::5], strict=True):  # before and at the end of each segment
+        before = float(objective.value_and_gradients(state.image, state.z, state.calibration).value)
+        decreases.append((before - after) / after)
+    assert all(decrease > 0.5 for decrease in decreases[:-1])
+    assert 0 <= decreases[-1] <= 0.5
+    assert progress.decrease == pytest.approx(decreases[-1], rel=1e-9)
+
+
+def test_a_start_that_spends_its_iterations_ends(explained):
+    schedule = Schedule(start_iterations=12, **NONE_MISSED, **BRISK)
+    progress = solver_of(explained[0], schedule=schedule).solve(Known())
+    assert progress.status is Status.START_LIMIT
+    assert progress.decrease is None
+    assert len(progress.costs) == 12
+
+
+@pytest.mark.parametrize("max_iterations", [1, 3, 6, 7, 13, 18, 40])
+def test_iterations_are_those_of_all_starts(max_iterations, explained):
+    """Four starts of six at most; the third and fourth are cut short, or do not begin."""
+    schedule = Schedule(start_iterations=6, alike=-1.0, **ALL_MISSED, **BRISK)
+    records: list[Record] = []
+    solver = solver_of(explained[0], records.append, schedule=schedule, max_iterations=max_iterations)
+    progress = solver.solve(Known())
+    n_all = min(max_iterations, 4 * 6)
+    assert len(progress.costs) == len(records) == n_all
+    assert progress.starts == math.ceil(n_all / 6)
+    assert [record.step for record in records] == list(range(1, n_all + 1))
+    assert [record.n_steps for record in records] == [
+        min(6 * (1 + number // 6), max_iterations) for number in range(n_all)
+    ]
+    if progress.starts == 1:  # of several it is the best that tells why it ended
+        assert progress.status is (Status.ITERATION_LIMIT if max_iterations <= 6 else Status.START_LIMIT)
+
+
+def test_every_segment_is_saved(explained):
+    solver, saved = solver_of(explained[0], schedule=Schedule(**NONE_MISSED, **BRISK), max_iterations=12), []
+    solver.run(
+        solver.begin(Known(), None), False, lambda progress: saved.append((len(progress.costs), progress.status))
+    )
+    assert saved == [(5, Status.RUNNING), (10, Status.RUNNING), (12, Status.ITERATION_LIMIT)]
+
+
+# --- when it starts again
+
+
+def test_what_is_tolerable_is_a_share_of_the_change_or_noise(explained):
+    objective, _ = explained
+    frames = objective.frames
+    change = float(((frames - frames.mean((1, 2), keepdim=True) * frames.mean(0)) ** 2).mean() * objective.precision)
+    noise = math.sqrt(2 / frames.numel())
+    assert solver_of(objective).tolerable == pytest.approx(max(0.0013 * change, 2 * noise))
+    assert solver_of(objective, schedule=Schedule(missed=0.5)).tolerable == pytest.approx(0.5 * change)
+    assert solver_of(objective, schedule=Schedule(missed=0.0, chance=3.0)).tolerable == pytest.approx(3 * noise)
+    assert solver_of(objective).first_inflation == pytest.approx(max(1, change / 30))
+    assert solver_of(objective, schedule=Schedule(first_inflation=1e9)).first_inflation == 1
+
+
+def test_what_is_unexplained_is_the_chi_square_beyond_one(explained):
+    objective, state = explained
+    chi_square = fit_of_frames(objective, state)[1]
+    assert solver_of(objective).unexplained(state) == pytest.approx(float(chi_square.mean()) - 1)
+    assert abs(solver_of(objective).unexplained(state)) < 4 * math.sqrt(2 / objective.frames.numel())  # is the truth
+
+
+@pytest.mark.parametrize("rival_is_better", [False, True])
+def test_the_better_of_two_starts_is_kept(rival_is_better, explained):
+    """At the end of a start that has one more iteration."""
+    objective, truth = explained
+    poor = replace(truth, z=0 * truth.z)
+    now, before = (poor, truth) if rival_is_better else (truth, poor)
+    solver = solver_of(objective, schedule=Schedule(start_iterations=1, **BRISK | {"sharp_after": 0}))
+    rival = Ending(before, Status.CONVERGED, 1e-9)
+    begun = Progress(Candidates(now, 1), [1.0], starts=4, began=1, rival=rival)
+    progress = solver.run(begun, True, lambda _: None)
+    assert progress.starts == 4  # that was the last one
+    assert not progress.alike
+    if rival_is_better:
+        assert progress.state is truth
+        assert (progress.status, progress.decrease) == (Status.CONVERGED, 1e-9)
+    else:
+        assert progress.status is Status.START_LIMIT
+        assert solver.unexplained(progress.state) < solver.unexplained(poor)
+
+
+@pytest.mark.parametrize(("alike", "n_starts"), [(0.03, 2), (-1.0, 4)])
+def test_two_starts_that_end_alike_are_the_last(alike, n_starts, explained):
+    objective, _ = explained
+    schedule = Schedule(start_rms=0.0, start_iterations=5, alike=alike, **ALL_MISSED, **BRISK)
+    progress = solver_of(objective, schedule=schedule).solve(Known())
+    assert progress.starts == n_starts
+    assert progress.alike == (alike > 0)
+
+
+def test_a_start_too_short_to_tell_is_not_judged(explained):
+    """Its object is not sharp yet."""
+    schedule = Schedule(start_iterations=5, **ALL_MISSED, **BRISK | {"sharp_after": 5})
+    assert solver_of(explained[0], schedule=schedule).solve(Known()).starts == 1
+
+
+def test_only_what_is_wholly_unknown_starts_again(explained):
+    """Not with something known, from an earlier result, without a prior on the aberrations, or of one frame."""
+    objective, truth = explained
+    schedule = Schedule(start_iterations=5, starts=2, alike=-1.0, **ALL_MISSED, **BRISK)
+    coefficients = objective.model.aberrations.coefficients(truth.z)
+    window = objective.model.window
+    for known in (Known(coefficients), Known(coefficients, torch.eye(15)), Known(object=window.crop(truth.image))):
+        solver = solver_of(
+            objective.with_changes(free=known.free), schedule=schedule, estimated=known.covariance is not None
+        )
+        assert solver.solve(known).starts == 1
+    assert solver_of(objective, schedule=schedule, prior_on_aberrations=False).solve(Known()).starts == 1
+    assert solver_of(objective.of_frames(slice(0, 1)), schedule=schedule).solve(Known()).starts == 1
+    assert solver_of(objective, schedule=schedule).solve(Known()).starts == 2
+
+
+# --- where it begins
+
+
+def test_a_mask_begins_without_aberrations_and_starts_again_at_random(explained):
+    objective, _ = explained
+    for seed in (0, 5):
+        begun = solver_of(objective, seed=seed).begin(Known(), None)
+        assert begun.candidates.n_each == 1
+        assert float(begun.state.z.abs().max()) == 0
+    schedule = Schedule(start_iterations=4, starts=2, alike=-1.0, **ALL_MISSED, **BRISK)
+    starts = {}
+    for seed in (0, 0, 5):
+        records: list[Record] = []
+        solver_of(objective, records.append, schedule=schedule, seed=seed).solve(Known())
+        starts.setdefault(seed, []).append([record.scalars["cost"] for record in records])
+    assert starts[0][0] == starts[0][1]
+    assert starts[0][0][:4] == starts[5][0][:4]
+    assert starts[0][0][4:] != starts[5][0][4:]
+
+
+def test_a_full_pupil_begins_with_candidates_of_its_seed(explain):
+    objective, _ = full_pupil(explain)
+    schedule = Schedule(candidates=((4, 3), (2, 2)))
+    begun = {
+        seed: solver_of(objective, schedule=schedule, many_minima=True, seed=seed).begin(Known(), None)
+        for seed in (0, 5)
+    }
+    again = solver_of(objective, schedule=schedule, many_minima=True, seed=0).begin(Known(), None)
+    assert begun[0].candidates.n_each == 4
+    assert torch.equal(begun[0].state.z, again.state.z)
+    assert not bool((begun[0].state.z == begun[5].state.z).any())
+    for prior, rms in ((True, 0.7), (False, 0.1)):
+        solver = solver_of(objective, many_minima=True, prior_on_aberrations=prior)
+        z = solver.begin(Known(), None).state.z
+        assert float(z.square().mean().sqrt()) == pytest.approx(rms, rel=4 / math.sqrt(2 * z.numel()))
+
+
+def test_a_sensor_that_saw_a_full_pupil_makes_candidates_needless(explain):
+    objective, state = full_pupil(explain)
+    known = Known(objective.model.aberrations.coefficients(state.z), torch.eye(6))
+    begun = solver_of(objective, many_minima=True, estimated=True).begin(known, None)
+    assert begun.candidates.n_each == 1
+
+
+def test_a_tournament_counts_what_its_candidates_cost(explain):
+    """Costs are those of one candidate for each frame; evaluations are of the stack, so those of four count four."""
+    objective, _ = full_pupil(explain)
+    schedule = Schedule(candidates=((4, 30), (2, 20)), segment=10, start_iterations=6, **NONE_MISSED)
+    records: list[Record] = []
+    solver = solver_of(objective, records.append, idle, schedule, many_minima=True)
+    begun = solver.begin(Known(), None)
+    crowded = with_candidates(objective, 4)
+    first = float(crowded.value_and_gradients(begun.state.image, begun.state.z, begun.state.calibration).value)
+    each, evaluations = [], []
+    progress = solver.run(
+        begun, False, lambda now: (each.append(now.candidates.n_each), evaluations.append(now.n_evaluations))
+    )
+    assert each == [2, 1, 1]
+    assert evaluations == [7 * 4, 7 * (4 + 2), 7 * (4 + 2 + 1)]
+    assert progress.costs[0] == pytest.approx(first / 4)
+    assert progress.state.z.shape == (3, 6)
+    assert all(record.arrays["coefficients"].shape == (3, 1, 6) for record in records if record.arrays)
+
+
+def test_a_tournament_cut_short_leaves_the_best_of_each_frame(explain):
+    objective, _ = full_pupil(explain)
+    schedule = Schedule(candidates=((4, 30), (2, 20)))
+    solver = solver_of(objective, minimizer=idle, schedule=schedule, many_minima=True, max_iterations=2)
+    progress = solver.solve(Known())
+    assert progress.status is Status.ITERATION_LIMIT
+    assert progress.candidates.n_each == 1
+    begun = solver.begin(Known(), None)
+    played = play_stage(
+        objective, begun.candidates, 1, lambda _, state: state, partial(recalibrate, power=None, follow_r0=False)
+    )
+    torch.testing.assert_close(progress.state.z, played.state.z, rtol=1e-13, atol=0)
+
+
+# --- what it does between two segments
+
+
+@pytest.mark.parametrize(("many_minima", "power"), [(False, 1), (True, 2)])
+def test_frames_of_a_full_pupil_are_weighed_by_the_square_of_their_fit(many_minima, power, explained):
+    """With no escapes to wait for, from the first recalibration on."""
+    objective, truth = explained
+    poor = replace(truth, z=truth.z * torch.tensor([1.0, 0.9, 0.7, 0.5]).double()[:, None])
+    schedule = Schedule(segment=2, escapes=0, **NONE_MISSED)
+    solver = solver_of(objective, minimizer=idle, schedule=schedule, many_minima=many_minima, max_iterations=3)
+    seen = []
+    solver.run(Progress(Candidates(poor, 1)), False, lambda now: seen.append(now.state))
+    expected = sharpen_noise_inflation(calibrate(objective, poor), power).calibration.noise_inflation
+    torch.testing.assert_close(seen[0].calibration.noise_inflation, expected)
+    assert float(expected.max()) > 2 * float(expected.min())
+
+
+class Spy:
+    """Stands in for an escape: moves the state so many times, then leaves it."""
+
+    def __init__(self, n_moves):
+        self.n_moves, self.seeds = n_moves, []
+
+    def restart(self, objective, state, first_inflation, schedule, minimizer, seed):
+        self.seeds.append(seed)
+        moved = len(self.seeds) <= self.n_moves
+        return (replace(state, z=state.z + 1e-3) if moved else state), 11
+
+    def run(self, monkeypatch, objective, truth, **options):
+        monkeypatch.setattr("torchmask.restoration.escapes.restart_outlier_frames", self.restart)
+        monkeypatch.setattr("torchmask.restoration.escapes.centre_on_pixels", lambda objective, state, schedule: state)
+        schedule = Schedule(segment=2, sharp_after=3, escapes=3, **NONE_MISSED)
+        solver = solver_of(objective, schedule=schedule, max_iterations=12, seed=20, **options)
+        return solver.run(Progress(Candidates(truth, 1)), False, lambda _: None)
+
+
+@pytest.mark.parametrize(("n_moves", "n_escapes"), [(0, 1), (1, 2), (9, 3)])
+def test_escapes_begin_when_the_object_is_sharp_and_end_when_nothing_moves(n_moves, n_escapes, monkeypatch, explained):
+    spy = Spy(n_moves)
+    progress = spy.run(monkeypatch, *explained)
+    assert spy.seeds == [21, 22, 23][:n_escapes]
+    assert progress.escapes == 3
+    assert progress.n_evaluations > 11 * n_escapes
+
+
+def test_frames_of_a_full_pupil_have_had_their_starts(monkeypatch, explained):
+    spy = Spy(1)
+    assert spy.run(monkeypatch, *explained, many_minima=True).escapes == 3
+    assert spy.seeds == []
+    spy.run(monkeypatch, *explained, many_minima=True, estimated=True)  # unless a sensor said where to begin
+    assert spy.seeds != []
+
+
+# --- whole restorations
 
 
 def test_a_descent_at_rest_comes_to_an_end(observation):
@@ -93,9 +389,8 @@ def test_further_starts_that_are_worse_change_nothing(observation, restoring):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not STACKS.is_dir(), reason="the mask of the reference stacks lies beside the checkout")
-def test_further_starts_find_what_the_first_has_missed():
-    stack = Observation.load(STACKS / "skylab_1e7_mask.npz")
+def test_further_starts_find_what_the_first_has_missed(shared_stack):
+    stack = shared_stack("skylab_1e7_mask")
     diameter = stack.aperture.mask_diameter
     grid = Grid.nyquist(diameter, stack.grid.wavelength, 64)
     turbulence = TurbulencePhase(diameter / 10, 20 * diameter)

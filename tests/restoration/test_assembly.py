@@ -1,0 +1,89 @@
+"""What is handed back, from a state whose frames are known."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchmask.restoration.assembly import add_deviations, assemble_result
+from torchmask.restoration.candidates import Candidates
+from torchmask.restoration.checkpoint import Progress, Status
+from torchmask.restoration.frames import FrameStack
+from torchmask.restoration.objective import Free
+
+UNIT, NOISE = 500.0, 0.03  # electrons, and the noise of `explained` in units of the mean
+
+
+@pytest.fixture
+def ended(explained):
+    """Objective, stack and progress of a restoration that has found the truth, in frames of unequal brightness."""
+    objective, state = explained
+    transmission = torch.tensor([0.8, 1.0, 1.0, 1.2], dtype=torch.float64)
+    frames = objective.frames * transmission[:, None, None]
+    valid = torch.ones_like(frames, dtype=torch.bool)
+    valid[1, 4:8] = False
+    stack = FrameStack(frames, valid, UNIT, (UNIT * NOISE) ** 2)
+    objective = type(objective)(objective.model, frames, stack.precision, objective.prior)
+    state = state.calibrated(transmission=transmission, aberration_weight=1.7)
+    return objective, stack, Progress(Candidates(state, 1), [5.0, 4.0], n_evaluations=9, status=Status.CONVERGED)
+
+
+def test_a_result_is_in_electrons_and_rad(ended):
+    objective, stack, progress = ended
+    state = progress.state
+    result = assemble_result(objective, stack, progress, r0=0.2)
+    torch.testing.assert_close(result.extended_object, UNIT * state.image)
+    assert torch.equal(result.object, result.extended_object[:32, :32])
+    assert torch.equal(result.coefficients, objective.model.aberrations.coefficients(state.z))
+    assert torch.equal(result.transmission, state.calibration.transmission)
+    made = objective.model(state.image, state.z) * state.calibration.transmission[:, None, None]
+    torch.testing.assert_close(result.model, UNIT * made)
+    expected = torch.where(stack.valid, (stack.frames - made) / NOISE, 0.0)
+    torch.testing.assert_close(result.residuals, expected)
+    torch.testing.assert_close(result.chi_square, expected.square().sum((1, 2)) / stack.valid.sum((1, 2)))
+    assert int(stack.valid[1].sum()) == 28 * 32
+    assert float(result.chi_square[[1, 2]].sub(1).abs().max()) < 4 * math.sqrt(2 / (28 * 32))
+    assert result.noise == pytest.approx(UNIT * NOISE)
+    assert result.r0 == pytest.approx(0.2 * 1.7 ** (3 / 5))  # (r0 / 0.2)^(-5/3) is the strength, 1 / 1.7
+    assert result.prior == "TotalVariation(weight=1, epsilon=0.01)"
+    assert result.cost.tolist() == [5.0, 4.0]
+    assert result.n_evaluations == 9
+    assert math.isnan(assemble_result(objective, stack, progress, r0=None).r0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"decrease": 3.2e-5}, "converged: the last segment lowered the cost by a fraction 3.2e-05"),
+        ({"status": Status.ITERATION_LIMIT}, "stopped at max_iterations = 2"),
+        ({"status": Status.START_LIMIT, "began": 1}, "stopped after the 1 iterations that a start may take"),
+        ({"status": Status.ITERATION_LIMIT, "starts": 3}, "stopped at max_iterations = 2; the best of 3 starts"),
+        (
+            {"decrease": 0.0, "starts": 2, "alike": True},
+            "converged: the last segment lowered the cost by a fraction 0.0e+00; the best of 2 starts, two of which "
+            "ended alike",
+        ),
+    ],
+)
+def test_the_message_says_why_it_ended(changes, message, ended):
+    objective, stack, progress = ended
+    result = assemble_result(objective, stack, replace(progress, **changes), r0=None)
+    assert result.message == message
+    assert result.converged == message.startswith("converged")
+
+
+def test_deviations_are_of_what_is_free(ended):
+    objective, stack, progress = ended
+    result = assemble_result(objective, stack, progress, r0=None)
+    assert result.object_std is None
+    whole = add_deviations(result, objective, stack, progress, 0.4, 2)
+    assert whole.object_std.shape == (32, 32)
+    assert whole.coefficients_std.shape == (5, 3)
+    assert float(whole.object_std.mean()) > 0
+    of_object = add_deviations(result, objective.with_changes(free=Free.OBJECT), stack, progress, 0.4, 2)
+    assert float(of_object.coefficients_std.abs().max()) == 0
+    brighter = replace(stack, unit=2 * UNIT, variance=4 * stack.variance)
+    twice = add_deviations(result, objective.with_changes(free=Free.OBJECT), brighter, progress, 0.4, 2)
+    assert stack.photon_share == 1  # of both
+    torch.testing.assert_close(twice.object_std, 2 * of_object.object_std)

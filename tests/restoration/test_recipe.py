@@ -1,0 +1,78 @@
+"""What a model is made from: the aperture where it lies now, and the aberrations it is assumed to have."""
+
+import math
+
+import pytest
+import torch
+from torch import nn
+
+from torchmask.grid import Grid
+from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.band import Band
+from torchmask.restoration.aberrations import turbulent_basis
+from torchmask.restoration.recipe import ModelRecipe, still
+
+GRID = Grid.nyquist(1.0, 550e-9, 32)
+HERE = [[0.0, 0.3], [0.3, -0.2], [-0.3, -0.15]]
+
+
+def mask(trains=False):
+    centers = torch.tensor(HERE, dtype=torch.float64)
+    return SparseAperture(nn.Parameter(centers) if trains else centers, 0.3, 1.0)
+
+
+def recipe(aperture=None, **changes):
+    given = {"frame_modes": 3, "static_modes": 0, "r0": 0.2, "outer_scale": 20.0, "whitened": True}
+    given |= {"band": Band.of([550e-9]), "dtype": torch.float64, "device": None}
+    return ModelRecipe(aperture or mask(), GRID, **given | changes)
+
+
+def test_turbulent_parameters_are_white():
+    aperture = mask()
+    for changes in ({}, {"static_modes": 6}, {"whitened": False}):
+        made = recipe(aperture, **changes)
+        expected = turbulent_basis(aperture, 3, made.static_modes, made.r0, made.outer_scale, whitened=made.whitened)
+        found = made.turbulent_model().aberrations
+        torch.testing.assert_close(found.mixing, expected.mixing)
+        assert (found.n_modes, found.n_common) == (expected.n_modes, expected.n_common)
+        assert made.n_modes == max(3, made.static_modes)
+
+
+def test_estimated_parameters_are_errors_of_one_sigma():
+    covariance = torch.linspace(0.1, 0.9, 9, dtype=torch.float64).diag() ** 2
+    basis = recipe().estimated_model(covariance).aberrations
+    torch.testing.assert_close(basis.mixing @ basis.mixing.T, covariance)
+    with pytest.raises(ValueError, match="covariance is given with static_modes"):
+        recipe(static_modes=3).estimated_model(covariance)
+
+
+@pytest.mark.parametrize("trains", [False, True])
+def test_a_model_stands_still_unless_it_follows(trains):
+    aperture = mask(trains)
+    stands, follows = (recipe(aperture).turbulent_model(follows_aperture=follows) for follows in (False, True))
+    assert follows.pupil.aperture is aperture
+    assert isinstance(stands.pupil.aperture.centers, nn.Parameter) == trains
+    assert not stands.pupil.aperture.centers.requires_grad
+    z = torch.ones(1, 8, dtype=torch.float64)
+    with torch.no_grad():
+        before = stands.psf(z)
+        aperture.centers.add_(0.03)
+        assert torch.equal(stands.psf(z), before)
+        assert not torch.equal(follows.psf(z), before)
+        copy = still(aperture)
+        assert torch.equal(copy.centers, aperture.centers)
+        assert copy.centers.data_ptr() != aperture.centers.data_ptr()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"r0": 0.0}, r"r0 is 0\.0: it must be finite and positive, in m"),
+        ({"outer_scale": math.nan}, "outer_scale is nan"),
+        ({"frame_modes": 0}, "n_modes is 0: it must be a whole number of at least 1"),
+        ({"static_modes": -1}, "static_modes is -1: it must be a whole number of at least 0"),
+    ],
+)
+def test_refuses_numbers_out_of_range(changes, words):
+    with pytest.raises(ValueError, match=words):
+        recipe(**changes)
