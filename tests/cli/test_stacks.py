@@ -1,0 +1,29 @@
+"""Which files are which stack."""
+
+from pathlib import Path
+
+from torchmask.cli.stacks import group_files
+
+FILES = [Path("a/cube.fits"), Path("b/cube.fits"), Path("b/other.npz"), Path("c/cube.fits")]
+
+
+def test_every_file_is_a_stack_under_a_name_of_its_own():
+    assert group_files(FILES, join=False) == {
+        "cube": FILES[:1],
+        "cube-2": FILES[1:2],
+        "other": FILES[2:3],
+        "cube-3": FILES[3:],
+    }
+
+
+def test_a_name_with_a_number_that_is_taken_is_passed_over():
+    files = [Path("cube-2.fits"), Path("a/cube.fits"), Path("b/cube.fits")]
+    assert list(group_files(files, join=False)) == ["cube-2", "cube", "cube-3"]
+
+
+def test_joined_files_are_one_stack_with_the_name_of_the_first():
+    assert group_files(FILES, join=True) == {"cube": FILES}
+
+
+def test_no_files_are_no_stack():
+    assert group_files([], join=False) == group_files([], join=True) == {}
