@@ -76,8 +76,8 @@ class Options(ExperimentOptions):
     """Zernike modes of every hole that are common to all exposures."""
     r0: float = 20.0
     """Of the small aberrations of each exposure, as if they were turbulence [m]: 0.07 rad rms over a hole."""
-    max_iterations: int = 800
-    """Of the restorations."""
+    max_iterations: int = 3200
+    """Of each restoration, all its starts together."""
     n_injections: int = 8
     """Companions put beside the calibrator, around the clock, to see how well they are found."""
     step: float = 0.05
