@@ -223,6 +223,18 @@ def test_the_sky_matrix_leads_from_pixels_to_east_and_north(mask, sky_cards, mir
     torch.testing.assert_close(observation.sky_matrix, expected, rtol=1e-12, atol=0)  # a card holds 13 digits
 
 
+def test_declination_may_come_first(mask, sky_cards):
+    pytest.importorskip("astropy")
+    cards = sky_cards(0.3, GRID.pixel_scale)
+    swapped = dict(cards)
+    for name in ("CTYPE", "CUNIT", "CRVAL"):
+        swapped[f"{name}1"], swapped[f"{name}2"] = cards[f"{name}2"], cards[f"{name}1"]
+    for axis in (1, 2):
+        swapped[f"CD1_{axis}"], swapped[f"CD2_{axis}"] = cards[f"CD2_{axis}"], cards[f"CD1_{axis}"]
+    one, other = (Observation(frames_of(1), mask, GRID, None, header=header) for header in (cards, swapped))
+    torch.testing.assert_close(other.sky_matrix, one.sky_matrix, rtol=1e-12, atol=0)
+
+
 @pytest.mark.parametrize("cards", [{}, {"OBJECT": "star"}, {"CDELT1": 1.0, "CDELT2": 1.0}])
 def test_without_sky_coordinates_there_is_no_sky_matrix(mask, cards):
     pytest.importorskip("astropy")

@@ -53,7 +53,7 @@ class Observation:
     errors : (T, H, W) electrons rms of each pixel, or None
     header : FITS cards that go with the frames: sky coordinates, target, telescope, filter, date
 
-    The truth (object, psfs, phases, r0, outer_scale, n_photons) is None where nobody knows it, as in a real one.
+    The truth (object, psfs, phases, r0, outer_scale, n_photons) is None where nobody knows it: in real observations.
 
     Examples
     --------
@@ -111,7 +111,7 @@ class Observation:
         Needs astropy (extra `data`).
         """
         matrix = pixel_matrix(self.header) if self.header else None
-        return None if matrix is None else torch.from_numpy(matrix).deg2rad()
+        return None if matrix is None else torch.from_numpy(matrix)
 
     def save(self, path: str | Path) -> None:
         """Write everything to a new .npz file (compressed, without pickle; the format of `load`).
@@ -203,7 +203,10 @@ def check_frames(frames: Tensor | np.ndarray, valid: Tensor | np.ndarray | None,
 
 
 def pixel_matrix(header: Any) -> np.ndarray | None:
-    """(2, 2) matrix from pixels (x, y) to the sky [deg], from CD, PC and CDELT, or CROTA and CDELT; None without."""
+    """(2, 2) from pixels (x, y) to (east, north) [rad], by CD, PC and CDELT, or CROTA and CDELT; None without.
+
+    Axes of the sky that stand the other way round, as DEC before RA, are put in order.
+    """
     from astropy.io.fits import Header
     from astropy.wcs import WCS
 
@@ -218,8 +221,10 @@ def pixel_matrix(header: Any) -> np.ndarray | None:
             wcs = WCS(cards, naxis=2)
             if not all(str(unit) for unit in wcs.wcs.cunit):  # plain pixel coordinates, which say nothing of the sky
                 return None
-            scale = [unit.to("deg") for unit in wcs.wcs.cunit]
+            scale = [unit.to("rad") for unit in wcs.wcs.cunit]
             matrix = np.diag(scale) @ wcs.pixel_scale_matrix
+            if wcs.wcs.lng > wcs.wcs.lat >= 0:
+                matrix = matrix[::-1].copy()
     except (ValueError, TypeError, AttributeError, MemoryError):  # cards that make no sense, units that are no angle
         return None
     return matrix if np.isfinite(matrix).all() and np.linalg.det(matrix) != 0 else None

@@ -261,7 +261,7 @@ def test_niriss_exposures_of_ab_dor(niriss):
     stars = [divmod(int(fits.getdata(path, "SCI").argmax()), 80)[::-1] for path in paths]
     assert len(set(stars)) == 2
     sky = np.array([[header["CRVAL1"], header["CRVAL2"]] for header in pointing])
-    tangent = (sky - sky[0]) * [math.cos(math.radians(sky[0, 1])), 1.0]
+    tangent = np.radians(sky - sky[0]) * [math.cos(math.radians(sky[0, 1])), 1.0]
     expected = -(tangent @ np.linalg.inv(matrix).T) - (np.array(stars) - stars[0])
     np.testing.assert_allclose(drift, expected, atol=0.1)
     assert np.abs(expected).max() > 0.1

@@ -55,8 +55,8 @@ def pixel_scale(header: Any, path: Any, given: float | None) -> float:
         raise missing(path, "PIXELSCL, CDELT or CD matrix in an angle", "pixel_scale [rad]")
     sides = np.linalg.norm(matrix, axis=0)
     if sides.max() / sides.min() > 1.02:
-        raise ValueError(f"{path}: pixels of {sides[0] * 3600:.4g} x {sides[1] * 3600:.4g} arcsec are not square")
-    return math.radians(math.sqrt(abs(np.linalg.det(matrix))))
+        raise ValueError(f"{path}: pixels of {sides[0] / ARCSEC:.4g} x {sides[1] / ARCSEC:.4g} arcsec are not square")
+    return math.sqrt(abs(np.linalg.det(matrix)))
 
 
 def wavelength(header: Any, path: Any, given: float | None) -> float:

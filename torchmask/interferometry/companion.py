@@ -155,9 +155,9 @@ class CompanionModel:
             coloured = replace(grid, wavelength=wavelength)
             samples, phase = aperture.samples(coloured, _FIELD), ZernikePhase(aperture, coloured, n_modes, _FIELD)
             self._colours.append((samples, phase, grid.wavelength / wavelength, share / samples.weights.square().sum()))
-        rows, columns = (_FIELD * side for side in grid.shape)
-        self._nu_y = torch.fft.fftfreq(rows, dtype=torch.float64)[:, None]
-        self._nu_x = torch.fft.rfftfreq(columns, dtype=torch.float64)
+        self._field = (_FIELD * grid.shape[0], _FIELD * grid.shape[1])
+        self._nu_y = torch.fft.fftfreq(self._field[0], dtype=torch.float64)[:, None]
+        self._nu_x = torch.fft.rfftfreq(self._field[1], dtype=torch.float64)
         self._pixel = torch.sinc(self._nu_y) * torch.sinc(self._nu_x)
         y, x = torch.meshgrid(*(torch.arange(n).double() - n // 2 for n in grid.shape), indexing="ij")
         self.near: Tensor = torch.hypot(y, x) <= radius  # (H, W), the pixels that are compared
@@ -192,28 +192,24 @@ class CompanionModel:
         contrast, offset = companion[0], to_pixels @ companion[1:]
         spread = torch.exp(-2 * math.pi**2 * (blur[0] * self._nu_y**2 + blur[1] * self._nu_x**2))
         transfer = torch.fft.rfft2(self.psf(aberrations)) * (flux * spread * self._pixel)
-        field = (_FIELD * self.grid.shape[0], _FIELD * self.grid.shape[1])
-        sky = shift_transfer(field, torch.stack([y, x])) * (1 + contrast * shift_transfer(field, offset))
+        star, away = (shift_transfer(self._field, shift) for shift in (torch.stack([y, x]), offset))
+        sky = star * (1 + contrast * away)
         return self._window(transfer * sky) + background
 
     def images(self, parameters: Parameters, to_pixels: Tensor) -> Tensor:
         """All exposures (T, H, W) [electrons], whose directions on the sky are `to_pixels` (T, 2, 2)."""
+        static, blur, companion = parameters.static, parameters.blur, parameters.companion
         shots = zip(parameters.own, to_pixels, strict=True)
-        shared = (parameters.blur, parameters.companion)
-        return torch.stack(
-            [self.image(self.total(parameters.static, own), shared[0], own[:4], shared[1], sky) for own, sky in shots]
-        )
+        return torch.stack([self.image(self.total(static, own), blur, own[:4], companion, sky) for own, sky in shots])
 
     def total(self, static: Tensor, own: Tensor) -> Tensor:
         """Aberrations (N J) of one exposure whose own parameters are `own` (4 + 3 N)."""
         extra = own[4:].view(self.n_subapertures, OWN_MODES)
         return static + torch.nn.functional.pad(extra, (0, self.n_modes - OWN_MODES)).flatten()
 
-    def moved(self, images: Tensor, offsets: Tensor) -> Tensor:
-        """Images (H, W), dark outside, moved by each of `offsets` (M, 2) [pixel, (y, x)]: (M, H, W)."""
-        rows, columns = (_FIELD * side for side in self.grid.shape)
-        transfer = torch.fft.rfft2(images, s=(rows, columns))
-        return self._window(transfer * shift_transfer((rows, columns), offsets))
+    def moved(self, image: Tensor, offsets: Tensor) -> Tensor:
+        """An image (H, W), dark outside, moved by each of `offsets` (M, 2) [pixel, (y, x)]: (M, H, W)."""
+        return self._window(torch.fft.rfft2(image, s=self._field) * shift_transfer(self._field, offsets))
 
     def root_weights(self, exposures: Exposures) -> Tensor:
         """One over the rms error of each pixel (T, H, W), 0 where it is not compared."""
@@ -222,4 +218,4 @@ class CompanionModel:
 
     def _window(self, transfer: Tensor) -> Tensor:
         rows, columns = self.grid.shape
-        return torch.fft.irfft2(transfer, s=(_FIELD * rows, _FIELD * columns))[..., :rows, :columns]
+        return torch.fft.irfft2(transfer, s=self._field)[..., :rows, :columns]
