@@ -379,6 +379,14 @@ def test_several_stacks_are_restored_each_as_by_itself_and_one_failure_harms_no_
     assert {"stack_restored.png", "stack-2_restored.png"} <= {path.name for path in several.iterdir()}
 
 
+def test_a_run_of_several_stacks_can_be_viewed(several, tmp_path, capsys):
+    run("view", several, "--out", tmp_path / "first.png")
+    out = capsys.readouterr().out
+    assert f"2 stacks: {several / 'stack/restored.npz'}, {several / 'stack-2/restored.npz'}" in out
+    assert "restored 32 x 32 pixels from 3 frames" in out
+    assert (tmp_path / "first.png").is_file()
+
+
 def test_what_failed_of_several_is_one_line_and_the_log_knows(several, capsys):
     status = json.loads((several / "status.json").read_text())
     assert status["status"] == "failed"

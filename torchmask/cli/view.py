@@ -173,6 +173,10 @@ def _view_run(folder: Path) -> View:
         values = ", ".join(f"{name} {value:.5g}" for name, value in row["scalars"].items() if value is not None)
         lines.append(f"  {stage} {row['step']}{budget}: {values}")
     there = [folder / name for name in _RESULTS if (folder / name).is_file()]
+    stacks = sorted(folder.glob("*/restored.npz"))  # several were restored
+    if len(stacks) > 1:
+        lines.append(f"{len(stacks)} stacks: {', '.join(str(path) for path in stacks)}")
+    there += stacks
     there += sorted((folder / "checkpoints").glob("*.npz"), key=lambda path: path.stat().st_mtime, reverse=True)
     if not there:
         return View("\n".join([*lines, "it has no results yet"]), {})
