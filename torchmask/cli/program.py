@@ -22,8 +22,11 @@ from torchmask.cli.config import CONFIG, load_config
 T = TypeVar("T")
 
 # What programs need beyond a plain install, by the name of the module.
-_EXTRAS = ("tyro", "rich", "yaml", "tensorboard", "matplotlib", "astropy", "cma", "imageio", "skimage", "kornia")
-_EXTRAS += ("trimesh", "ezdxf", "joblib")
+_EXTRAS = (
+    *("tyro", "rich", "yaml", "tensorboard", "matplotlib"),
+    *("astropy", "imageio", "skimage", "kornia", "trimesh"),
+    *("cma", "joblib", "ezdxf"),
+)
 
 
 def run_script(
