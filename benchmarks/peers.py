@@ -27,6 +27,7 @@ import tyro
 from peer_methods import LIMIT, METHODS, OURS, Candidate, Effort
 from torch import Tensor
 
+import torchmask
 from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.cli.options import ExperimentOptions
 from torchmask.cli.program import run_script
@@ -116,7 +117,8 @@ def simulated(smoke: bool) -> dict[str, Observation]:
 def versions() -> dict[str, str]:
     """Of everything that was compared. Raises ValueError if the extra is not installed."""
     try:
-        return {name: version(name) for name in ("torchmask", "torchmfbd", "scikit-image", "torch", "numpy", "scipy")}
+        others = ("torchmfbd", "scikit-image", "torch", "numpy", "scipy")
+        return {"torchmask": torchmask.__version__} | {name: version(name) for name in others}
     except PackageNotFoundError as error:
         raise ValueError(f"{error.name} is not installed: pip install 'torchmask[bench]'") from error
 
