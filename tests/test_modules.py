@@ -19,11 +19,16 @@ from torchmask.atmosphere.profiles import named_layers
 from torchmask.design.criterion import AsymptoticMSE
 from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture, FullAperture, SparseAperture
+from torchmask.optics.band import Band
 from torchmask.optics.detector import Detector
 from torchmask.optics.otf import OTF
 from torchmask.optics.psf import PSF
 from torchmask.optics.zernike import ZernikePhase
+from torchmask.restoration.aberrations import AberrationBasis, plain_basis
 from torchmask.restoration.forward import ExposureModel
+from torchmask.restoration.objective import MyopicObjective
+from torchmask.restoration.priors import EdgePreserving, FunctionPrior, ObjectPrior, TotalVariation
+from torchmask.restoration.pupil import SampledPupil
 from torchmask.spectra import NoisePSD, PowerLawPSD
 
 GRID = Grid.nyquist(1.0, 550e-9, 32)
@@ -50,6 +55,24 @@ def seeded():
 
 def random(*shape, dtype):
     return torch.rand(*shape, generator=seeded(), dtype=torch.float64, device="cpu").to(dtype)
+
+
+def sampled(aperture: SparseAperture) -> SampledPupil:
+    return SampledPupil(aperture, GRID, Band.of([GRID.wavelength]), plain_basis(aperture, 4))
+
+
+def objective(aperture: SparseAperture) -> MyopicObjective:
+    frames = random(2, 32, 32, dtype=torch.float64)
+    precision = torch.ones(1, 1, 1, dtype=torch.float64, device="cpu")
+    return MyopicObjective(ExposureModel(aperture, GRID, 4), frames, precision, TotalVariation())
+
+
+def costly(module: MyopicObjective, dtype: torch.dtype) -> Tensor:
+    return module(random(*module.model.window.field.shape, dtype=dtype), random(2, 12, dtype=dtype))
+
+
+def penalised(module: ObjectPrior, dtype: torch.dtype) -> Tensor:
+    return module(random(8, 8, dtype=dtype))
 
 
 @dataclass(frozen=True)
@@ -105,6 +128,23 @@ MODULES: dict[str, Entry] = {
         lambda module, dtype: module(1e3 * random(8, 8, dtype=dtype), seeded()),
     ),
     "exposure model": Entry(lambda: ExposureModel(mask(), GRID, 4), exposed, lambda: ExposureModel(moved(), GRID, 4)),
+    "sampled pupil": Entry(
+        lambda: sampled(mask()),
+        lambda module, dtype: module.samples().field(module.samples().phase(random(2, 12, dtype=dtype))).abs(),
+        lambda: sampled(moved()),
+    ),
+    "aberration basis": Entry(
+        lambda: AberrationBasis(random(6, 5, dtype=torch.float64), 3),
+        lambda module, dtype: module.coefficients(random(2, 5, dtype=dtype)),
+        lambda: AberrationBasis(1 + random(6, 5, dtype=torch.float64), 3),
+    ),
+    "objective": Entry(lambda: objective(mask()), costly, lambda: objective(moved())),
+    "total variation": Entry(TotalVariation, penalised),
+    "edge-preserving prior": Entry(EdgePreserving, penalised),
+    "prior that is a module": Entry(
+        lambda: FunctionPrior(nn.Sequential(nn.Flatten(0), nn.Softplus(), nn.LayerNorm(64, elementwise_affine=False))),
+        penalised,
+    ),
 }
 each_module = pytest.mark.parametrize("entry", MODULES.values(), ids=MODULES)
 
@@ -116,7 +156,7 @@ def test_the_registry_is_complete():
             for _, value in inspect.getmembers(importlib.import_module(found.name), inspect.isclass):
                 if issubclass(value, nn.Module) and value.__module__.startswith("torchmask."):
                     classes.add(value)
-    assert classes - {Aperture} == {type(entry.make()) for entry in MODULES.values()}
+    assert classes - {Aperture, ObjectPrior} == {type(entry.make()) for entry in MODULES.values()}
 
 
 @each_module
