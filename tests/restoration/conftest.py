@@ -113,13 +113,18 @@ def observe(five_holes) -> Callable[..., Observation]:
     """Simulates end to end: no part of the model that is inverted has a share in it."""
 
     def make(
-        aperture: Aperture | None = None, n_frames: int = 8, n_photons: float = 1e6, seed: int = 1, shape=(48, 48)
+        aperture: Aperture | None = None,
+        n_frames: int = 8,
+        n_photons: float = 1e6,
+        seed: int = 1,
+        shape: tuple[int, int] = (48, 48),
+        r0: float = R0,
     ) -> Observation:
         return simulate_observation(
             satellite(shape, n_photons),
             aperture or five_holes,
             Grid.nyquist(1.0, 550e-9, shape),
-            TurbulencePhase(R0, OUTER_SCALE),
+            TurbulencePhase(r0, OUTER_SCALE),
             Detector(READOUT),
             n_frames,
             generator=torch.Generator().manual_seed(seed),

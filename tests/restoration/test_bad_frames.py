@@ -4,6 +4,7 @@ One frame, odd sizes and dead pixels in whole restorations stand in test_myopic.
 """
 
 import math
+import statistics
 import warnings
 
 import pytest
@@ -33,9 +34,9 @@ def body(shape, panel):
     return image
 
 
-def observe(grid=GRID, panel=(4, 20), n_frames=4, photons=3e6):
+def observe(grid=GRID, panel=(4, 20), n_frames=4, photons=3e6, seed=1):
     scene = body(grid.shape, panel)
-    generator = torch.Generator().manual_seed(1)
+    generator = torch.Generator().manual_seed(seed)
     turbulence = TurbulencePhase(R0, 20.0)
     return simulate_observation(
         scene * (photons / scene.sum()), MASK, grid, turbulence, Detector(READOUT), n_frames, generator
@@ -125,13 +126,18 @@ def test_a_wrong_noise_level_is_noticed(seen, gain, readout_noise):
         method(readout_noise=readout_noise, max_iterations=5).restore(gain * seen.frames)
 
 
+@pytest.mark.slow
 def test_frames_that_no_aberration_explains_do_little_harm():
-    """Exposures too long, which hold several states of the turbulence; with equal weights the error is 2.2 times."""
-    seen = observe(n_frames=10)
-    short = seen.frames[:4]
-    smeared = torch.stack([seen.frames[4:7].mean(0), seen.frames[7:].mean(0)])
-    patient = method(max_iterations=600)
-    alone = relative_error(patient.restore(short).object, seen.object, 0.5)
-    together = relative_error(patient.restore(torch.cat([short, smeared])).object, seen.object, 0.5)
-    # Measured 1.225. Squared weights, which cost a tenth at 1e8 photons, kept it below 1.2.
-    assert together < 1.25 * alone
+    """Exposures too long, which hold several states of the turbulence; with equal weights the error is 2.2 times.
+
+    Over 12 seeds it is 1.132 times, with a standard deviation of 0.095: the mean of four may be off by three of its
+    standard errors, that of the 12 included. Squared weights, which cost a tenth at 1e8 photons, kept it lower.
+    """
+    patient, seeds, ratios = method(max_iterations=600), range(1, 5), []
+    for seed in seeds:
+        seen = observe(n_frames=10, seed=seed)
+        short = seen.frames[:4]
+        smeared = torch.stack([seen.frames[4:7].mean(0), seen.frames[7:].mean(0)])
+        alone, together = (patient.restore(frames).object for frames in (short, torch.cat([short, smeared])))
+        ratios.append(relative_error(together, seen.object, 0.5) / relative_error(alone, seen.object, 0.5))
+    assert statistics.mean(ratios) < 1.132 + 3 * 0.095 * math.sqrt(1 / len(seeds) + 1 / 12)

@@ -1,6 +1,8 @@
 """Many candidates for every frame of a full pupil."""
 
 import dataclasses
+import math
+import statistics
 
 import pytest
 import torch
@@ -124,11 +126,15 @@ def test_a_stage_descends_calibrates_and_selects_in_this_order():
     assert torch.equal(played.state.z, best.state.z)
 
 
-@pytest.fixture(scope="module")
-def stack():
-    generator = torch.Generator().manual_seed(0)
+def exposures(seed=0):
+    generator = torch.Generator().manual_seed(seed)
     scene = make_scene(GRID.shape, 1e6, SceneOptions(size=0.5))
     return simulate_observation(scene, PUPIL, GRID, TurbulencePhase(1 / 5, 20.0), Detector(1.5), 4, generator)
+
+
+@pytest.fixture(scope="module")
+def stack():
+    return exposures()
 
 
 @pytest.mark.parametrize("n_iterations", [2, 5, 12, 14])
@@ -190,11 +196,26 @@ def test_candidates_explain_more_than_a_single_start(stack):
 
 @pytest.mark.slow
 def test_a_new_frame_has_candidates_too(stack):
-    few = dataclasses.replace(stack, frames=stack.frames[:3], psfs=None)
-    first = restore(few)
+    first = restore(dataclasses.replace(stack, frames=stack.frames[:3], psfs=None))
     result = restore(stack, start=first)
     assert float(result.chi_square[-1]) < 1.2
     assert relative_error(result.object, stack.object, 0.5) < relative_error(first.object, stack.object, 0.5)
-    # The new frame's candidates, as shares of an evaluation of 4 frames, and then 500 iterations of all.
-    # Line searches make it 1.103 to 1.109 times as many.
-    assert result.n_evaluations < 1.11 * (sum(n * count for n, count in Schedule().candidates) / 4 + 500)
+
+
+def test_a_new_frame_costs_its_share():
+    """The candidates of one frame in four, its last descent, and then iterations of all.
+
+    Line searches make it 1.087 times as many evaluations over eight seeds, with a standard deviation of 0.022: the mean
+    of three may be off by three of its standard errors, that of the eight included.
+    """
+    brief = Schedule(candidates=((8, 15), (4, 30), (2, 30)), segment=50)
+    method = MyopicDeconvolution(PUPIL, GRID, 28, readout_noise=1.5, max_iterations=200, schedule=brief)
+    planned = (sum(number * count for number, count in brief.candidates) + brief.segment) / 4 + 200
+    seeds, ratios = range(3), []
+    for seed in seeds:
+        frames = exposures(seed).frames
+        result = method.restore(frames, start=method.restore(frames[:3]))
+        assert len(result.cost) == 200
+        ratios.append(result.n_evaluations / planned)
+    assert statistics.mean(ratios) < 1.087 + 3 * 0.022 * math.sqrt(1 / len(seeds) + 1 / 8)
+    assert min(ratios) >= 1

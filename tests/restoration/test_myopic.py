@@ -1,18 +1,21 @@
 """Whole restorations, on small end-to-end simulations that share no model with the inversion."""
 
 import math
+import statistics
 import time
-from pathlib import Path
+from functools import partial
 
 import pytest
 import torch
+from torch import nn
 
+from torchmask.grid import Grid
 from torchmask.metrics import relative_error
-from torchmask.observation import Observation
 from torchmask.optics.aperture import FullAperture, SparseAperture
+from torchmask.restoration.minimizers import TorchMinimizer
 from torchmask.restoration.myopic import MyopicDeconvolution
-
-STACKS = Path(__file__).parents[3] / "shared" / "stacks"
+from torchmask.restoration.priors import TotalVariation
+from torchmask.restoration.schedule import Schedule
 
 
 def errors(observation, image):
@@ -39,13 +42,26 @@ def test_beats_the_mean_frame_and_explains_the_data(observation, restored):
     )
 
 
-def test_nothing_but_the_frames_is_needed(observation, restored):
-    result = MyopicDeconvolution(observation.aperture, observation.grid).restore(observation.frames)
-    # Over eight seeds the ratio is 1.23 with a standard deviation of 0.07; here it is 1.17.
-    assert errors(observation, result.object)[0] < 1.23 * errors(observation, restored.object)[0]
-    assert 0.6 * observation.r0 < result.r0 < 1.7 * observation.r0
-    expected = math.sqrt(float(observation.frames.mean()) + observation.readout_noise**2)
-    assert result.noise == pytest.approx(expected, rel=0.05)
+def test_nothing_but_the_frames_is_needed(observe):
+    """Over 16 seeds the error is 1.068 times that with turbulence and noise known, and r0 is 0.980 of the true one.
+
+    Single seeds have standard deviations of 0.077 and 0.096. The mean of three may be off by three of its standard
+    errors, that of the 16 included.
+    """
+    r0, seeds = 0.4, range(1, 4)
+    margin = 3 * math.sqrt(1 / len(seeds) + 1 / 16)
+    ratios, strengths, noises = [], [], []
+    for seed in seeds:
+        seen = observe(seed=seed, shape=(40, 40), r0=r0)
+        told = {"r0": r0, "outer_scale": seen.outer_scale, "readout_noise": seen.readout_noise}
+        known = MyopicDeconvolution(seen.aperture, seen.grid, 10, max_iterations=600, **told).restore(seen.frames)
+        result = MyopicDeconvolution(seen.aperture, seen.grid, max_iterations=600).restore(seen.frames)
+        ratios.append(errors(seen, result.object)[0] / errors(seen, known.object)[0])
+        strengths.append(math.log(result.r0 / r0))
+        noises.append(result.noise / math.sqrt(float(seen.frames.mean()) + seen.readout_noise**2))
+    assert statistics.mean(ratios) < 1.068 + margin * 0.077
+    assert abs(statistics.mean(strengths) - math.log(0.980)) < margin * 0.096
+    assert statistics.mean(noises) == pytest.approx(1, rel=0.05)
 
 
 def test_full_pupil(observe):
@@ -139,6 +155,172 @@ def test_another_default_device_sees_nothing_of_it(observation):
             assert torch.equal(one, other)
 
 
+# --- a mask that moves
+
+
+def exposures(n_frames=3, size=32):
+    """Photons of two blocks, seen by nobody's mask."""
+    frames = torch.full((n_frames, size, size), 20.0, dtype=torch.float64)
+    frames[:, 12:20, 10:16], frames[:, 14:17, 16:24] = 1000.0, 400.0
+    return torch.poisson(frames, generator=torch.Generator().manual_seed(0))
+
+
+@pytest.mark.parametrize("trains", [False, True])
+@pytest.mark.parametrize("options", [{}, {"aberration_prior": False}, {"wavelengths": (550e-9, 560e-9)}])
+def test_a_mask_that_has_moved_is_restored_with_where_it_is(trains, options, five_holes):
+    """The same as by a method built there: whitening, samples and cut-off; not a trace of where it was."""
+    grid, there = Grid.nyquist(1.0, 550e-9, 32), 0.9 * five_holes.centers.flip(0)
+    centers = five_holes.centers.clone()
+    aperture = SparseAperture(nn.Parameter(centers) if trains else centers, 0.25, 1.0)
+    moved = SparseAperture(there.clone(), 0.25, 1.0)
+    given = {"n_modes": 3, "max_iterations": 4} | options
+    method, fresh = (MyopicDeconvolution(one, grid, **given) for one in (aperture, moved))
+    before = method.restore(exposures())
+    known = {"coefficients": torch.zeros(3, 5, 3), "covariance": 0.1 * torch.eye(15)}
+    for move in (
+        lambda: aperture.centers.copy_(there),
+        lambda: aperture.load_state_dict(moved.state_dict()),
+    ):
+        with torch.no_grad():
+            move()
+        for how in ({}, known):
+            found, expected = method.restore(exposures(), **how), fresh.restore(exposures(), **how)
+            assert torch.equal(found.object, expected.object)
+            assert torch.equal(found.coefficients, expected.coefficients)
+            assert torch.equal(found.model, expected.model)
+        assert not torch.equal(found.object, before.object)
+        with torch.no_grad():
+            aperture.centers.copy_(five_holes.centers)
+        assert torch.equal(method.restore(exposures()).object, before.object)
+
+
+def test_restoring_leaves_the_mask_and_its_gradient_alone(five_holes):
+    aperture = SparseAperture(nn.Parameter(five_holes.centers.clone()), 0.25, 1.0)
+    method = MyopicDeconvolution(aperture, Grid.nyquist(1.0, 550e-9, 32), 3, max_iterations=2)
+    result = method.restore(exposures(), n_samples=2)
+    assert aperture.centers.requires_grad
+    assert aperture.centers.grad is None
+    for image in (result.object, result.object_std, result.coefficients):
+        assert not image.requires_grad
+
+
+def test_the_objective_of_a_method_trains_its_mask(five_holes):
+    aperture = SparseAperture(nn.Parameter(five_holes.centers.clone()), 0.25, 1.0)
+    objective = MyopicDeconvolution(aperture, Grid.nyquist(1.0, 550e-9, 32), 3).objective(exposures())
+    image = objective.model.window.embed(objective.frames.mean(0))
+    z = torch.zeros(3, objective.model.aberrations.n_parameters, dtype=torch.float64)
+    objective(image, z).backward()
+    assert float(aperture.centers.grad.abs().max()) > 0
+
+
+# --- a prior of one's own
+
+
+class Smooth(nn.Module):
+    """Squares of the slopes, with a weight that is learned: no gradient or curvature of its own."""
+
+    def __init__(self, weight):
+        super().__init__()
+        self.weight = nn.Parameter(torch.tensor(weight, dtype=torch.float64))
+
+    def forward(self, image):
+        return self.weight * sum((image.roll(1, axis) - image).square().sum() for axis in (0, 1))
+
+
+class Told:
+    """Total variation as a stranger brings it, with its gradient and its curvature."""
+
+    def __init__(self):
+        self.inner = TotalVariation()
+
+    def __call__(self, image):
+        return self.inner(image)
+
+    def gradient(self, image):
+        return self.inner.value_and_gradient(image)[1]
+
+    def curvature(self, image):
+        return self.inner.curvature(image)
+
+
+def test_a_prior_from_outside_is_as_good_as_one_from_here(observation, restoring):
+    given = {"n_modes": 3, "max_iterations": 20}
+    ours, theirs = (restoring(**given, prior=prior).restore(observation.frames) for prior in (None, Told()))
+    assert torch.equal(ours.object, theirs.object)
+    assert torch.equal(ours.coefficients, theirs.coefficients)
+    assert torch.equal(ours.cost, theirs.cost)
+
+
+def test_a_prior_of_ones_own_loses_nothing(observation, tmp_path):
+    """Noise, transmissions, another start, deviations and checkpoints are as with ours."""
+    schedule = Schedule(segment=10, start_iterations=20, sharp_after=15, missed=-1.0, chance=-1e9, alike=-1.0, starts=2)
+    given = {"n_modes": 3, "schedule": schedule, "tolerance": 0}
+    dim = observation.frames * torch.linspace(0.8, 1.2, 8).double()[:, None, None]
+    made = {}
+    for prior in (None, Smooth(0.1)):
+        method = MyopicDeconvolution(observation.aperture, observation.grid, prior=prior, **given)
+        made[prior is None] = method.restore(dim, n_samples=2)
+    ours, theirs = made[True], made[False]
+    assert theirs.noise == ours.noise
+    torch.testing.assert_close(theirs.transmission, ours.transmission, rtol=0.05, atol=0)
+    assert theirs.message == "stopped after the 20 iterations that a start may take; the best of 2 starts"
+    assert len(theirs.cost) == 40
+    assert theirs.prior == "Smooth()"
+    assert not torch.equal(theirs.object, ours.object)
+    assert theirs.object_std.shape == observation.grid.shape
+
+    def interrupt(record):
+        if record.step == 35:
+            raise KeyboardInterrupt
+
+    path = tmp_path / "state.npz"
+    with pytest.raises(KeyboardInterrupt):
+        method.restore(dim, checkpoint=path, callback=interrupt)
+    resumed = method.restore(dim, checkpoint=path, n_samples=2)
+    assert torch.equal(resumed.object, theirs.object)
+    assert torch.equal(resumed.object_std, theirs.object_std)
+    other = MyopicDeconvolution(observation.aperture, observation.grid, prior=Smooth(0.2), **given)
+    with pytest.raises(ValueError, match="other frames or settings"):
+        other.restore(dim, checkpoint=path)
+
+
+@pytest.mark.parametrize(
+    ("prior", "words"),
+    [
+        (lambda image: image.square(), r"returns a tensor of shape \(40, 40\) for an image: it must return a scalar"),
+        (lambda image: float(image.detach().sum()), "returns a float for an image: it must return a scalar tensor"),
+        (lambda image: (image.sum() - image.sum()).log() * 0, "is nan at the mean frame: it must be finite there"),
+        (lambda image: (image > 1).double().sum(), "does not depend on the image by operations that PyTorch"),
+        (lambda image: image.sqrt().sum(), "the gradient of the prior .* or is not finite"),  # where frames are dark
+        (lambda image: (image @ torch.ones(3).double()).sum(), r"fails on an image \(40, 40\)"),
+    ],
+)
+def test_a_prior_that_is_none_is_refused_before_the_descent(prior, words, five_holes):
+    method = MyopicDeconvolution(five_holes, Grid.nyquist(1.0, 550e-9, 32), 3, prior=prior)
+    records = []
+    with pytest.raises(ValueError, match=words):
+        method.restore(exposures(), callback=records.append)
+    assert records == []
+
+
+def test_a_prior_that_cannot_be_called_is_refused_at_once(five_holes):
+    with pytest.raises(TypeError, match=r"prior is 1\.0: it must be a function or module"):
+        MyopicDeconvolution(five_holes, Grid.nyquist(1.0, 550e-9, 32), 3, prior=1.0)
+
+
+def test_any_optimiser_of_torch_descends(observation, restoring):
+    """Within the bound of the object; each of its steps is an evaluation."""
+    adam = TorchMinimizer(partial(torch.optim.Adam, lr=0.1), steps=3)
+    result = restoring(3, minimizer=adam, max_iterations=20).restore(observation.frames)
+    assert len(result.cost) == 20
+    assert result.n_evaluations == 3 * 20
+    assert bool((result.object >= 0).all())
+    assert result.cost[-1] < 0.9 * result.cost[0]
+
+
+# --- what is refused
+
+
 def test_an_object_beyond_the_field_is_noticed(restoring):
     frames = torch.poisson(torch.full((3, 48, 48), 100.0), generator=torch.Generator().manual_seed(0))
     with pytest.warns(UserWarning, match="beyond the field"):
@@ -182,19 +364,18 @@ def test_refuses_shapes_that_disagree(observation, restored, restoring):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not STACKS.is_dir(), reason="the reference stacks lie beside the checkout")
 @pytest.mark.parametrize(
     ("name", "limit"),
     [("skylab_1e7_mask", 0.065), ("mgs_1e6_mask", 0.1385), ("skylab_1e7_full", 0.0737), ("mgs_1e6_full", 0.087)],
 )
-def test_reference_stacks(name, limit):
+def test_reference_stacks(name, limit, shared_stack):
     """One call, nothing known but the instrument.
 
     The limits of the masks are those measured plus 2 % for another platform. A full pupil ends in another minimum
     after another rounding: the limits are a lead of 1.5 over the best peer on Skylab, and what a single start reached
     on Mars Global Surveyor, where candidates have 0.076 with a standard deviation of 0.006 over seeds.
     """
-    stack = Observation.load(STACKS / f"{name}.npz")
+    stack = shared_stack(name)
     started = time.process_time()
     result = MyopicDeconvolution(stack.aperture, stack.grid).restore(stack.frames)
     assert relative_error(result.object, stack.object, 0.5) < limit
