@@ -82,6 +82,26 @@ def test_observations_that_lack_something_are_refused(mask, sky_cards, changes, 
         Exposures.from_observations([])
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"frames": torch.ones(24, 24)},
+            r"frames has shape \(24, 24\): it must be \(24, 24, 24\), for frames \(T, H, W\)",
+        ),
+        ({"errors": torch.ones(24, 24)}, r"errors has shape \(24, 24\): it must be \(2, 24, 24\)"),
+        ({"valid": torch.ones(1, 24, 24)}, r"valid has shape \(1, 24, 24\): it must be \(2, 24, 24\)"),
+        ({"to_pixels": torch.eye(2)}, r"to_pixels has shape \(2, 2\): it must be \(2, 2, 2\)"),
+        ({"frames": torch.full((2, 24, 24), math.nan)}, "frames holds values that are not finite: mark those pixels"),
+    ],
+)
+def test_exposures_of_parts_that_disagree_are_refused(changes, message):
+    ones = torch.ones(2, 24, 24)
+    parts = {"frames": ones, "errors": ones, "valid": ones > 0, "to_pixels": torch.eye(2).expand(2, 2, 2)}
+    with pytest.raises(ValueError, match=message):
+        Exposures(**parts | changes)
+
+
 def test_parameters_of_some_exposures_keep_what_is_shared():
     whole = Parameters(aberrations(), NO_BLUR, torch.rand(5, 13), torch.rand(3))
     part = whole.of_exposures(slice(1, None, 2))

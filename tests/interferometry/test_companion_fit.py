@@ -73,7 +73,7 @@ def test_errors_of_a_companion_are_those_of_its_scatter(small):
     for _ in range(n):
         noise = 100 * torch.randn(exposures.frames.shape, dtype=torch.float64, generator=generator)
         noisy = Exposures(exposures.frames + noise, exposures.errors, exposures.valid, exposures.to_pixels)
-        found = fit_companion(small, noisy, TRUTH, truth, steps=3)
+        found = fit_companion(small, noisy, TRUTH, truth, steps=1)  # the first is nearly all
         away = found.companion - TRUTH
         squares.append(float(away @ torch.linalg.solve(found.covariance, away)) / 3)
     # residuals may count with more than their size, so the ratio lies a little below 1; aberrations are held

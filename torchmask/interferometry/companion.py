@@ -30,9 +30,11 @@ _FIELD = 3  # of the PSFs, in widths of an exposure: sets how finely the holes a
 class Exposures:
     """Exposures of one star, which stands in the middle of each but for a fraction of a pixel.
 
-    frames, errors : (T, H, W) electrons, and their rms
-    valid : (T, H, W) bool
+    frames, errors : (T, H, W) electrons, and their rms; finite in every pixel
+    valid : (T, H, W) bool, False where a pixel does not count
     to_pixels : (T, 2, 2) from (east, north) [rad] to (y, x) [pixel]
+
+    Raises ValueError if they disagree in shape or are not finite.
 
     Examples
     --------
@@ -47,6 +49,16 @@ class Exposures:
     errors: Tensor
     valid: Tensor
     to_pixels: Tensor
+
+    def __post_init__(self) -> None:
+        shape = tuple(self.frames.shape)
+        shapes = {"frames": shape[:1] + shape[-2:], "errors": shape, "valid": shape, "to_pixels": (*shape[:1], 2, 2)}
+        for name, needed in shapes.items():
+            values = getattr(self, name)
+            if tuple(values.shape) != needed:
+                raise ValueError(f"{name} has shape {tuple(values.shape)}: it must be {needed}, for frames (T, H, W)")
+            if not bool(torch.isfinite(values).all()):
+                raise ValueError(f"{name} holds values that are not finite: mark those pixels in `valid` and fill them")
 
     def __getitem__(self, chosen: Sequence[int] | slice) -> Exposures:
         index = chosen if isinstance(chosen, slice) else list(chosen)
