@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.func import functional_call, grad, jacrev, vmap
 
 from torchmask.design.criterion import AsymptoticMSE, wiener_mse
+from torchmask.design.overlap import baseline_mse
 from torchmask.grid import Grid
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.otf import OTF, analytic_otf
@@ -107,6 +108,19 @@ def test_maps_may_be_nested(shape):
     population = 0.6 * (uniform(2, 3, 4, 2, seed=2) - 0.5)
     nested = vmap(vmap(lambda c: CRITERION(SparseAperture(c, 0.2, 1.0, shape))))(population)
     close(nested, CRITERION(SparseAperture(population, 0.2, 1.0, shape)))
+
+
+def test_the_axis_that_is_mapped_may_be_any():
+    """The node of autograd itself, which the criterion always gives the mapped axis first."""
+    mask = SparseAperture(CENTERS, **SIZE)
+    geometry = CRITERION._geometry(mask)
+    population = torch.stack([CENTERS, 0.5 * CENTERS], dim=1)  # (masks, maps, N, 2)
+
+    def values(centers: Tensor) -> Tensor:
+        return baseline_mse(centers, CRITERION._weight, CRITERION._ratio, geometry)
+
+    mapped = vmap(values, in_dims=1, out_dims=1)(population)
+    close(mapped, torch.stack([values(CENTERS), values(0.5 * CENTERS)], dim=1))
 
 
 def test_modules_are_called_with_other_states():

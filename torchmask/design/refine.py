@@ -139,7 +139,7 @@ def refine_mask(
     require_constraints(constraints)
     if budget != int(budget) or budget < 1:
         raise ValueError(f"budget is {budget}: it must be a whole number of evaluations, at least 1")
-    still = aperture.replace(centers=aperture.centers.detach().clone())
+    still = aperture.still()
     holes = Holes(still, (InsideDisc(), NoOverlap(), *constraints))
     start = holes.coordinates(still.centers)
     monitor = Monitor("design/refine", budget, holes, callback)

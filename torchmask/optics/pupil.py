@@ -6,8 +6,9 @@ open, so the field follows a hole that moves by less than a sample, and autograd
 
 from __future__ import annotations
 
+import copy
 import math
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
@@ -80,6 +81,13 @@ class Aperture(nn.Module):
     def reach(self) -> float:
         """Distance of the outermost edge from the origin, corners again taken to point outwards [m]."""
         return float(torch.linalg.vector_norm(self.centers.detach(), dim=-1).max()) + self.outer_diameter / 2
+
+    def still(self) -> Self:
+        """A copy that stays where it is while this one moves or trains."""
+        centers = self.centers.detach().clone()
+        if isinstance(self.centers, nn.Parameter):
+            centers = nn.Parameter(centers, requires_grad=False)
+        return copy.deepcopy(self, {id(self.centers): centers})
 
     def samples(self, grid: Grid, oversampling: int = 1) -> PupilSamples:
         """Sample the aperture on the pupil raster of a field `oversampling` times as wide as `grid`.

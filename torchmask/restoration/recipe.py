@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture
@@ -63,7 +62,7 @@ class ModelRecipe:
             basis = turbulent_basis(
                 self.aperture, self.frame_modes, self.static_modes, self.r0, self.outer_scale, whitened=self.whitened
             )
-        aperture = self.aperture if follows_aperture else still(self.aperture)
+        aperture = self.aperture if follows_aperture else self.aperture.still()
         return ExposureModel(aperture, self.grid, basis, self.band, dtype=self.dtype, device=self.device)
 
     def estimated_model(self, covariance: Tensor) -> ExposureModel:
@@ -74,12 +73,4 @@ class ModelRecipe:
         if self.static_modes:
             raise ValueError("covariance is given with static_modes: what is common to all frames is in the estimate")
         basis = estimated_basis(self.aperture, self.n_modes, covariance)
-        return ExposureModel(still(self.aperture), self.grid, basis, self.band, dtype=self.dtype, device=self.device)
-
-
-def still(aperture: Aperture) -> Aperture:
-    """A copy of an aperture that stays where it is while the other moves or trains."""
-    centers = aperture.centers.detach().clone()
-    if isinstance(aperture.centers, nn.Parameter):
-        centers = nn.Parameter(centers, requires_grad=False)
-    return copy.deepcopy(aperture, {id(aperture.centers): centers})
+        return ExposureModel(self.aperture.still(), self.grid, basis, self.band, dtype=self.dtype, device=self.device)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
@@ -167,7 +166,7 @@ class StackDataset(Dataset[dict[str, Tensor]]):
             raise TypeError(f"scene is a {type(scene).__name__}: it must be a function of an index and a generator")
         if scene is not None and path is not None:
             raise ValueError("scene and path are two targets: give one of them")
-        self.aperture: Aperture = copy.deepcopy(aperture).requires_grad_(False).to("cpu", dtype)
+        self.aperture: Aperture = aperture.still().to("cpu", dtype)
         self.grid = grid
         self.length: int = int(length)
         self.n_frames = n_frames

@@ -7,7 +7,6 @@ leaves the field is lost.
 
 from __future__ import annotations
 
-import copy
 import math
 
 import torch
@@ -122,7 +121,7 @@ def simulate_observation(
         phases = samples.weights.new_zeros(n_frames, *samples.weights.shape)
     return Observation(
         frames=torch.cat(frames),
-        aperture=copy.deepcopy(aperture).requires_grad_(False),  # a mask that trains on does not change the past
+        aperture=aperture.still(),  # a mask that trains on does not change the past
         grid=grid,
         readout_noise=detector.readout_noise,
         object=scene,
