@@ -1,8 +1,68 @@
-"""Filters by the cards of a header."""
+"""Bands as a few wavelengths, by Gauss quadrature; filters by the cards of a header."""
 
+import math
+
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from torchmask.optics.band import FILTERS, Filter, filter_of_header
+from torchmask.optics.band import FILTERS, Band, Filter, filter_of_header
+
+
+@pytest.mark.parametrize("n", [1, 3, 8])
+def test_a_top_hat_is_gauss_and_legendre(n):
+    band = Band.top_hat(550e-9, 80e-9, n)
+    nodes, weights = np.polynomial.legendre.leggauss(n)
+    np.testing.assert_allclose(band.wavelengths, 550e-9 + 40e-9 * nodes, rtol=1e-12)
+    np.testing.assert_allclose(band.shares, weights / 2, rtol=1e-10)
+
+
+@given(
+    st.lists(st.floats(0.01, 1.0), min_size=2, max_size=9),
+    st.integers(1, 6),
+    st.randoms(use_true_random=False),
+)
+def test_means_of_polynomials_over_a_curve_are_exact(transmission, n, random):
+    """Against the closed form of the integral of a straight line times a power, piece by piece."""
+    gaps = [random.uniform(1e-9, 20e-9) for _ in transmission]
+    curve = 500e-9 + np.cumsum(gaps)
+    band = Band.of_curve(curve, transmission, n)
+    places = (np.array(band.wavelengths) - curve[0]) / (curve[-1] - curve[0])
+    x = (curve - curve[0]) / (curve[-1] - curve[0])
+    slopes = np.diff(transmission) / np.diff(x)
+    offsets = np.array(transmission[:-1]) - slopes * x[:-1]
+
+    def moment(k):
+        by_offset, by_slope = ((x[1:] ** j - x[:-1] ** j) / j for j in (k + 1, k + 2))
+        return float((offsets * by_offset + slopes * by_slope).sum())
+
+    for power in range(2 * n):
+        assert np.dot(band.shares, places**power) == pytest.approx(moment(power) / moment(0), rel=1e-7)
+    assert curve[0] < min(band.wavelengths) <= max(band.wavelengths) < curve[-1]
+
+
+@pytest.mark.parametrize(
+    ("wavelengths", "transmission", "n", "message"),
+    [
+        ([5e-7], [1.0], 3, "at least 2"),
+        ([5e-7, 6e-7], [1.0], 3, "as many"),
+        ([6e-7, 5e-7], [1.0, 1.0], 3, "increasing"),
+        ([-1e-7, 5e-7], [1.0, 1.0], 3, "positive"),
+        ([5e-7, 6e-7], [1.0, -1.0], 3, "negative"),
+        ([5e-7, 6e-7], [0.0, 0.0], 3, "positive"),
+        ([5e-7, 6e-7], [1.0, math.nan], 3, "finite"),
+        ([5e-7, 6e-7], [1.0, 1.0], 0, "n_wavelengths"),
+    ],
+)
+def test_what_is_no_curve_is_refused(wavelengths, transmission, n, message):
+    with pytest.raises(ValueError, match=message):
+        Band.of_curve(wavelengths, transmission, n)
+
+
+def test_a_top_hat_wider_than_its_wavelength_is_refused():
+    with pytest.raises(ValueError, match="positive"):
+        Band.top_hat(550e-9, 1.2e-6)
 
 
 @pytest.mark.parametrize(

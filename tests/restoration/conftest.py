@@ -141,10 +141,14 @@ def observation(observe) -> Observation:
 
 @pytest.fixture(scope="session")
 def restoring(observation) -> Callable[..., MyopicDeconvolution]:
-    """The method for `observation`, which knows the turbulence and the noise unless told otherwise."""
+    """The method for `observation`, which knows turbulence and noise, and of no sky, unless told otherwise."""
 
     def make(n_modes: int = N_MODES, **options) -> MyopicDeconvolution:
-        given = {"r0": R0, "outer_scale": OUTER_SCALE, "readout_noise": READOUT} | options
+        given = {
+            "r0": R0,
+            "outer_scale": OUTER_SCALE,
+            "readout_noise": READOUT,
+        } | options
         return MyopicDeconvolution(observation.aperture, observation.grid, n_modes, **given)
 
     return make

@@ -7,6 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
+
+_MOST_WAVELENGTHS = 32  # of a quadrature: far more than any image needs
+
 
 @dataclass(frozen=True)
 class Band:
@@ -38,10 +42,92 @@ class Band:
         total = sum(shares)
         return cls(tuple(float(value) for value in wavelengths), tuple(share / total for share in shares))
 
+    @classmethod
+    def of_curve(cls, wavelengths: Sequence[float], transmission: Sequence[float], n_wavelengths: int = 5) -> Band:
+        """The few wavelengths that stand for a transmission curve, by Gauss quadrature.
+
+        The mean over the band of any polynomial in wavelength of degree 2 n_wavelengths - 1 or less is exact
+        (Golub & Welsch, Math. Comp. 23, 221, 1969). How many an image needs grows with the width of the band: 3 for
+        5 %, 5 for 15 %.
+
+        Parameters
+        ----------
+        wavelengths : sequence of float
+            Where the curve is known [m], increasing; it is straight in between and zero outside.
+        transmission : sequence of float
+            Of the detected light of the object, on any scale: of filter, telescope and detector, times its spectrum.
+        n_wavelengths : int
+
+        Raises
+        ------
+        ValueError
+            If both are not equally long with at least 2 values, wavelengths are not positive and increasing, the
+            transmission is negative, not finite or nowhere positive, or `n_wavelengths` is not from 1 to 32.
+
+        Examples
+        --------
+        >>> band = Band.of_curve([500e-9, 600e-9], [1.0, 1.0], 2)  # Gauss & Legendre: 1 / sqrt(3) to both sides
+        >>> [round(1e9 * wavelength, 3) for wavelength in band.wavelengths]
+        [521.132, 578.868]
+        """
+        nodes, weights = np.asarray(wavelengths, dtype=float), np.asarray(transmission, dtype=float)
+        _check_curve(nodes, weights)
+        if not 1 <= n_wavelengths <= _MOST_WAVELENGTHS:
+            raise ValueError(f"n_wavelengths is {n_wavelengths}: it must be from 1 to {_MOST_WAVELENGTHS}")
+        found, shares = _gauss_quadrature(*_fine_samples(nodes, weights), n_wavelengths)
+        return cls.of(found.tolist(), shares.tolist())
+
+    @classmethod
+    def top_hat(cls, wavelength: float, width: float, n_wavelengths: int = 5) -> Band:
+        """The band of even transmission over `width` [m] around `wavelength` [m]; errors as for `of_curve`.
+
+        Examples
+        --------
+        >>> len(Band.top_hat(550e-9, 80e-9, 3).wavelengths)
+        3
+        """
+        return cls.of_curve([wavelength - width / 2, wavelength + width / 2], [1.0, 1.0], n_wavelengths)
+
     @property
     def shortest(self) -> float:
         """The shortest wavelength [m], which samples the image most coarsely."""
         return min(self.wavelengths)
+
+
+def _check_curve(wavelengths: np.ndarray, transmission: np.ndarray) -> None:
+    if wavelengths.ndim != 1 or wavelengths.shape != transmission.shape or len(wavelengths) < 2:
+        raise ValueError(
+            f"the curve has {wavelengths.shape} wavelengths and {transmission.shape} transmissions: as many, and at "
+            "least 2, are needed"
+        )
+    if not (np.isfinite(wavelengths).all() and wavelengths[0] > 0 and (np.diff(wavelengths) > 0).all()):
+        raise ValueError("the curve's wavelengths must be finite, positive and increasing, in m")
+    if not (np.isfinite(transmission).all() and transmission.min() >= 0 and transmission.max() > 0):
+        raise ValueError("the curve's transmission must be finite, nowhere negative and somewhere positive")
+
+
+def _fine_samples(wavelengths: np.ndarray, transmission: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes and weights that integrate the piecewise straight curve times a polynomial, piece by piece, exactly."""
+    places, weights = np.polynomial.legendre.leggauss(_MOST_WAVELENGTHS + 1)
+    half = np.diff(wavelengths)[:, None] / 2
+    nodes = wavelengths[:-1, None] + half * (1 + places)
+    return nodes.ravel(), (half * weights * np.interp(nodes, wavelengths, transmission)).ravel()
+
+
+def _gauss_quadrature(nodes: np.ndarray, weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """The n nodes and weights of the Gauss quadrature of a measure on many `nodes`, by Lanczos' recurrence."""
+    middle, half = (nodes[-1] + nodes[0]) / 2, (nodes[-1] - nodes[0]) / 2
+    x, vectors, jacobi = (nodes - middle) / half, [np.sqrt(weights / weights.sum())], np.zeros((n, n))
+    for step in range(n):
+        following = x * vectors[step]
+        jacobi[step, step] = following @ vectors[step]
+        for vector in vectors * 2:  # twice is enough against rounding
+            following = following - (following @ vector) * vector
+        if step + 1 < n:
+            jacobi[step, step + 1] = jacobi[step + 1, step] = np.linalg.norm(following)
+            vectors.append(following / jacobi[step, step + 1])
+    places, rotation = np.linalg.eigh(jacobi)
+    return middle + half * places, rotation[0] ** 2
 
 
 class Filter(NamedTuple):

@@ -5,6 +5,7 @@ They cost six FFTs a frame (and two more for every further wavelength) in a memo
 
 from __future__ import annotations
 
+from functools import reduce
 from typing import NamedTuple
 
 import torch
@@ -37,7 +38,7 @@ def data_fidelity(
     want_aberrations: bool = True,
     parallel: Map = map,
 ) -> DataFidelity:
-    """1/2 sum precision (model - frames)^2 of every frame, and its gradients.
+    """1/2 sum precision (model + background - frames)^2 of every frame, and its gradients.
 
     Parameters
     ----------
@@ -53,7 +54,7 @@ def data_fidelity(
         Goes over the frames, a few at a time, as `map` does.
     """
     shape, samples = model.window.field.shape, model.pupil.samples()
-    spectrum = torch.fft.rfft2(image.to(model.dtype))
+    spectrum = model.spectrum(image)
     conjugate = spectrum.conj().resolve_conj()
     phase = samples.phase(z)  # of all frames at once: one large matrix product is faster than many small ones
 
@@ -62,8 +63,10 @@ def data_fidelity(
         field = samples.field(phase[part])
         amplitude = model.amplitude(samples, field)
         transfer = torch.fft.rfft2(intensity(amplitude))
+        weight = precision[part] if len(precision) > 1 else precision
         error = model.window.crop(torch.fft.irfft2(transfer * spectrum, s=shape)) - frames[part]
-        residual = error * (precision[part] if len(precision) > 1 else precision)
+        error = -model.background.residual(-error, weight)
+        residual = error * weight
         value = 0.5 * torch.linalg.vecdot(residual.flatten(1), error.flatten(1)).double()
         if not (want_object or want_aberrations):
             return value, None, None
@@ -77,7 +80,7 @@ def data_fidelity(
     values, by_object, slopes = zip(*parallel(compare, model.chunks(len(z))), strict=True)
     return DataFidelity(
         torch.cat(values),
-        torch.fft.irfft2(sum(by_object[1:], by_object[0]), s=shape).to(image.dtype) if want_object else None,
+        model.spectrum_adjoint(reduce(torch.add, by_object)).to(image.dtype) if want_object else None,
         (torch.cat(slopes) @ samples.basis).to(z.dtype) if want_aberrations else None,
     )
 
@@ -99,7 +102,7 @@ def curvature(
     a diagonal that is averaged over frames (Bekas, Kokiopoulou & Saad, Appl. Numer. Math. 57, 1214, 2007).
     """
     shape, samples = model.window.field.shape, model.pupil.samples()
-    conjugate = torch.fft.rfft2(image.to(model.dtype)).conj().resolve_conj()
+    conjugate = model.spectrum(image).conj().resolve_conj()
     total, pixel = torch.zeros_like(z[0]), 0.0
     for part in model.chunks(len(z)):
         field = samples.field(samples.phase(z[part]))

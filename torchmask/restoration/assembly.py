@@ -23,13 +23,16 @@ def assemble_result(
     transmission, weight = state.calibration.transmission, state.calibration.aberration_weight
     made = torch.cat([model(state.image, state.z[part]) for part in model.chunks(len(state.z))])
     frames = made * transmission[:, None, None].to(made)
+    background = model.background.level(objective.frames - frames, objective.precision)
+    frames = frames + background
     residuals = (objective.frames - frames) * objective.precision.sqrt()
     return RestorationResult(
         object=(model.window.crop(state.image) * stack.unit).clone(),
         extended_object=state.image * stack.unit,
         coefficients=model.aberrations.coefficients(state.z),
         transmission=transmission,
-        model=frames * stack.unit,
+        background=(background * stack.unit + stack.known).mean((1, 2)).to(transmission),
+        model=frames * stack.unit + stack.known,
         residuals=residuals,
         chi_square=(residuals**2).sum((1, 2)) / stack.valid.sum((1, 2)).clamp(min=1),
         prior=repr(objective.prior),

@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from torchmask.restoration.background import Background, weighted_mean
 from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.state import State
 
@@ -15,17 +16,35 @@ _LEAST_TRANSMISSION = 1e-3
 
 @torch.no_grad()
 def fit_of_frames(objective: MyopicObjective, state: State) -> tuple[Tensor, Tensor]:
-    """The transmission (T,) at which each frame fits best, and the chi-square per pixel (T,) that is left then."""
-    transmissions, squares = [], []
+    """The transmission (T,) at which each frame fits best, and the chi-square per pixel (T,) that is left then.
+
+    A background that is free is fitted with it.
+    """
+    transmissions, squares, background = [], [], objective.model.background
     for part in objective.model.chunks(len(state.z)):
-        frames, model = objective.frames[part], objective.model(state.image, state.z[part])
         precision = objective.precision[part] if len(objective.precision) > 1 else objective.precision
+        frames = objective.frames[part]
+        model = objective.model(state.image, state.z[part])
+        transmission = _fit_transmission(background, model, frames, precision)
+        transmissions.append(transmission.flatten())
         precision = precision.expand_as(frames)
-        transmission = (precision * model * frames).sum((1, 2)) / (precision * model**2).sum((1, 2))
-        transmissions.append(transmission)
-        error = (precision * (frames - transmission[:, None, None] * model) ** 2).sum((1, 2))
+        error = (precision * background.residual(frames - transmission * model, precision) ** 2).sum((1, 2))
         squares.append(error / (precision > 0).sum((1, 2)).clamp(min=1))
     return torch.cat(transmissions).to(state.z).clamp(min=_LEAST_TRANSMISSION), torch.cat(squares).to(state.z)
+
+
+def _fit_transmission(background: Background, model: Tensor, frames: Tensor, precision: Tensor) -> Tensor:
+    """Least squares (T, 1, 1) of `frames` against `model`, with a constant besides where that is free and positive."""
+
+    def slope(x: Tensor, y: Tensor) -> Tensor:
+        return (precision * x * y).sum((1, 2), keepdim=True) / (precision * x**2).sum((1, 2), keepdim=True)
+
+    alone = slope(model, frames)
+    if background is Background.NONE:
+        return alone
+    mean_model, mean_frame = weighted_mean(model, precision), weighted_mean(frames, precision)
+    beside = slope(model - mean_model, frames - mean_frame)
+    return torch.where(mean_frame > beside * mean_model, beside, alone)
 
 
 def recalibrate(objective: MyopicObjective, state: State, power: int | None, *, follow_r0: bool) -> State:
@@ -42,9 +61,15 @@ def recalibrate(objective: MyopicObjective, state: State, power: int | None, *, 
 
 
 def calibrate(objective: MyopicObjective, state: State) -> State:
-    """The state with the transmissions that fit best, 1 on average, and each frame's noise inflation of its own."""
+    """The state with the transmissions that fit best, 1 on average, and each frame's noise inflation of its own.
+
+    What all transmissions have in common is the object's brightness.
+    """
     transmission, chi_square = fit_of_frames(objective, state)
-    return state.calibrated(transmission=transmission / transmission.mean(), noise_inflation=chi_square.clamp(min=1))
+    common = transmission.mean()
+    if objective.model.background is not Background.NONE:  # beside which the frames' mean does not tell it
+        state = replace(state, image=state.image * common)
+    return state.calibrated(transmission=transmission / common, noise_inflation=chi_square.clamp(min=1))
 
 
 def share_noise_inflation(state: State) -> State:

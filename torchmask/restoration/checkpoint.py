@@ -131,10 +131,10 @@ class Checkpoint:
 
 def fingerprint_of(objective: MyopicObjective, settings: Sequence[object], known: Sequence[Tensor | None]) -> str:
     """Tells whether a checkpoint belongs to these frames, priors and settings, and to what is known besides."""
-    prior = objective.prior
-    digest = hashlib.sha256(repr((*settings, objective.free, repr(prior))).encode())
-    samples = objective.model.pupil.samples()
-    tensors = [objective.frames, objective.precision, *samples, *prior.state_dict().values()]
+    prior, model = objective.prior, objective.model
+    digest = hashlib.sha256(repr((*settings, objective.free, model.background, repr(prior))).encode())
+    tensors = [objective.frames, objective.precision, *model.pupil.samples(), model.response]
+    tensors += prior.state_dict().values()
     for tensor in [*tensors, *known]:
         digest.update(b"none" if tensor is None else as_array(tensor).tobytes())
     return digest.hexdigest()

@@ -17,7 +17,9 @@ from torch import Tensor, nn
 from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.band import Band
+from torchmask.optics.pixel import PixelResponse
 from torchmask.restoration.aberrations import AberrationBasis, plain_basis
+from torchmask.restoration.background import Background
 from torchmask.restoration.pupil import OpenSamples, SampledPupil
 
 MARGIN = 0.25  # of the frames' width, by which the object's field is wider at least
@@ -57,7 +59,7 @@ class Window:
 
 
 class ExposureModel(nn.Module):
-    """Frames y_t = window(h_t * o), h_t = sum_w share_w |FFT(P_w exp(i B_w z_t))|^2 with unit sum.
+    """Frames y_t = window(p * h_t * o), p the pixel, h_t = sum_w share_w |FFT(P_w exp(i B_w z_t))|^2 with unit sum.
 
     Parameters
     ----------
@@ -71,6 +73,10 @@ class ExposureModel(nn.Module):
         None: the wavelength of the grid. Aberrations are path differences: coefficients are rad at that wavelength.
     margin : float
         The object's field is at least (1 + margin) times as wide as the frames.
+    background : Background
+        What frames may hold besides; `forward` makes them without.
+    pixel : PixelResponse, optional
+        Of the detector. None: pixels sample the image at their centres.
 
     Raises
     ------
@@ -96,6 +102,8 @@ class ExposureModel(nn.Module):
     torch.Size([5, 32, 32])
     """
 
+    response: Tensor | None
+
     def __init__(
         self,
         aperture: Aperture,
@@ -103,6 +111,8 @@ class ExposureModel(nn.Module):
         aberrations: AberrationBasis | int,
         band: Band | None = None,
         margin: float = MARGIN,
+        background: Background = Background.NONE,
+        pixel: PixelResponse | None = None,
         *,
         dtype: torch.dtype | None = None,
         device: torch.device | str | None = None,
@@ -112,6 +122,9 @@ class ExposureModel(nn.Module):
         band = band or Band.of([grid.wavelength])
         basis = AberrationBasis(basis.mixing.to(device=device), basis.n_modes, basis.n_common)
         self.window: Window = Window.around(grid, margin)
+        self.background: Background = background
+        response = None if pixel is None else _half_plane(pixel, self.window.field).to(device)
+        self.register_buffer("response", response, persistent=False)
         self.pupil: SampledPupil = SampledPupil(aperture, self.window.field, band, basis, dtype=dtype, device=device)
 
     @property
@@ -152,21 +165,38 @@ class ExposureModel(nn.Module):
         pupil = field.new_zeros(len(field), math.prod(rasters)).index_add(1, samples.index, field)
         return torch.fft.fft2(pupil.unflatten(1, rasters))
 
+    def spectrum(self, image: Tensor) -> Tensor:
+        """Fourier transform (..., H', W'/2 + 1) of objects (..., H', W'), as the detector's pixels see it."""
+        spectrum = torch.fft.rfft2(image.to(self.dtype))
+        return spectrum if self.response is None else spectrum * self.response.to(spectrum)
+
+    def spectrum_adjoint(self, spectrum: Tensor) -> Tensor:
+        """The adjoint of `spectrum`, up to the normalisation of the FFT: what pulls back to objects (..., H', W')."""
+        if self.response is not None:
+            spectrum = spectrum * self.response.conj().to(spectrum)
+        return torch.fft.irfft2(spectrum, s=self.window.field.shape)
+
     def psf(self, z: Tensor) -> Tensor:
-        """PSFs (T, H', W') of unit sum, origin at [0, 0], for z (T, K)."""
+        """PSFs (T, H', W') of the optics, of unit sum, origin at [0, 0], for z (T, K)."""
         samples = self.pupil.samples()
         return intensity(self.amplitude(samples, samples.field(samples.phase(z))))
 
     def forward(self, image: Tensor, z: Tensor) -> Tensor:
-        spectrum = torch.fft.rfft2(image.to(self.dtype))
         transfer = torch.fft.rfft2(self.psf(z))
-        return self.window.crop(torch.fft.irfft2(transfer * spectrum, s=self.window.field.shape))
+        return self.window.crop(torch.fft.irfft2(transfer * self.spectrum(image), s=self.window.field.shape))
 
 
 def intensity(amplitude: Tensor) -> Tensor:
     """(T, H', W') of amplitudes (T, wavelength, H', W')."""
     power = amplitude.real**2 + amplitude.imag**2
     return power[:, 0] if power.shape[1] == 1 else power.sum(1)
+
+
+def _half_plane(pixel: PixelResponse, field: Grid) -> Tensor:
+    """The transfer function (H', W'/2 + 1) of pixels on the frequencies of a real FFT."""
+    rows, columns = field.shape
+    nu_y, nu_x = torch.fft.fftfreq(rows, dtype=torch.float64), torch.fft.rfftfreq(columns, dtype=torch.float64)
+    return pixel.transfer(nu_y[:, None], nu_x[None])
 
 
 def fast_size(n: int) -> int:

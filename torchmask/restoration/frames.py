@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -12,25 +12,31 @@ from torch import Tensor
 from torchmask.grid import Grid
 from torchmask.observation import check_frames
 from torchmask.optics.aperture import Aperture
+from torchmask.restoration.background import Background, check_known_level
 from torchmask.restoration.noise import expected_variance
 
 _BRIGHT_BORDER = 0.5  # of the mean pixel
+_EVEN_LIGHT = 0.6  # of all light: in the darkest part it may be a wide object as well as a sky
 
 
 @dataclass(frozen=True)
 class FrameStack:
     """Frames that a restoration can work on.
 
-    frames : (T, H, W) in units of `unit`, where a pixel is 1 on average; invalid pixels are filled in
+    frames : (T, H, W) in units of `unit`; invalid pixels are filled in, and a background that is given is taken off
     valid : (T, H, W) bool, False where a pixel carries no weight
-    unit : electrons
-    variance : mean noise variance of a pixel [electrons^2]
+    unit : electrons of a mean pixel, without the background
+    variance : mean noise variance of a pixel [electrons^2], with that of the background
+    known : the background that is given [electrons], broadcasts to the frames
+    free : the one that is not
     """
 
     frames: Tensor
     valid: Tensor
     unit: float
     variance: float
+    known: Tensor = field(default_factory=lambda: torch.zeros(1, 1, 1))
+    free: Background = Background.NONE
 
     @classmethod
     def of(
@@ -40,6 +46,7 @@ class FrameStack:
         grid: Grid,
         aperture: Aperture,
         readout_noise: float | None,
+        background: Background | float | Tensor = Background.NONE,
     ) -> FrameStack:
         """Check `frames` (T, H, W) [electrons] and measure their noise.
 
@@ -47,18 +54,34 @@ class FrameStack:
         `check_frames` and `expected_variance` do; warns if the object seems to reach beyond the field.
         """
         frames, valid = check_frames(frames, valid, grid)
-        unit = float(frames.mean())
         variance = expected_variance(frames, grid, aperture, readout_noise, valid)
-        if border_brightness(frames) > _BRIGHT_BORDER:
-            warnings.warn("the frames are bright at the border: does the object reach beyond the field?", stacklevel=3)
-        return cls(frames / unit, valid, unit, variance)
+        free = background if isinstance(background, Background) else Background.NONE
+        known = check_known_level(0.0 if isinstance(background, Background) else background, frames)
+        frames = frames - known
+        guess = free.first_guess(frames)
+        light = frames - guess
+        unit = float(light.mean())
+        if not unit > 0:
+            raise ValueError("the frames hold nothing but their background: there is no object to restore")
+        if border_brightness(light) > _BRIGHT_BORDER or float(guess.mean()) > _EVEN_LIGHT * float(frames.mean()):
+            warnings.warn(
+                "the frames are bright at the border: does the object reach beyond the field? If that is a sky, give "
+                "what is known of it as background, or Background.PER_FRAME",
+                stacklevel=3,
+            )
+        return cls(frames / unit, valid, unit, variance, known, free)
 
     def __len__(self) -> int:
         return len(self.frames)
 
     def to(self, dtype: torch.dtype, device: torch.device) -> FrameStack:
         """The stack in another precision, elsewhere."""
-        return FrameStack(self.frames.to(device, dtype), self.valid.to(device), self.unit, self.variance)
+        return replace(
+            self,
+            frames=self.frames.to(device, dtype),
+            valid=self.valid.to(device),
+            known=self.known.to(device, dtype),
+        )
 
     @property
     def precision(self) -> Tensor:
@@ -69,7 +92,8 @@ class FrameStack:
     @property
     def change(self) -> float:
         """Chi-square per pixel of the frames against their mean, each with its own light."""
-        moved = self.frames - self.frames.mean((1, 2), keepdim=True) * self.frames.mean(0)
+        light = self.frames - self.free.first_guess(self.frames)
+        moved = light - light.mean((1, 2), keepdim=True) * light.mean(0)
         return float((moved**2 * self.precision).mean())
 
     @property

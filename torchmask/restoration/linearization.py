@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import reduce
+
 import torch
 from torch import Tensor
 
@@ -21,7 +23,7 @@ class Linearization:
         self.model: ExposureModel = model
         self.parallel: Map = parallel
         self.samples = model.pupil.samples()
-        self.spectrum: Tensor = torch.fft.rfft2(image.to(model.dtype))
+        self.spectrum: Tensor = model.spectrum(image)
         self.parts: list[slice] = list(model.chunks(len(z)))
         self.fields: list[Tensor] = [self.samples.field(self.samples.phase(z[part])) for part in self.parts]
         self.amplitudes: list[Tensor] = [model.amplitude(self.samples, field) for field in self.fields]
@@ -30,7 +32,7 @@ class Linearization:
     def forward(self, image: Tensor, z: Tensor) -> Tensor:
         """Changes of the frames (S, T, H, W) for those of the object (S, H', W') and the aberrations (S, T, K)."""
         model, samples, shape = self.model, self.samples, self.model.window.field.shape
-        spectra = torch.fft.rfft2(image.to(model.dtype))
+        spectra = model.spectrum(image)
 
         @torch.no_grad()
         def part_of(number: int) -> Tensor:
@@ -47,7 +49,7 @@ class Linearization:
 
     def adjoint(self, frames: Tensor) -> tuple[Tensor, Tensor]:
         """J^T of (S, T, H, W), as changes of the object (S, H', W') and of the aberrations (S, T, K)."""
-        samples, shape = self.samples, self.model.window.field.shape
+        model, samples, shape = self.model, self.samples, self.model.window.field.shape
         conjugate = self.spectrum.conj().resolve_conj()
 
         @torch.no_grad()
@@ -62,4 +64,4 @@ class Linearization:
             return torch.stack(by_object), torch.stack(by_aberrations)
 
         objects, aberrations = zip(*self.parallel(part_of, range(len(self.parts))), strict=True)
-        return torch.fft.irfft2(sum(objects[1:], objects[0]), s=shape), torch.cat(aberrations, dim=1)
+        return model.spectrum_adjoint(reduce(torch.add, objects)), torch.cat(aberrations, dim=1)

@@ -15,8 +15,10 @@ from torch import Tensor
 from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.band import Band
+from torchmask.optics.pixel import PixelResponse
 from torchmask.record import Callback
 from torchmask.restoration.assembly import add_deviations, assemble_result
+from torchmask.restoration.background import Background
 from torchmask.restoration.checkpoint import Checkpoint, fingerprint_of
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.frames import FrameStack
@@ -37,10 +39,11 @@ class MyopicDeconvolution:
     Minimises, over an object o >= 0 and the whitened aberrations z of every frame (a = L z, L L^T the von Karman
     covariance of the Zernike modes of all sub-apertures), in units of the stack's mean pixel,
 
-        1/2 sum_t || (g_t window(h_t(a_t) * o) - y_t) / sigma ||^2  +  prior(o)  +  1/2 ||z||^2
+        1/2 sum_t || (g_t window(h_t(a_t) * o) + b_t - y_t) / sigma ||^2  +  prior(o)  +  1/2 ||z||^2
 
-    from the clipped mean frame on. `torchmask.restoration.solver` tells the course of it: how the noise sigma and the
-    transmissions g_t are brought up to date on the way, and how it leaves local minima.
+    from the clipped mean frame on, with the background b_t that fits best. `torchmask.restoration.solver` tells the
+    course of it: how the noise sigma and the transmissions g_t are brought up to date on the way, and how it leaves
+    local minima.
 
     Parameters
     ----------
@@ -62,6 +65,13 @@ class MyopicDeconvolution:
         Zernike modes per sub-aperture, Noll 1 to static_modes, of aberrations common to all frames, such as those of
         the telescope, besides the `n_modes` of each frame. Their prior is turbulence as strong as a hole is wide,
         whatever `r0`. Coefficients then have max(n_modes, static_modes) modes, and are the sum of both.
+    background : Background, float or tensor
+        Light on every pixel that is not the object's: none; with `Background.PER_FRAME` a constant of its own in each
+        frame, which is found with the object; or what is known of it [electrons per pixel], a number or a tensor that
+        broadcasts to the frames. Its noise counts in all cases.
+    pixel : PixelResponse, optional
+        How the detector's pixels blur the image: `SquarePixel(fill_factor)`, or `MappedPixel` with a map of their
+        sensitivity. The object is restored without it. None: pixels are points.
     prior : callable
         Of the object: a function or module that maps an image (H', W'), in units of the stack's mean pixel and on a
         field somewhat wider than the frames, to a scalar that PyTorch differentiates. At hand are `TotalVariation` and
@@ -113,6 +123,8 @@ class MyopicDeconvolution:
         wavelengths: Sequence[float] | None = None,
         weights: Sequence[float] | None = None,
         static_modes: int = 0,
+        background: Background | float | Tensor = Background.NONE,
+        pixel: PixelResponse | None = None,
         prior: Callable[[Tensor], Tensor] | None = None,
         aberration_prior: bool = True,
         max_iterations: int = 4000,
@@ -142,10 +154,13 @@ class MyopicDeconvolution:
             r0=aperture.subaperture_diameter / (7 if self.many_minima else 1) if r0 is None else r0,
             outer_scale=20 * aperture.mask_diameter if outer_scale is None else outer_scale,
             whitened=aberration_prior,
+            background=background if isinstance(background, Background) else Background.NONE,
+            pixel=pixel,
             dtype=dtype,
             device=device,
         )
         self.readout_noise: float | None = readout_noise
+        self.background: Background | float | Tensor = background
         self.max_iterations: int = max_iterations
         self.tolerance: float = tolerance
         self.prior: ObjectPrior = as_prior(TotalVariation() if prior is None else prior)
@@ -258,7 +273,7 @@ class MyopicDeconvolution:
 
     def _stack(self, frames: Tensor | np.ndarray, valid: Tensor | np.ndarray | None) -> FrameStack:
         bluest = replace(self.recipe.grid, wavelength=self.recipe.band.shortest)
-        return FrameStack.of(frames, valid, bluest, self.recipe.aperture, self.readout_noise)
+        return FrameStack.of(frames, valid, bluest, self.recipe.aperture, self.readout_noise, self.background)
 
     def _checkpoint(self, path: str | Path | None, solver: Solver, known: Known) -> Checkpoint | None:
         if path is None:

@@ -13,6 +13,7 @@ from torchmask.optics.aperture import Aperture
 from torchmask.restoration.conjugate import conjugate_gradients
 
 _ITERATIONS = 30  # of the search for what dead pixels would hold
+_CLEARLY_MORE = 1.1  # than expected: a few times the error of what one small frame tells
 
 
 def noise_variance(frames: Tensor, grid: Grid, aperture: Aperture, valid: Tensor | None = None) -> float | None:
@@ -58,7 +59,9 @@ def expected_variance(
 ) -> float:
     """Mean noise variance of a pixel [electrons^2]: photon and read-out noise, or what `noise_variance` measures.
 
-    Raises ValueError if nothing tells the noise; warns if both ways are open and disagree by more than a factor of 2.
+    Noise that is clearly more than the light of the frames tells is what is left of a sky that was subtracted, or of a
+    dark current: what is measured counts then. Raises ValueError if nothing tells the noise; warns if both ways are
+    open and disagree by more than a factor of 2.
     """
     measured = noise_variance(frames, grid, aperture, valid)
     if readout_noise is None:
@@ -72,4 +75,4 @@ def expected_variance(
             f"{variance**0.5:.3g}: check the gain and readout_noise",
             stacklevel=4,
         )
-    return variance
+    return measured if measured is not None and measured > _CLEARLY_MORE * variance else variance

@@ -35,7 +35,10 @@ class CostAndGradients(NamedTuple):
 
 
 class MyopicObjective(nn.Module):
-    """1/2 sum precision / inflation (transmission * model - frames)^2 + prior(image) + weight/2 |z - centre|^2.
+    """1/2 sum precision / inflation (transmission * model + background - frames)^2 + prior(image) + hold.
+
+    The hold is weight/2 |z - centre|^2. A background that is free is always the one that fits best, and beside it the
+    object pays for its light (`Background`).
 
     `forward(image, z)` returns it as a scalar that autograd differentiates in the image, in z and in the centres of
     the model's aperture, as often as wanted: the mask may move or train while the matrix of the aberration basis stays
@@ -133,17 +136,18 @@ class MyopicObjective(nn.Module):
 
     def neutral_calibration(self) -> Calibration:
         """Frames as bright as they are, noise as it is said to be, aberrations as strong as their prior says."""
-        transmission = self.frames.mean((1, 2)).double()
+        light = self.frames - self.model.background.first_guess(self.frames)
+        transmission = light.mean((1, 2)).double()
         return Calibration(transmission / transmission.mean(), torch.ones_like(transmission), 1.0)
 
     def forward(self, image: Tensor, z: Tensor, calibration: Calibration | None = None) -> Tensor:
         calibration = calibration or self.neutral_calibration()
         frames, precision = self.scaled_data(calibration)
-        residual = self.model(image, z) - frames
+        residual = self.model.background.residual(frames - self.model(image, z), precision)
         misfit = 0.5 * (precision * residual**2).sum().to(image.dtype)
         away = z - self.centre
         hold = 0.5 * (self.aberration_weight(calibration, z) * away**2).sum()
-        return misfit + self.prior_copies * self.prior(image) + hold
+        return misfit + self.prior_copies * (self.prior(image) + self.model.background.price * image.sum()) + hold
 
     def value_and_gradients(self, image: Tensor, z: Tensor, calibration: Calibration | None = None) -> CostAndGradients:
         """The cost and its gradients in `image` (H', W') and `z` (T, K), by the adjoint."""
@@ -167,7 +171,7 @@ class MyopicObjective(nn.Module):
                 want_aberrations=by_aberrations,
                 parallel=self.parallel,
             )
-            penalty, slope = self.prior.value_and_gradient(image)
+            penalty, slope = self._penalty_and_slope(image)
             weight, away = self.aberration_weight(calibration, z), z - self.centre
             value = misfit.value.sum() + self.prior_copies * penalty + 0.5 * (weight * away**2).sum()
             image_gradient, z_gradient = torch.zeros_like(image), torch.zeros_like(z)
@@ -178,6 +182,11 @@ class MyopicObjective(nn.Module):
             return CostAndGradients(value, image_gradient, z_gradient)
 
         return evaluate
+
+    def _penalty_and_slope(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        value, slope = self.prior.value_and_gradient(image)
+        price = self.model.background.price
+        return value + price * image.sum(), slope + price
 
     def _within_free(self, gradient: Tensor) -> Tensor:
         """The gradient (T, K) of a function of the common aberrations' mean, which keeps equal what is equal."""
@@ -227,4 +236,6 @@ class MyopicObjective(nn.Module):
             transfer = torch.fft.rfft2(self.model.psf(z[part]))
             weight = precision[part].mean((1, 2), keepdim=True)
             power += ((transfer.real**2 + transfer.imag**2) * weight).sum(0).to(power)
+        if self.model.response is not None:
+            power *= self.model.response.abs().to(power) ** 2
         return slope, power

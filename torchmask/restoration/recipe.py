@@ -11,7 +11,9 @@ from torch import Tensor
 from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.band import Band
-from torchmask.restoration.aberrations import estimated_basis, turbulent_basis
+from torchmask.optics.pixel import PixelResponse
+from torchmask.restoration.aberrations import AberrationBasis, estimated_basis, turbulent_basis
+from torchmask.restoration.background import Background
 from torchmask.restoration.forward import ExposureModel
 
 
@@ -22,6 +24,8 @@ class ModelRecipe:
     frame_modes, static_modes : Zernike modes per sub-aperture of each frame, and of what all frames have in common
     r0, outer_scale : of the turbulence [m]
     whitened : whether the parameters are white under the prior; False: they are the coefficients themselves
+    background : what frames hold besides
+    pixel : the detector's; None: it samples the image
 
     Raises
     ------
@@ -39,6 +43,8 @@ class ModelRecipe:
     whitened: bool
     dtype: torch.dtype
     device: torch.device | str | None
+    background: Background = Background.NONE
+    pixel: PixelResponse | None = None
 
     def __post_init__(self) -> None:
         shape = tuple(self.aperture.centers.shape)
@@ -63,7 +69,7 @@ class ModelRecipe:
                 self.aperture, self.frame_modes, self.static_modes, self.r0, self.outer_scale, whitened=self.whitened
             )
         aperture = self.aperture if follows_aperture else self.aperture.still()
-        return ExposureModel(aperture, self.grid, basis, self.band, dtype=self.dtype, device=self.device)
+        return self._build(aperture, basis)
 
     def estimated_model(self, covariance: Tensor) -> ExposureModel:
         """The model whose parameters are errors of estimated coefficients, of `covariance` (N J, N J) [rad^2].
@@ -73,4 +79,8 @@ class ModelRecipe:
         if self.static_modes:
             raise ValueError("covariance is given with static_modes: what is common to all frames is in the estimate")
         basis = estimated_basis(self.aperture, self.n_modes, covariance)
-        return ExposureModel(self.aperture.still(), self.grid, basis, self.band, dtype=self.dtype, device=self.device)
+        return self._build(self.aperture.still(), basis)
+
+    def _build(self, aperture: Aperture, basis: AberrationBasis) -> ExposureModel:
+        options = {"background": self.background, "pixel": self.pixel, "dtype": self.dtype, "device": self.device}
+        return ExposureModel(aperture, self.grid, basis, self.band, **options)

@@ -35,6 +35,7 @@ class RestorationResult:
     object_std : (H, W) standard deviation of the object below the diffraction limit [electrons], its position and
         brightness, which frames cannot tell, taken as found; None unless samples were asked for
     coefficients_std : (N, J) that of the coefficients of a frame [rad rms], or None
+    background : (T,) mean light of a pixel of each frame that is not the object's [electrons]; None in files of 0.1
 
     Examples
     --------
@@ -68,6 +69,7 @@ class RestorationResult:
     seconds: float
     object_std: Tensor | None = None
     coefficients_std: Tensor | None = None
+    background: Tensor | None = None
 
     def save(self, path: str | Path) -> None:
         """Write everything to a new .npz file, without pickle. Errors as in `torchmask.io.save_npz`."""

@@ -79,7 +79,8 @@ def first_state(
     """
     window, model = objective.model.window, objective.model
     neutral = objective.neutral_calibration()
-    image = window.embed(objective.frames.mean(0).clamp(min=0)).double()
+    light = objective.frames - model.background.first_guess(objective.frames)
+    image = window.embed(light.mean(0).clamp(min=0)).double()
     if known_object is not None:
         if tuple(known_object.shape) != window.grid.shape:
             raise ValueError(f"known_object has shape {tuple(known_object.shape)}: it must be {window.grid.shape}")

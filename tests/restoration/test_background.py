@@ -1,0 +1,128 @@
+"""The background: closed forms of the constant that fits, and what a restoration makes of a sky."""
+
+import math
+
+import pytest
+import torch
+
+from torchmask.grid import Grid
+from torchmask.restoration.adjoint import data_fidelity
+from torchmask.restoration.background import Background, check_known_level, darkest_level
+from torchmask.restoration.calibration import fit_of_frames
+from torchmask.restoration.forward import ExposureModel
+from torchmask.restoration.frames import FrameStack
+from torchmask.restoration.objective import MyopicObjective
+from torchmask.restoration.priors import TotalVariation
+from torchmask.restoration.state import Calibration, State
+
+GRID = Grid((12, 15), 2.3e-7, 550e-9)
+FREE = Background.PER_FRAME
+
+
+def test_no_other_constant_fits_better(random_exposures, three_holes):
+    exposures = random_exposures(ExposureModel(three_holes, GRID, 4))
+    difference, precision = exposures.frames, exposures.precision
+    level = FREE.level(difference, precision)
+    least = (precision * (difference - level) ** 2).sum((1, 2), keepdim=True)
+    total = precision.sum((1, 2), keepdim=True)
+    for step in (0.01, -0.01):  # a parabola: precision * step^2 above the least
+        moved = (precision * (difference - level - step) ** 2).sum((1, 2), keepdim=True)
+        torch.testing.assert_close(moved - least, total * step**2)
+    assert float(level.min()) > 0
+    assert torch.equal(FREE.residual(-difference, precision), -difference)  # light is not negative
+    assert torch.equal(Background.NONE.residual(difference, precision), difference)
+
+
+@pytest.mark.parametrize(("dtype", "rounding"), [(torch.float64, 1e-12), (torch.float32, 1e-4)])
+@pytest.mark.parametrize("one_precision", [True, False])
+def test_gradients_beside_a_free_background_are_those_of_autograd(
+    dtype, rounding, one_precision, random_exposures, three_holes
+):
+    model = ExposureModel(three_holes, GRID, 4, background=FREE, dtype=dtype)
+    model, image, z, frames, precision = random_exposures(model)
+    precision = precision[:, :1, :1] if one_precision else precision
+    objective = MyopicObjective(
+        model, frames + torch.tensor([9.0, -9.0, 9.0])[:, None, None], precision, TotalVariation()
+    )
+    image.requires_grad_()
+    z.requires_grad_()
+    value = objective(image, z)
+    by_image, by_z = torch.autograd.grad(value, (image, z))
+    found = objective.value_and_gradients(image.detach(), z.detach())
+    assert float(found.value) == pytest.approx(value.item(), rel=rounding)
+    assert (found.object_gradient - by_image).abs().max() < rounding * by_image.abs().max()
+    assert (found.aberration_gradient - by_z).abs().max() < rounding * by_z.abs().max()
+
+
+def test_the_misfit_does_not_know_a_sky_and_the_object_pays_for_its_light(random_exposures, three_holes):
+    model, image, z, frames, precision = random_exposures(ExposureModel(three_holes, GRID, 4, background=FREE))
+    frames = frames + 10.0 * image.mean()
+    sky = torch.tensor([0.3, 2.0, 50.0], dtype=torch.float64)[:, None, None]
+    below, above = (data_fidelity(model, image, z, f, precision) for f in (frames, frames + sky))
+    torch.testing.assert_close(below.value, above.value)
+    torch.testing.assert_close(below.object_gradient, above.object_gradient, rtol=1e-9, atol=1e-12)
+    # A level of the object is a sky too: only its price tells them apart.
+    objective = MyopicObjective(model, frames, precision, TotalVariation())
+    evaluate = objective.evaluator(objective.neutral_calibration())
+    rise = evaluate(image + 2.0, z).value - evaluate(image, z).value
+    assert float(rise) == pytest.approx(2.0 * FREE.price * image.numel(), rel=1e-6)
+
+
+def test_transmissions_are_those_of_what_rises_above_the_background(random_exposures, three_holes):
+    model, image, z, _, precision = random_exposures(ExposureModel(three_holes, GRID, 4, background=FREE))
+    transmission = torch.tensor([0.7, 1.4, 0.9], dtype=torch.float64)
+    frames = transmission[:, None, None] * model(image, z) + torch.tensor([3.0, 0.0, 0.5]).double()[:, None, None]
+    objective = MyopicObjective(model, frames, precision, TotalVariation())
+    state = State(image, z, Calibration(torch.ones(3).double(), torch.ones(3).double(), 1.0))
+    found, chi_square = fit_of_frames(objective, state)
+    torch.testing.assert_close(found, transmission)
+    assert float(chi_square.max()) < 1e-20
+
+
+def test_the_darkest_part_is_that_of_the_mean_frame():
+    frames = torch.full((3, 40, 32), 9.0, dtype=torch.float64)
+    frames[:, :5, 4:8] = torch.tensor([2.0, 6.0, 4.0]).double()[:, None, None]
+    frames[0, 20:25, 8:12] = 0.0  # darker, in one frame only
+    assert darkest_level(frames).flatten().tolist() == [2.0, 6.0, 4.0]
+
+
+def test_a_background_that_is_known_is_taken_off_and_its_noise_is_left(five_holes, observation):
+    frames, sky = observation.frames, 40.0
+    options = (observation.grid, five_holes, 1.5)
+    plain = FrameStack.of(frames, None, *options)
+    for given in (sky, torch.full(frames.shape[1:], sky), torch.full((len(frames), 1, 1), sky)):
+        stack = FrameStack.of(frames + sky, None, *options, given)
+        torch.testing.assert_close(stack.frames, plain.frames)
+        assert stack.unit == pytest.approx(plain.unit)
+        assert stack.variance == pytest.approx(plain.variance + sky)
+
+
+@pytest.mark.parametrize(
+    ("background", "message"),
+    [(math.nan, "not finite"), (torch.zeros(5), "broadcasts"), (torch.zeros(2, 1, 1), "one number")],
+)
+def test_a_background_that_cannot_be_one_is_refused(background, message):
+    with pytest.raises(ValueError, match=message):
+        check_known_level(background, torch.ones(3, 8, 8))
+
+
+def test_frames_that_are_darker_than_their_background_are_refused(observation, five_holes):
+    with pytest.raises(ValueError, match="nothing but their background"):
+        FrameStack.of(
+            observation.frames, None, observation.grid, five_holes, 1.5, 2.0 * float(observation.frames.mean())
+        )
+
+
+@pytest.mark.filterwarnings("ignore:the frames are bright at the border")  # where the sky is ignored
+def test_a_restoration_finds_the_sky_and_loses_nothing_else(observe, restoring, restored):
+    """A sky as bright as the mean pixel: its noise is more, the object is the same."""
+    observation = observe()
+    sky = float(observation.frames.mean())
+    noise = torch.poisson(torch.full_like(observation.frames, sky), generator=torch.Generator().manual_seed(5))
+    result = restoring(background=FREE).restore(observation.frames + noise)
+    assert result.background is not None
+    assert float((result.background - sky).abs().max()) < 0.05 * sky  # of which the halo of the object is a part
+    torch.testing.assert_close(result.transmission, restored.transmission, atol=0.02, rtol=0)
+    change = (result.object - restored.object).norm() / restored.object.norm()
+    ignored = restoring().restore(observation.frames + noise)
+    assert float(change) < 0.5 * float((ignored.object - restored.object).norm() / restored.object.norm())

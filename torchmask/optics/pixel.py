@@ -1,0 +1,90 @@
+"""The response of a detector's pixels, which blurs every image alike."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+
+class PixelResponse(Protocol):
+    """What a pixel does to each spatial frequency."""
+
+    def transfer(self, nu_y: Tensor, nu_x: Tensor) -> Tensor:
+        """The factor (H, W) on frequencies (H, 1) and (1, W) [cycles/pixel]: 1 at zero."""
+        ...
+
+
+@dataclass(frozen=True)
+class SquarePixel:
+    """Pixels that are sensitive in a square and collect what falls on it: a product of two sincs.
+
+    fill_factor : the part of the area of the pitch that is sensitive
+
+    Raises ValueError unless `fill_factor` lies in (0, 1].
+
+    Examples
+    --------
+    >>> nu = torch.tensor([0.0, 0.5])
+    >>> round(float(SquarePixel().transfer(nu[:, None], nu)[0, 1]), 4)  # 2 / pi at Nyquist
+    0.6366
+    """
+
+    fill_factor: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.fill_factor <= 1:
+            raise ValueError(f"fill_factor is {self.fill_factor}: it is a part of the pitch's area, above 0, at most 1")
+
+    def transfer(self, nu_y: Tensor, nu_x: Tensor) -> Tensor:
+        """sinc(w nu_y) sinc(w nu_x), w the side of the square in pitches."""
+        width = math.sqrt(self.fill_factor)
+        return torch.sinc(width * nu_y) * torch.sinc(width * nu_x)
+
+
+@dataclass(frozen=True, eq=False)
+class MappedPixel:
+    """Pixels whose response within and around the pitch is known as a map.
+
+    sensitivity : (rows, columns) of any scale, centred on the pixel, not negative
+    samples : of the map along one pitch
+
+    Raises ValueError if the map is not two-dimensional, holds no sensitivity or negative or not finite values, or
+    `samples` is below 1.
+
+    Examples
+    --------
+    >>> nu = torch.fft.rfftfreq(8)
+    >>> fine = MappedPixel(torch.ones(64, 64), samples=64).transfer(nu[:, None], nu)
+    >>> torch.allclose(fine, SquarePixel().transfer(nu[:, None], nu).to(fine), atol=1e-3)
+    True
+    """
+
+    sensitivity: Tensor
+    samples: int
+
+    def __post_init__(self) -> None:
+        if self.sensitivity.ndim != 2 or self.samples < 1:
+            raise ValueError(
+                f"sensitivity has shape {tuple(self.sensitivity.shape)} and samples is {self.samples}: a map (rows, "
+                "columns) with at least 1 sample to the pitch is needed"
+            )
+        total = float(self.sensitivity.sum())
+        if not (0 < total < math.inf and float(self.sensitivity.min()) >= 0):
+            raise ValueError("sensitivity must be finite, nowhere negative and somewhere positive")
+
+    def transfer(self, nu_y: Tensor, nu_x: Tensor) -> Tensor:
+        """The Fourier transform of the map, complex unless it is symmetric."""
+        weights = (self.sensitivity / self.sensitivity.sum()).to(nu_y)
+        by_y, by_x = (
+            torch.exp(-2j * math.pi * nu.reshape(-1, 1) * self._places(size).to(nu))
+            for nu, size in zip((nu_y, nu_x), weights.shape, strict=True)
+        )
+        return by_y @ weights.to(by_y) @ by_x.T
+
+    def _places(self, size: int) -> Tensor:
+        """Of the samples along one axis [pitches]."""
+        return (torch.arange(size) - (size - 1) / 2) / self.samples
