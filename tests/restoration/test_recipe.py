@@ -10,7 +10,7 @@ from torchmask.grid import Grid
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.band import Band
 from torchmask.restoration.aberrations import turbulent_basis
-from torchmask.restoration.recipe import ModelRecipe, still
+from torchmask.restoration.recipe import ModelRecipe
 
 GRID = Grid.nyquist(1.0, 550e-9, 32)
 HERE = [[0.0, 0.3], [0.3, -0.2], [-0.3, -0.15]]
@@ -59,7 +59,7 @@ def test_a_model_stands_still_unless_it_follows(trains):
         aperture.centers.add_(0.03)
         assert torch.equal(stands.psf(z), before)
         assert not torch.equal(follows.psf(z), before)
-        copy = still(aperture)
+        copy = aperture.still()
         assert torch.equal(copy.centers, aperture.centers)
         assert copy.centers.data_ptr() != aperture.centers.data_ptr()
 
