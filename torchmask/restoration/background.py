@@ -81,7 +81,7 @@ def check_known_level(level: float | Tensor, frames: Tensor) -> Tensor:
 
     Raises ValueError if it is not finite or does not broadcast to the frames.
     """
-    given = torch.as_tensor(level).to(frames)
+    given = torch.as_tensor(level, dtype=frames.dtype, device=frames.device)
     if not bool(torch.isfinite(given).all()):
         raise ValueError("background holds values that are not finite: electrons per pixel are needed")
     try:

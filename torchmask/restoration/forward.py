@@ -195,7 +195,8 @@ def intensity(amplitude: Tensor) -> Tensor:
 def _half_plane(pixel: PixelResponse, field: Grid) -> Tensor:
     """The transfer function (H', W'/2 + 1) of pixels on the frequencies of a real FFT."""
     rows, columns = field.shape
-    nu_y, nu_x = torch.fft.fftfreq(rows, dtype=torch.float64), torch.fft.rfftfreq(columns, dtype=torch.float64)
+    like = {"dtype": torch.float64, "device": "cpu"}
+    nu_y, nu_x = torch.fft.fftfreq(rows, **like), torch.fft.rfftfreq(columns, **like)
     return pixel.transfer(nu_y[:, None], nu_x[None])
 
 

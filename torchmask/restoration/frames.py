@@ -35,7 +35,7 @@ class FrameStack:
     valid: Tensor
     unit: float
     variance: float
-    known: Tensor = field(default_factory=lambda: torch.zeros(1, 1, 1))
+    known: Tensor = field(default_factory=lambda: torch.zeros(1, 1, 1, device="cpu"))
     free: Background = Background.NONE
 
     @classmethod
