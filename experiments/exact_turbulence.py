@@ -1,0 +1,97 @@
+"""E|OTF|^2 by Monte Carlo, with the exact von Karman covariance between all samples of a pupil.
+
+Screens made by FFT lack low frequencies. Here the phases of all samples, at all instants of an exposure and all
+wavelengths of a band, are drawn together from their covariance, by its Cholesky factor.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchmask.atmosphere.seeing import Seeing
+from torchmask.grid import Grid
+from torchmask.optics.aperture import Aperture
+from torchmask.optics.band import Band
+from torchmask.optics.psf import fold
+from torchmask.optics.pupil import PupilSamples
+
+_ROWS, _FRAMES = 500, 50  # in memory at a time
+
+
+class Drawn(NamedTuple):
+    """|OTF|^2 on the grid (H, W): its mean over draws, the standard error of that, and the value without turbulence.
+
+    All three are of the same samples of the pupil, so that mean / perfect is free of most of the error of sampling.
+    """
+
+    mean: Tensor
+    error: Tensor
+    perfect: Tensor
+
+
+def drawn_mean_square(
+    aperture: Aperture,
+    grid: Grid,
+    seeing: Seeing,
+    band: Band | None = None,
+    *,
+    n_draws: int,
+    n_instants: int = 1,
+    oversampling: int = 1,
+    generator: torch.Generator | None = None,
+) -> Drawn:
+    """|OTF|^2 of one aperture under turbulence whose wind is a vector or 0, on average over `n_draws` exposures.
+
+    An exposure is the mean of `n_instants`, the pupil sampled for a field `oversampling` times as wide as the grid.
+    """
+    band = Band.of([grid.wavelength]) if band is None else band
+    grids = [Grid(grid.n_pixels, grid.pixel_scale, wavelength) for wavelength in band.wavelengths]
+    samples = [aperture.samples(own, oversampling) for own in grids]
+    open_ = [own.weights > 0 for own in samples]
+    wind = torch.tensor(seeing.wind if isinstance(seeing.wind, tuple) else (seeing.speed, 0.0), dtype=torch.float64)
+    times = (torch.arange(n_instants, dtype=torch.float64) + 0.5) / n_instants * seeing.exposure
+    places = [(own.offsets + aperture.centers[:, None])[inside] for own, inside in zip(samples, open_, strict=True)]
+    covariance = _covariance(torch.cat([place - time * wind for time in times for place in places]), seeing)
+    factor = torch.linalg.cholesky(covariance + 1e-9 * torch.eye(len(covariance), dtype=torch.float64))
+    perfect = sum(share * _otf(own, grid) for own, share in zip(samples, band.shares, strict=True))
+    assert isinstance(perfect, Tensor)
+    total, squares = torch.zeros(grid.shape, dtype=torch.float64), torch.zeros(grid.shape, dtype=torch.float64)
+    for first in range(0, n_draws, _FRAMES):
+        count = min(_FRAMES, n_draws - first)
+        phases = (factor @ torch.randn(len(factor), count, dtype=torch.float64, generator=generator)).T
+        pieces = iter(phases.split([len(place) for _ in times for place in places], dim=1))
+        otf = torch.zeros(count, *grid.shape, dtype=torch.complex128)
+        for _ in times:
+            for own, inside, share, wavelength in zip(samples, open_, band.shares, band.wavelengths, strict=True):
+                phase = torch.zeros(count, *inside.shape, dtype=torch.float64)
+                phase[:, inside] = next(pieces) * grid.wavelength / wavelength
+                otf += share / n_instants * _otf(own, grid, phase)
+        power = otf.abs() ** 2
+        total, squares = total + power.sum(0), squares + (power**2).sum(0)
+    mean = total / n_draws
+    return Drawn(mean, ((squares / n_draws - mean**2) / n_draws).sqrt(), perfect.abs() ** 2)
+
+
+def _covariance(points: Tensor, seeing: Seeing) -> Tensor:
+    """Of the phases at `points` (S, 2) [m], less the phase at the origin, which leaves no trace in |OTF|."""
+    structure = seeing.structure(2 * float(points.norm(dim=-1).max()))
+    own = structure(points)
+    rows = [
+        (own[i : i + _ROWS, None] + own - structure(points[i : i + _ROWS, None] - points)) / 2
+        for i in range(0, len(points), _ROWS)
+    ]
+    return torch.cat(rows)
+
+
+def _otf(samples: PupilSamples, grid: Grid, phase: Tensor | None = None) -> Tensor:
+    """The autocorrelation (..., H, W) of the pupil's samples, 1 at 0 for an ideal pupil."""
+    weights = samples.weights.to(torch.complex128)
+    field = (weights if phase is None else weights * torch.polar(torch.ones_like(phase), phase)).flatten(-2)
+    pupil = torch.zeros(*field.shape[:-1], math.prod(samples.raster), dtype=field.dtype)
+    pupil = pupil.scatter_add(-1, samples.index.flatten(-2).expand(field.shape), field).unflatten(-1, samples.raster)
+    intensity = torch.fft.fft2(pupil).abs() ** 2 / math.prod(samples.raster)
+    return torch.fft.fft2(fold(intensity, grid.shape)) / samples.weights.sum()

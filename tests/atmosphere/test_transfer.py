@@ -1,0 +1,107 @@
+"""E|OTF|^2 of any pupil against closed forms and against draws from the exact covariance."""
+
+import math
+
+import pytest
+import torch
+from exact_turbulence import drawn_mean_square
+
+from torchmask.atmosphere.seeing import Seeing
+from torchmask.atmosphere.transfer import difference_variance, mean_square_otf
+from torchmask.grid import Grid
+from torchmask.optics.aperture import FullAperture, SparseAperture
+from torchmask.optics.band import Band
+from torchmask.optics.otf import analytic_otf
+from torchmask.optics.round import disc_otf
+
+NYQUIST = Grid.nyquist(1.0, 550e-9, 32)
+
+
+# What Korff's integral gives over its limit, 0.435 (r0 / D)^2 T(b), at b = D / 2
+@pytest.mark.parametrize(("strength", "ratio"), [(7, 1.61), (10, 1.53), (20, 1.39)])
+def test_full_pupil_above_its_limit(strength, ratio):
+    limit = 0.341864 * 4 / math.pi / strength**2 * float(disc_otf(torch.tensor(0.5, dtype=torch.float64)))
+    found = float(mean_square_otf(FullAperture(1.0), NYQUIST, torch.tensor([[0.25, 0.0]]), Seeing(1 / strength)))
+    assert found / limit == pytest.approx(ratio, rel=0.02)
+
+
+# Mean over both wavelengths of a top hat of exp(-(k - k')^2 D / 2), D/r0 = 7, fixed points D apart
+@pytest.mark.parametrize(("width", "kept"), [(0.05, 0.965), (0.1, 0.875), (0.2, 0.659), (0.4, 0.397)])
+def test_a_band_blurs_the_phase_between_two_points(width, kept):
+    band = Band.top_hat(1.0, width, 12)
+    scale = 1 / torch.tensor(band.wavelengths, dtype=torch.float64)
+    shares = torch.tensor(band.shares, dtype=torch.float64)
+    baseline = torch.tensor([1.0, 0.0], dtype=torch.float64)
+    variance = difference_variance(
+        Seeing(1 / 7).structure(), torch.zeros(2), baseline, baseline, scale[:, None], scale[None, :]
+    )
+    assert float(shares @ torch.exp(-variance / 2) @ shares) == pytest.approx(kept, abs=1e-3)
+
+
+def test_pistons_alone_are_the_denominator_of_mse_a():
+    """Holes of r0 / 5, 3.6 r0 apart or more: the squares of the pairs, each less what turbulence takes in a hole."""
+    mask = SparseAperture([[0.0, 0.4], [0.35, -0.2], [-0.4, -0.25]], 0.04, 1.0)
+    centers = mask.centers / NYQUIST.period
+    at = torch.tensor([0.002, 0.004], dtype=torch.float64)
+    found = mean_square_otf(
+        mask, NYQUIST, torch.stack([centers[0] - centers[1], centers[2] - centers[0]]) + at, Seeing(0.2)
+    )
+    square = float(disc_otf(torch.linalg.vector_norm(NYQUIST.period * at) / 0.04)) ** 2
+    # each of two independent holes loses the variance of its piston-removed phase at most, 1.03 (d / r0)^(5/3)
+    lost = 2 * 1.0324 * 0.2 ** (5 / 3)
+    assert (found * 9 < square).all()
+    assert (found * 9 > square * (1 - lost)).all()
+
+
+def test_a_point_far_from_all_baselines_carries_nothing():
+    mask = SparseAperture([[0.4, 0.0], [-0.4, 0.0]], 0.1, 1.0)
+    assert float(mean_square_otf(mask, NYQUIST, torch.tensor([[0.0, 0.2]]), Seeing(0.1))) == 0
+
+
+@pytest.mark.parametrize("ratio", [0.4, 1.5])
+def test_a_mask_agrees_with_draws(ratio):
+    mask = SparseAperture([[0.0, 0.3], [0.25, -0.1], [-0.3, -0.1]], 0.25, 1.0)
+    assert_agrees(mask, NYQUIST, Seeing(0.25 / ratio, 5.0), oversampling=4)
+
+
+def test_a_full_pupil_agrees_with_draws_through_a_band():
+    band = Band.top_hat(550e-9, 110e-9, 3)
+    assert_agrees(FullAperture(0.5, 0.3), Grid.nyquist(0.6, 550e-9, 32), Seeing(0.25, 5.0), band, oversampling=2)
+
+
+def test_an_exposure_agrees_with_draws():
+    seeing = Seeing(0.25, 5.0, exposure=2 * Seeing(0.25, wind=10.0).tau0, wind=(8.0, 6.0))
+    # eight instants stand for the exposure: by the midpoint rule that is half a per cent of contrast too much
+    assert_agrees(FullAperture(0.5), Grid.nyquist(0.5, 550e-9, 32), seeing, n_instants=8, oversampling=1)
+
+
+def assert_agrees(aperture, grid, seeing, band=None, **sampling):
+    """Within 3 % beyond four standard errors, at 12 frequencies that carry something."""
+    generator = torch.Generator().manual_seed(3)
+    drawn = drawn_mean_square(aperture, grid, seeing, band, n_draws=500, generator=generator, **sampling)
+    nu_y, nu_x = grid.frequencies(torch.float64)
+    carried = (drawn.mean > 3e-3) & (torch.hypot(nu_y, nu_x) > 0.04) & (nu_y >= 0)
+    row, column = carried.nonzero()[torch.randperm(int(carried.sum()), generator=generator)[:12]].T
+    nu = torch.stack([nu_x[0, column], nu_y[row, 0]], -1)
+    still = mean_square_otf(aperture, grid, nu, Seeing(1e9), band)
+    found = mean_square_otf(aperture, grid, nu, seeing, band) / still * drawn.perfect[row, column]
+    excess = (found - drawn.mean[row, column]).abs() - 4 * drawn.error[row, column]
+    assert (excess < 0.03 * found).all()
+    # on average over the frequencies the draws' errors are smaller
+    assert float((found / drawn.mean[row, column]).mean()) == pytest.approx(1, abs=0.02)
+
+
+def test_hexagons_annuli_and_zero_frequency():
+    nu = torch.tensor([[0.0, 0.0], [0.1, 0.2]], dtype=torch.float64)
+    for aperture in (FullAperture(1.0, 0.3), SparseAperture([[0.3, 0.0], [-0.3, 0.1]], 0.2, 1.0, "hexagon")):
+        still = mean_square_otf(aperture, NYQUIST, nu, Seeing(1e6))
+        assert float(still[0]) == pytest.approx(1, rel=1e-9)
+        row, column = int(nu[1, 1] * 32), int(nu[1, 0] * 32)
+        grid_nu = torch.tensor([[column / 32, row / 32]], dtype=torch.float64)
+        exact = float(analytic_otf(aperture, NYQUIST).real[row, column]) ** 2
+        assert float(mean_square_otf(aperture, NYQUIST, grid_nu, Seeing(1e6))[0]) == pytest.approx(exact, rel=1e-6)
+
+
+def test_a_population_is_refused():
+    with pytest.raises(ValueError, match="one mask is needed"):
+        mean_square_otf(SparseAperture(torch.zeros(2, 1, 2), 0.2, 1.0), NYQUIST, torch.zeros(1, 2), Seeing(0.1))

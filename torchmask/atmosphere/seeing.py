@@ -1,0 +1,101 @@
+"""What the air does during one exposure: turbulence of some strength, carried along by a wind."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.special import roots_jacobi
+from torch import Tensor
+
+from torchmask.atmosphere.structure import StructureFunction
+from torchmask.atmosphere.von_karman import STRUCTURE_CONSTANT
+
+
+@dataclass(frozen=True)
+class Seeing:
+    """One layer of von Karman turbulence under a frozen wind, and the exposure that averages over it.
+
+    Parameters
+    ----------
+    r0 : float
+        Fried's parameter at the reference wavelength, that of the grid [m].
+    outer_scale : float
+        L0 [m]; infinite for Kolmogorov turbulence.
+    exposure : float
+        T [s]; 0 for instantaneous frames.
+    wind : float or (float, float)
+        Its speed [m/s], all directions being equally likely, or its velocity (vx, vy).
+
+    Raises
+    ------
+    ValueError
+        For a length that is not positive, a negative exposure or speed, a number that is not finite, and an exposure
+        without wind, which would be instantaneous however long.
+
+    Examples
+    --------
+    >>> seeing = Seeing(r0=0.1, exposure=5e-3, wind=10.0)
+    >>> round(1e3 * seeing.tau0, 2)  # ms
+    3.14
+    """
+
+    r0: float
+    outer_scale: float = math.inf
+    exposure: float = 0.0
+    wind: float | tuple[float, float] = 0.0
+
+    def __post_init__(self) -> None:
+        self.structure()  # which checks the scales
+        if not (math.isfinite(self.exposure) and self.exposure >= 0):
+            raise ValueError(f"exposure is {self.exposure}: it must be finite and not negative, in s")
+        pair = isinstance(self.wind, tuple | list)
+        speeds = tuple(self.wind) if isinstance(self.wind, tuple | list) else (self.wind,)
+        if len(speeds) != 1 + pair or not all(math.isfinite(speed) and (pair or speed >= 0) for speed in speeds):
+            raise ValueError(f"wind is {self.wind}: it must be a speed of at least 0 or a pair (vx, vy), in m/s")
+        if self.exposure > 0 and self.speed == 0:
+            raise ValueError(f"exposure is {self.exposure} s without wind: say how fast the turbulence moves, in m/s")
+
+    @property
+    def speed(self) -> float:
+        """Of the wind [m/s]."""
+        return math.hypot(*self.wind) if isinstance(self.wind, tuple | list) else float(self.wind)
+
+    @property
+    def tau0(self) -> float:
+        """Time in which two points of Kolmogorov turbulence change by 1 rad rms against each other [s]."""
+        return math.inf if self.speed == 0 else STRUCTURE_CONSTANT ** (-3 / 5) * self.r0 / self.speed
+
+    @property
+    def is_isotropic(self) -> bool:
+        """Whether no direction is distinguished."""
+        return self.exposure == 0 or not isinstance(self.wind, tuple | list)
+
+    def structure(self, reach: float = math.inf) -> StructureFunction:
+        """The structure function of the phase, for displacements up to `reach` [m]."""
+        return StructureFunction(self.r0, self.outer_scale, reach)
+
+    def drift(self, n_lags: int = 7, n_directions: int = 8) -> tuple[Tensor, Tensor]:
+        """How far the turbulence moves between two instants of an exposure: displacements (L, 2) [m], weights (L,).
+
+        The lag of two instants of [0, T] has the density 2 (1 - x) / T, x = lag / T, whose Gauss quadrature this is;
+        a displacement stands for its opposite too.
+        """
+        if self.exposure == 0:
+            return torch.zeros(1, 2, dtype=torch.float64), torch.ones(1, dtype=torch.float64)
+        lags, weights = _triangle_quadrature(n_lags)
+        if isinstance(self.wind, tuple | list):
+            directions = torch.tensor([self.wind], dtype=torch.float64)
+        else:
+            angle = math.pi * (torch.arange(n_directions, dtype=torch.float64) + 0.5) / n_directions
+            directions = self.wind * torch.stack([angle.cos(), angle.sin()], -1)
+        steps = self.exposure * lags[:, None, None] * directions
+        return steps.flatten(0, 1), (weights[:, None] / len(directions)).expand(-1, len(directions)).flatten()
+
+
+def _triangle_quadrature(n: int) -> tuple[Tensor, Tensor]:
+    """Nodes and weights on [0, 1] of the mean with the density 2 (1 - x), exact for polynomials of degree 2 n - 1."""
+    nodes, weights = roots_jacobi(n, 1, 0)
+    return torch.from_numpy((np.asarray(nodes) + 1) / 2), torch.from_numpy(np.asarray(weights) / np.sum(weights))

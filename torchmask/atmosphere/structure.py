@@ -1,0 +1,101 @@
+"""The phase structure function as a smooth, differentiable function of the displacement, whatever the outer scale.
+
+Over Kolmogorov's 6.88 (r / r0)^(5/3), von Karman's structure function is analytic in (r / L0)^(1/3), so a short
+Chebyshev series stands for its Bessel function (`von_karman_structure_function`) to 1e-7.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import torch
+from numpy.polynomial import Chebyshev
+from torch import Tensor
+
+from torchmask.atmosphere.von_karman import STRUCTURE_CONSTANT, require_turbulence, von_karman_structure_function
+
+_SATURATED = 3.0  # outer scales: beyond, the structure function is constant to 2e-8
+_TOLERANCE = 1e-8  # of the Chebyshev series
+_DEGREES = (6, 8, 12, 16, 24, 32, 48)
+
+
+@dataclass(frozen=True)
+class StructureFunction:
+    """Mean square phase difference [rad^2] between two points of the pupil.
+
+    Parameters
+    ----------
+    r0 : float
+        Fried's parameter [m].
+    outer_scale : float
+        L0 [m]; infinite for Kolmogorov turbulence.
+    reach : float
+        The longest displacement that will be asked for [m]; a known one makes the series shorter. Longer ones are
+        taken as this one.
+
+    Raises
+    ------
+    ValueError
+        For scales that are not positive, and an r0 that is not finite.
+
+    Examples
+    --------
+    >>> kolmogorov = StructureFunction(r0=0.1)
+    >>> round(float(kolmogorov(torch.tensor([0.06, 0.08]))), 2)  # one r0 apart
+    6.88
+    """
+
+    r0: float
+    outer_scale: float = math.inf
+    reach: float = math.inf
+
+    def __post_init__(self) -> None:
+        require_turbulence(self.r0, 1.0)
+        for name, value in (("outer_scale", self.outer_scale), ("reach", self.reach)):
+            if not value > 0:
+                raise ValueError(f"{name} is {value}: it must be positive, in m")
+
+    def __call__(self, displacement: Tensor) -> Tensor:
+        """At `displacement` (..., 2) [m]: (...), in its dtype and differentiable in it, with gradient 0 at 0."""
+        return self.of_square((displacement**2).sum(-1))
+
+    def of_square(self, squared: Tensor) -> Tensor:
+        """At the squared distance (...) [m^2]."""
+        # The offset, a billionth of r0 squared, keeps the derivative finite at 0.
+        unit = squared / self.r0**2 + 1e-18
+        if math.isinf(self.outer_scale):
+            return STRUCTURE_CONSTANT * torch.exp(5 / 6 * torch.log(unit))
+        longest = min(self.reach, _SATURATED * self.outer_scale)
+        root = torch.exp(torch.log(unit.clamp(max=(longest / self.r0) ** 2)) / 6)  # (r / r0)^(1/3)
+        series = _series(longest / self.outer_scale)
+        position = root * (2 / (longest / self.r0) ** (1 / 3)) - 1
+        return STRUCTURE_CONSTANT * root**5 * _clenshaw(series, position)
+
+
+@lru_cache(maxsize=64)
+def _series(longest: float) -> tuple[float, ...]:
+    """Chebyshev coefficients of von Karman's over Kolmogorov's on (r / L0)^(1/3) from 0 to that of `longest`."""
+
+    def ratio(position: np.ndarray) -> np.ndarray:
+        # 1 at 0, which the factor r^(5/3) hides: a tiny distance stands for it
+        root = np.maximum((position + 1) / 2 * longest ** (1 / 3), 1e-5)
+        values = von_karman_structure_function(torch.from_numpy(root**3), 1.0, 1.0).numpy()
+        return values / (STRUCTURE_CONSTANT * root**5)
+
+    coefficients = np.empty(0)
+    for degree in _DEGREES:
+        coefficients = Chebyshev.interpolate(ratio, degree).coef
+        if np.abs(coefficients[-2:]).max() < _TOLERANCE:
+            break
+    return tuple(coefficients.tolist())
+
+
+def _clenshaw(coefficients: tuple[float, ...], x: Tensor) -> Tensor:
+    """The Chebyshev series at x (...)."""
+    after, current = torch.zeros_like(x), torch.full_like(x, coefficients[-1])
+    for coefficient in coefficients[-2:0:-1]:
+        current, after = 2 * x * current - after + coefficient, current
+    return x * current - after + coefficients[0]
