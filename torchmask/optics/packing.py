@@ -52,6 +52,29 @@ def largest_fill_factor(n_subapertures: int) -> float:
     return n / (1 + 2 * radius) ** 2
 
 
+def largest_number(ratio: float) -> int:
+    """The largest N of equal discs that may fit into a disc `ratio` times as wide: no more do, fewer perhaps.
+
+    Up to 20 as in the best packing known; beyond, the bound of Oler, whose density tends to pi / sqrt(12).
+    """
+    known = sum(ratio >= needed * (1 - _ROUNDING) for needed in _RATIOS)
+    if known < len(_RATIOS):
+        return known
+    radius = (ratio - 1) / 2
+    return max(known, math.floor(2 * math.pi / math.sqrt(3) * radius**2 + math.pi * radius + 1))
+
+
+def certain_number(ratio: float) -> int:
+    """A number of equal discs that do fit into a disc `ratio` times as wide: the best packing known, or a lattice."""
+    known = sum(ratio >= needed for needed in _RATIOS)
+    if known < len(_RATIOS):
+        return known
+    reach = math.ceil(ratio)
+    i, j = np.meshgrid(np.arange(-reach, reach + 1), np.arange(-reach, reach + 1))
+    lattice = (i**2 + i * j + j**2) <= ((ratio - 1) / 2) ** 2  # squared distances from a point of the lattice
+    return max(known, int(lattice.sum()))
+
+
 def hole_diameter(n_subapertures: int, mask_diameter: float, fill_factor: float) -> float:
     """Diameter d [m] of N holes in a disc of diameter D with N d^2 / D^2 = `fill_factor`.
 

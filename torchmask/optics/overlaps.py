@@ -1,0 +1,77 @@
+"""Which holes of a mask overlap, and by how much.
+
+A mask with overlapping holes can be made, because some real ones are like that. What simulates or draws a mask asks
+here: where holes overlap, the models count the light twice, and a plate has one hole where the drawing shows two.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchmask.optics.aperture import SparseAperture
+
+_SHOWN = 3  # pairs in a message
+
+
+class Overlap(NamedTuple):
+    """Two holes that overlap, counted from 0, and by how much [m]."""
+
+    first: int
+    second: int
+    depth: float
+
+
+def pair_clearances(aperture: SparseAperture) -> Tensor:
+    """Material between the holes of each pair (..., N(N-1)/2) [m], negative where they overlap.
+
+    Pairs are those of `torch.triu_indices(N, N, 1)`. For holes with corners it is measured along the normal of a side,
+    which is exact for sides that face each other, right in its sign, and never more than the true distance.
+    """
+    n = aperture.n_subapertures
+    first, second = torch.triu_indices(n, n, 1).to(aperture.centers.device)
+    difference = aperture.centers[..., first, :] - aperture.centers[..., second, :]
+    return aperture.shape.separation(difference) - aperture.subaperture_diameter
+
+
+def find_overlaps(aperture: SparseAperture, tolerance: float = 1e-6) -> list[Overlap]:
+    """The pairs of holes that overlap by more than `tolerance`, a fraction of the mask diameter; the deepest first.
+
+    The default is what rounding leaves of touching holes in files and in float32. Of a population, the pairs of all its
+    masks.
+    """
+    n = aperture.n_subapertures
+    first, second = torch.triu_indices(n, n, 1).tolist()
+    depths = -pair_clearances(aperture).detach().cpu()
+    depths = depths.reshape(math.prod(depths.shape[:-1]), len(first))
+    found = [
+        Overlap(first[pair], second[pair], float(depths[mask, pair]))
+        for mask, pair in torch.nonzero(depths > tolerance * aperture.mask_diameter).tolist()
+    ]
+    return sorted(found, key=lambda overlap: -overlap.depth)
+
+
+def check_overlaps(aperture: SparseAperture, tolerance: float = 1e-6) -> None:
+    """Raise ValueError where `find_overlaps` finds some: the message says which holes, and by how much.
+
+    Examples
+    --------
+    >>> check_overlaps(SparseAperture([[-0.4, 0.0], [-0.3, 0.0], [0.4, 0.0]], 0.2, 1.0))
+    Traceback (most recent call last):
+        ...
+    ValueError: 1 pair of holes overlaps: 0 and 1 by 0.1 m (holes of 0.2 m, counted from 0)
+    """
+    pairs = find_overlaps(aperture, tolerance)
+    if pairs:
+        raise ValueError(describe_overlaps(aperture, pairs))
+
+
+def describe_overlaps(aperture: SparseAperture, pairs: list[Overlap]) -> str:
+    """The overlaps in one line, the deepest first."""
+    count = "1 pair of holes overlaps" if len(pairs) == 1 else f"{len(pairs)} pairs of holes overlap"
+    shown = ", ".join(f"{first} and {second} by {depth:.3g} m" for first, second, depth in pairs[:_SHOWN])
+    more = f", and {len(pairs) - _SHOWN} more pairs" if len(pairs) > _SHOWN else ""
+    return f"{count}: {shown}{more} (holes of {aperture.subaperture_diameter:.4g} m, counted from 0)"
