@@ -20,12 +20,17 @@ from torchmask.io import load_npz, save_npz
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.bad_pixels import fill_bad_pixels
 from torchmask.optics.records import aperture_record, read_aperture
+from torchmask.record import Brief
 
 _NEEDED_NUMBERS = ("subaperture_diameter", "mask_diameter", "pixel_scale", "wavelength")
 
-_NUMBERS = (*_NEEDED_NUMBERS, "readout_noise", "r0", "outer_scale", "n_photons")
+_OPTIONAL_NUMBERS = ("r0", "outer_scale", "n_photons", "background")
 
-_ARRAYS = ("object", "psfs", "phases", "valid", "errors")
+_NUMBERS = (*_NEEDED_NUMBERS, "readout_noise", *_OPTIONAL_NUMBERS)
+
+_ARRAYS = ("object", "psfs", "phases", "valid", "errors", "transmission")
+
+_TRUE = "true_"  # begins what a file holds of the true aperture
 
 PHASE_OVERSAMPLING = 4  # of the pupil samples that the phases of an observation lie on
 
@@ -35,8 +40,8 @@ _CELESTIAL = re.compile(
 )
 
 
-@dataclass(frozen=True, eq=False)
-class Observation:
+@dataclass(frozen=True, eq=False, repr=False)
+class Observation(Brief):
     """Short exposures of one object, how they were taken and, where it is known, the truth behind them.
 
     frames : (T, H, W) electrons
@@ -51,9 +56,13 @@ class Observation:
     n_photons : electrons per frame, before the field was cropped
     valid : (H, W) or (T, H, W) bool, False where a pixel is dead or saturated; None: all are valid
     errors : (T, H, W) electrons rms of each pixel, or None
+    true_aperture : through which the light went, where it is not `aperture`
+    background : electrons per pixel and frame that the object did not send
+    transmission : (T,) of the object's light in each frame, 1 in the mean
     header : FITS cards that go with the frames: sky coordinates, target, telescope, filter, date
 
-    The truth (object, psfs, phases, r0, outer_scale, n_photons) is None where nobody knows it: in real observations.
+    The truth (object, psfs, phases, r0, outer_scale, n_photons, background, transmission, true_aperture) is None where
+    nobody knows it: in real observations.
 
     Examples
     --------
@@ -78,6 +87,9 @@ class Observation:
     errors: Tensor | None = None
     header: Mapping[str, str | int | float] = field(default_factory=dict)
     phases: Tensor | None = None
+    true_aperture: Aperture | None = None
+    background: float | None = None
+    transmission: Tensor | None = None
 
     def __post_init__(self) -> None:
         if self.frames.ndim != 3 or self.frames.shape[-2:] != self.grid.shape or not len(self.frames):
@@ -89,6 +101,7 @@ class Observation:
         if noise is not None and not (math.isfinite(noise) and noise >= 0):
             raise ValueError(f"readout_noise is {noise}: it must be finite and not negative")
         shapes = {"object": self.grid.shape, "psfs": self.frames.shape, "errors": self.frames.shape}
+        shapes["transmission"] = (len(self.frames),)
         if self.phases is not None:
             samples = self.aperture.samples(self.grid, PHASE_OVERSAMPLING)
             shapes["phases"] = (len(self.frames), *samples.weights.shape)
@@ -125,7 +138,10 @@ class Observation:
             "wavelength": grid.wavelength,
             **aperture_record(self.aperture),
         }
-        optional = {name: getattr(self, name) for name in ("readout_noise", *_ARRAYS, "r0", "outer_scale", "n_photons")}
+        if self.true_aperture is not None:
+            record = aperture_record(self.true_aperture)
+            values |= {_TRUE + name: value for name, value in record.items()}
+        optional = {name: getattr(self, name) for name in ("readout_noise", *_ARRAYS, *_OPTIONAL_NUMBERS)}
         if self.header:
             optional["header"] = json.dumps(dict(self.header))
         save_npz(path, values | {name: value for name, value in optional.items() if value is not None})
@@ -151,15 +167,15 @@ class Observation:
     @classmethod
     def _from_arrays(cls, stored: dict[str, Any]) -> Observation:
         number = {name: float(stored[name].item()) for name in _NUMBERS if name in stored}
-        aperture = read_aperture(
-            {name: array.item() for name, array in stored.items() if array.size == 1}
-            | {"centers": torch.from_numpy(stored["centers"])}
-        )
+        aperture = _read_aperture(stored, "")
         frames = torch.from_numpy(stored["frames"])
         height, width = frames.shape[-2:]
         grid = Grid(height if height == width else (height, width), number["pixel_scale"], number["wavelength"])
-        optional: dict[str, Any] = {name: torch.from_numpy(stored[name]) for name in _ARRAYS if name in stored}
-        optional |= {name: number[name] for name in ("r0", "outer_scale", "n_photons") if name in number}
+        true_aperture = _read_aperture(stored, _TRUE) if f"{_TRUE}centers" in stored else None
+        optional: dict[str, Any] = {"true_aperture": true_aperture} | {
+            name: torch.from_numpy(stored[name]) for name in _ARRAYS if name in stored
+        }
+        optional |= {name: number[name] for name in _OPTIONAL_NUMBERS if name in number}
         if "header" in stored:
             optional["header"] = json.loads(str(stored["header"]))
         return cls(frames, aperture, grid, number.get("readout_noise"), **optional)
@@ -200,6 +216,12 @@ def check_frames(frames: Tensor | np.ndarray, valid: Tensor | np.ndarray | None,
     if bool(dark.any()):
         raise ValueError(f"frames {dark.nonzero().flatten().tolist()} hold no light: leave them out")
     return frames, valid
+
+
+def _read_aperture(stored: Mapping[str, Any], prefix: str) -> Aperture:
+    own = {name.removeprefix(prefix): array for name, array in stored.items() if name.startswith(prefix)}
+    numbers = {name: array.item() for name, array in own.items() if array.size == 1}
+    return read_aperture(numbers | {"centers": torch.from_numpy(own["centers"])})
 
 
 def pixel_matrix(header: Any) -> np.ndarray | None:

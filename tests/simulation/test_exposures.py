@@ -194,7 +194,7 @@ def test_agrees_with_stacks_of_another_program(shared_stack, name):
     inner = torch.fft.fftshift(attenuation)[192:320, 192:320]
     kept, samples = 1 - lost(own), other.aperture.samples(other.grid, 4)
     phase = TurbulencePhase(other.r0, 20.0)(samples, 4, generator(1))
-    whole = module.psf_from_samples(samples, phase)
+    whole = psf_from_samples(samples, phase)
     total = float((whole * attenuation).sum(dim=(-2, -1)).mean())
     darkened = float((own.psfs * inner).sum(dim=(-2, -1)).mean()) / total
     assert kept < 1 - lost(other) < 1

@@ -7,31 +7,46 @@ leaves the field is lost.
 
 from __future__ import annotations
 
+import functools
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from torchmask.atmosphere.phase import TurbulencePhase
+from torchmask.atmosphere.screens import draw_seed
 from torchmask.grid import Grid
-from torchmask.observation import PHASE_OVERSAMPLING, Observation
+from torchmask.observation import Observation
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.detector import Detector, image_formation
-from torchmask.optics.psf import psf_from_samples
 from torchmask.record import Callback, Record
+from torchmask.simulation.conditions import Conditions
+from torchmask.simulation.exposed_psf import ExposedPSF
+from torchmask.simulation.field import SPACING, FieldPoint, field_points
+from torchmask.simulation.wavefronts import (
+    Turbulence,
+    Wavefront,
+    exposure_delays,
+    isoplanatic_angle,
+    wavefronts,
+    with_layers,
+)
 
-_CHUNK = 2**21  # pixels of unfolded PSFs held at once
+_CHUNK = 2**21  # pixels of unfolded PSFs: frames of about as many have their noise drawn together
+_MIDDLE = (0.0, 0.0)  # of the field: direction [rad]
 
 
 def simulate_observation(
     scene: Tensor,
     aperture: Aperture,
     grid: Grid,
-    turbulence: TurbulencePhase | None,
+    turbulence: Turbulence,
     detector: Detector,
     n_frames: int,
     generator: torch.Generator | None = None,
     *,
+    conditions: Conditions | None = None,
+    told: Aperture | None = None,
     keep_phases: bool = False,
     callback: Callback | None = None,
 ) -> Observation:
@@ -45,16 +60,22 @@ def simulate_observation(
     aperture : Aperture
         One aperture, without leading axes.
     grid : Grid
-    turbulence : TurbulencePhase or None
-        None for a perfect atmosphere.
+    turbulence : TurbulencePhase, LayeredPhase or None
+        With layers in height the PSF varies over the field. None for a perfect atmosphere.
     detector : Detector
     n_frames : int
     generator : torch.Generator, optional
         Seeds one stream for the screens and one for the noise: another flux or read-out noise leaves the screens as
         they were.
+    conditions : Conditions, optional
+        Sky, transparency, exposure time, band and pixels. None: snapshots of one wavelength on a black sky.
+    told : Aperture, optional
+        What the observer takes the aperture for, if that is not what the light goes through: it stands in the
+        observation, with the true one as `true_aperture`.
     keep_phases : bool
         Whether the observation keeps the phase of every frame's wavefront (`Observation.phases`), to compare with a
-        restored one; flat ones for a perfect atmosphere.
+        restored one: in the middle of the field, flat for a perfect atmosphere, and for snapshots of one wavelength
+        only.
     callback : callable, optional
         Receives a `Record` of stage "simulation" after each chunk of frames, with the frames so far.
 
@@ -67,11 +88,15 @@ def simulate_observation(
     ------
     ValueError
         If the scene does not fit the grid, is negative, black or not finite, the aperture is a population,
-        `n_frames` is below 1, or the grid samples the aperture too coarsely.
+        `n_frames` is below 1, the grid samples the aperture too coarsely at the shortest wavelength, an exposure lasts
+        under turbulence without wind or longer than the frames are apart, or phases are to be kept of what is no
+        snapshot of one wavelength through the aperture that is told.
 
     Examples
     --------
     >>> from torchmask.optics.aperture import SparseAperture
+    >>> from torchmask.atmosphere.phase import TurbulencePhase
+    >>> from torchmask.observation import PHASE_OVERSAMPLING
     >>> from torchmask.optics.zernike import ZernikePhase
     >>> mask = SparseAperture([[0.0, 0.3], [0.3, -0.2], [-0.3, -0.2]], 0.2, 1.0)
     >>> scene = torch.zeros(32, 32, dtype=torch.float64); scene[12:20, 14:18] = 1000.0
@@ -96,41 +121,82 @@ def simulate_observation(
     >>> rms.shape
     torch.Size([4])
     """
+    conditions = conditions or Conditions()
     scene = scene.detach()
     _check(scene, aperture, grid, n_frames)
+    turbulence = with_layers(turbulence, grid.wavelength)
+    delays = exposure_delays(turbulence, conditions.exposure_time)
+    if keep_phases and (len(delays) > 1 or conditions.band is not None or told is not None):
+        raise ValueError(
+            "keep_phases is for snapshots of one wavelength through the aperture that is told: leave out "
+            "exposure_time, band and told, or it"
+        )
     device = None if generator is None else generator.device
     screens_seed, noise_seed = torch.randint(2**62, (2,), generator=generator, device=device).tolist()
     noise = torch.Generator().manual_seed(noise_seed)
     with torch.no_grad():
-        samples = aperture.samples(grid, PHASE_OVERSAMPLING)
-        phases = None
-        if turbulence is not None:
-            phases = turbulence(samples, n_frames, torch.Generator().manual_seed(screens_seed))
-        chunk = max(1, _CHUNK // math.prod(samples.raster))
-        frames, psfs = [], []
+        optics = ExposedPSF(aperture, grid, conditions.band, conditions.pixel)
+        points = field_points(scene, grid, SPACING * isoplanatic_angle(turbulence))
+        transmission = _draw_transmission(n_frames, conditions.transparency_scatter, generator).to(scene)
+        screens = torch.Generator().manual_seed(screens_seed)
+        stream = wavefronts(turbulence, optics.samples, n_frames, delays, screens)
+        frames, psfs, phases = scene.new_empty(n_frames, *grid.shape), scene.new_empty(n_frames, *grid.shape), []
+        chunk = max(1, _CHUNK // math.prod(optics.samples.raster))
         for first in range(0, n_frames, chunk):
-            count = min(chunk, n_frames - first)
-            phase = None if phases is None else phases[first : first + count]
-            unfolded = psf_from_samples(samples, phase).to(scene).expand(count, *samples.raster)
-            frames.append(detector(image_formation(scene, unfolded), noise))
-            psfs.append(_centre(unfolded, grid.shape))
+            now = range(first, min(first + chunk, n_frames))
+            for t, wavefront in zip(now, stream, strict=False):
+                frames[t], psfs[t] = _expose(points, optics, wavefront, scene)
+                if keep_phases:
+                    phases += wavefront(_MIDDLE)
+            expected = transmission[first : now.stop, None, None] * frames[first : now.stop] + conditions.sky
+            frames[first : now.stop] = detector(expected, noise)
             if callback is not None:
-                light = {"kept_light": float(frames[-1].sum() / (count * scene.sum()))}
-                callback(Record("simulation", first + count, n_frames, light, {"frames": torch.cat(frames)}))
-    if keep_phases and phases is None:
-        phases = samples.weights.new_zeros(n_frames, *samples.weights.shape)
+                light = float((frames[first : now.stop] - conditions.sky).sum() / (len(now) * scene.sum()))
+                arrays = {"frames": frames[: now.stop]}
+                callback(Record("simulation", now.stop, n_frames, {"kept_light": light}, arrays))
     return Observation(
-        frames=torch.cat(frames),
-        aperture=aperture.still(),  # a mask that trains on does not change the past
+        frames=frames,
+        aperture=(told or aperture).still(),  # a mask that trains on does not change the past
         grid=grid,
         readout_noise=detector.readout_noise,
         object=scene,
-        psfs=torch.cat(psfs),
+        psfs=psfs,
         r0=None if turbulence is None else float(turbulence.r0),
         outer_scale=None if turbulence is None else float(turbulence.outer_scale),
         n_photons=float(scene.sum()),
-        phases=phases.to(scene.device) if keep_phases and phases is not None else None,
+        phases=_stack_phases(phases, optics.samples.weights).to(scene.device) if keep_phases else None,
+        background=conditions.sky,
+        transmission=transmission,
+        true_aperture=None if told is None else aperture.still(),
     )
+
+
+def _expose(
+    points: Sequence[FieldPoint], optics: ExposedPSF, wavefront: Wavefront, scene: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The expected image (H, W) of one frame without the sky, and the PSF of the middle of the field, centred."""
+    images, centred = [], None
+    for direction, light in points:
+        psf = optics(wavefront(direction)).to(scene)
+        images.append(image_formation(light, psf))
+        if direction == _MIDDLE:
+            centred = psf
+    if centred is None:
+        centred = optics(wavefront(_MIDDLE)).to(scene)
+    return functools.reduce(torch.add, images), _centre(centred, (scene.shape[0], scene.shape[1]))
+
+
+def _draw_transmission(n_frames: int, scatter: float, generator: torch.Generator | None) -> Tensor:
+    """(n_frames,) log-normal with mean 1. The stream of the screens and that of the noise do not know of it."""
+    if scatter == 0:
+        return torch.ones(n_frames, dtype=torch.float64, device="cpu")
+    own = torch.Generator().manual_seed(draw_seed(generator))
+    normal = torch.randn(n_frames, generator=own, dtype=torch.float64, device="cpu")
+    return torch.exp(scatter * normal - scatter**2 / 2)
+
+
+def _stack_phases(phases: Sequence[Tensor | None], like: Tensor) -> Tensor:
+    return torch.stack([torch.zeros_like(like) if phase is None else phase for phase in phases])
 
 
 def _check(scene: Tensor, aperture: Aperture, grid: Grid, n_frames: int) -> None:

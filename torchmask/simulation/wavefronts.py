@@ -1,0 +1,86 @@
+"""The wavefronts of one frame after another: in any direction, and in turn while a frame lasts."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator
+
+import torch
+from torch import Tensor
+
+from torchmask.atmosphere.layers import Layers, Vector
+from torchmask.atmosphere.phase import DrawnLayers, LayeredPhase, TurbulencePhase
+from torchmask.optics.pupil import PupilSamples
+
+Turbulence = TurbulencePhase | LayeredPhase | None
+Wavefront = Callable[[Vector], Iterator[Tensor | None]]
+"""From a direction (x, y) [rad] to the phases (N, P) [rad] in turn while a frame lasts; None is a perfect one."""
+
+STEPS_PER_TAU0 = 8  # of an exposure: two points keep at most 0.3 % too much of their contrast (Kolmogorov)
+_BLOCK = 2**23  # samples of phases held at once
+
+
+def with_layers(turbulence: Turbulence, wavelength: float) -> Turbulence:
+    """Frozen flow as the one layer that it is; anything else as it comes."""
+    if not isinstance(turbulence, TurbulencePhase) or turbulence.wind is None:
+        return turbulence
+    layer = Layers.from_fractions(turbulence.r0, wavelength, [0.0], [1.0], [turbulence.wind])
+    return LayeredPhase(layer, wavelength, turbulence.outer_scale, turbulence.frame_interval)
+
+
+def exposure_delays(turbulence: Turbulence, exposure_time: float) -> list[float]:
+    """The middles [s] of the steps into which an exposure is cut, so short that the phase hardly changes in one.
+
+    Raises ValueError for an exposure that lasts under turbulence without wind, or longer than the frames are apart.
+    """
+    if exposure_time == 0 or turbulence is None:
+        return [0.0]
+    if not isinstance(turbulence, LayeredPhase) or math.isinf(turbulence.layers.tau0(turbulence.wavelength)):
+        raise ValueError(
+            f"exposure_time is {exposure_time:g} s, but the turbulence has no wind that moves it meanwhile: give "
+            "layers with winds (LayeredPhase), or wind and frame_interval (TurbulencePhase), or leave exposure_time out"
+        )
+    interval = turbulence.frame_interval
+    if interval is not None and exposure_time > interval * (1 + 1e-9):
+        raise ValueError(
+            f"exposure_time is {exposure_time:g} s, longer than the {interval:g} s from one frame to the next "
+            "(frame_interval)"
+        )
+    steps = math.ceil(STEPS_PER_TAU0 * exposure_time / turbulence.layers.tau0(turbulence.wavelength))
+    return [(k + 0.5) / steps * exposure_time for k in range(steps)]
+
+
+def isoplanatic_angle(turbulence: Turbulence) -> float:
+    """theta0 [rad]; infinite for turbulence without height."""
+    return turbulence.layers.theta0(turbulence.wavelength) if isinstance(turbulence, LayeredPhase) else math.inf
+
+
+def wavefronts(
+    turbulence: Turbulence,
+    samples: PupilSamples,
+    n_frames: int,
+    delays: list[float],
+    generator: torch.Generator,
+) -> Iterator[Wavefront]:
+    """The wavefronts of `n_frames` frames on the samples of a pupil, at `delays` [s] after the start of each."""
+    if turbulence is None:
+        yield from (_steady(None) for _ in range(n_frames))
+    elif isinstance(turbulence, LayeredPhase):
+        draws = itertools.islice(turbulence.draws(samples, generator), n_frames)
+        yield from (_moving(layers, delays) for layers in draws)
+    else:
+        # An even number at a time, because independent screens are drawn in pairs.
+        block = max(2, _BLOCK // samples.weights.numel() // 2 * 2)
+        for first in range(0, n_frames, block):
+            phases = turbulence(samples, min(block, n_frames - first), generator)
+            yield from (_steady(phase) for phase in phases)
+
+
+def _steady(phase: Tensor | None) -> Wavefront:
+    """The same in all directions, at all times."""
+    return lambda direction: iter([phase])
+
+
+def _moving(layers: DrawnLayers, delays: list[float]) -> Wavefront:
+    return lambda direction: (layers.phase(delay, direction) for delay in delays)
