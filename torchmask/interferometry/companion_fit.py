@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchmask.interferometry.companion import OWN_MODES, CompanionModel, Exposures, Parameters
 from torchmask.interferometry.companion_equations import BLUR, LeastSquares
-from torchmask.record import Callback, Record
+from torchmask.record import Brief, Callback, Record
 
 STEPS = 40  # of Gauss-Newton, at most
 TOLERANCE = 0.1  # the last one lowers the squared residuals by less, which no error bar sees
@@ -21,8 +21,8 @@ _HALVINGS = 6  # of a step that makes the fit worse
 _CORE = 3  # pixels to each side of the middle, in which the first guess looks for the star
 
 
-@dataclass(frozen=True, eq=False)
-class CompanionFit:
+@dataclass(frozen=True, eq=False, repr=False)
+class CompanionFit(Brief):
     """Where a fit ended.
 
     parameters : companion, aberrations and the rest

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchmask.grid import ARCSEC
+from torchmask.record import Brief
 
 SIGNIFICANCE = 5.0  # times the scatter where there is no companion: what counts as found
 _ANNULUS, _REACH = 0.1, 0.025  # [arcsec] width of an annulus, and how far its scatter is measured beyond its borders
@@ -36,8 +37,8 @@ def search_offsets(step: float, least: float = 0.1, most: float = 0.7) -> Tensor
     return grid[(separation > least) & (separation < most)]
 
 
-@dataclass(frozen=True, eq=False)
-class DetectionLimits:
+@dataclass(frozen=True, eq=False, repr=False)
+class DetectionLimits(Brief):
     """Faintest companion that would be found, by the separation of annuli around the star.
 
     separation : (A,) middle of each annulus [arcsec]

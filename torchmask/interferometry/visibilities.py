@@ -24,12 +24,13 @@ from torchmask.observation import Observation
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.otf import OTF
 from torchmask.optics.zernike import ZernikePhase
+from torchmask.record import Brief
 
 _SAMPLES_PER_HOLE = 8
 
 
-@dataclass(frozen=True, eq=False)
-class Observables:
+@dataclass(frozen=True, eq=False, repr=False)
+class Observables(Brief):
     """Visibilities of B = N (N - 1) / 2 baselines and closure phases of C = N (N - 1) (N - 2) / 6 triangles.
 
     pairs : (B, 2) holes i < j of each baseline

@@ -1,0 +1,93 @@
+"""Images of a star through a mask that lies otherwise: against FFTs, and all their derivatives."""
+
+import math
+
+import pytest
+import torch
+
+from torchmask.grid import Grid
+from torchmask.interferometry.star_model import PLACE, Shared, StarModel
+from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.geometry import MaskGeometry
+from torchmask.optics.pixel import SquarePixel
+from torchmask.optics.psf import focal_intensity
+from torchmask.optics.zernike import ZernikePhase
+
+GRID = Grid.nyquist(1.1, 550e-9, 48)
+MASKS = {
+    shape: SparseAperture([[0.02, 0.38], [-0.35, -0.2], [0.3, -0.28], [0.31, 0.2]], 0.2, 1.0, shape)
+    for shape in ("disc", "hexagon")
+}
+
+
+def shared(geometry: MaskGeometry, logarithms: list[float]) -> Shared:
+    return Shared(geometry.matrix, torch.tensor(logarithms, dtype=torch.float64))
+
+
+def own(seed: int, n_modes: int, rms: float = 0.5) -> torch.Tensor:
+    values = rms * torch.randn(4 * n_modes, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return torch.cat([values.new_tensor([3.0, 0.7]), values])
+
+
+@pytest.mark.parametrize("shape", MASKS)
+def test_images_are_those_of_the_moved_mask_by_fft(shape):
+    geometry, mask, values = MaskGeometry(0.05, 1.02, 1.02), MASKS[shape], own(0, 3)
+    model, lies = StarModel(mask, GRID, 23, 3), shared(geometry, [0.0] * 4)
+    image = model.image(values, lies, model.kernels(lies.matrix)) - values[1]
+    moved, errors = geometry.apply(mask), []
+    coefficients = values[PLACE:].view(4, 3)
+    tilts = coefficients[:, 1:] @ (geometry.matrix / 1.02).T  # the model's turn with the mask
+    coefficients = torch.cat([coefficients[:, :1], tilts], 1)
+    for oversampling in (4, 8):
+        phase = ZernikePhase(moved, GRID, 3, oversampling)
+        by_fft = focal_intensity(moved.samples(GRID, oversampling), phase(coefficients))
+        square = by_fft.roll((23, 23), (0, 1))[:47, :47].flatten()
+        errors.append(float((square * (image.sum() / square.sum()) - image).norm() / image.norm()))
+    # The samples of the pupil err by the square of their step.
+    assert errors[1] < 2e-3
+    assert 2.5 < errors[0] / errors[1] < 6
+
+
+@pytest.mark.parametrize("pixel", [None, SquarePixel()], ids=["points", "squares"])
+@pytest.mark.parametrize("shape", MASKS)
+def test_derivatives_are_those_of_autograd(shape, pixel):
+    model = StarModel(MASKS[shape], GRID, 4, 6, pixel)
+    lies = shared(MaskGeometry(0.05, 1.02, 0.99, 0.01, mirrored=True), [0.1, -0.1, 0.2, 0.0])
+
+    def image(own, matrix, logarithms):
+        here = Shared(matrix.view(2, 2), logarithms)
+        return model.image(own, here, model.kernels(here.matrix))
+
+    arguments = (own(1, 6), lies.matrix.flatten(), lies.log_transmission)
+    values, by_own, by_shared = model.linearise(arguments[0], lies, model.kernels(lies.matrix))
+    expected = torch.func.jacrev(image, argnums=(0, 1, 2))(*arguments)
+    torch.testing.assert_close(values, image(*arguments))
+    torch.testing.assert_close(by_own, expected[0], rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(by_shared, torch.cat(expected[1:], 1), rtol=1e-9, atol=1e-9)
+
+
+def test_pixels_blur_by_their_transfer_function():
+    sharp, blurred = (StarModel(MASKS["disc"], GRID, 12, 3, pixel) for pixel in (None, SquarePixel(0.7)))
+    lies, values = shared(MaskGeometry(), [0.0] * 4), own(2, 3)
+    images = [model.image(values, lies, model.kernels(lies.matrix)).view(25, 25) for model in (sharp, blurred)]
+    nu = torch.fft.fftfreq(25, dtype=torch.float64)
+    ratio = torch.fft.fft2(images[1] - values[1]) / torch.fft.fft2(images[0] - values[1])
+    torch.testing.assert_close(ratio.real, SquarePixel(0.7).transfer(nu[:, None], nu))
+
+
+@pytest.mark.parametrize("shape", MASKS)
+def test_offsets_tell_by_how_much_a_common_tilt_moves_the_image(shape):
+    model, lies = StarModel(MASKS[shape], GRID, 12, 6), shared(MaskGeometry(0.3, 1.05, 0.97, 0.02), [0.0] * 4)
+    move = torch.tensor([1.0, -2.0], dtype=torch.float64)
+    # phase k s . A r at the centres is their piston; over a hole, by Noll 2 and 3 along x and y: 2 r / R has unit rms
+    slope = 2 * math.pi / GRID.period * (move @ lies.matrix)
+    points, weights = model._points, model._weights
+    tilts = torch.linalg.lstsq(model._modes * weights.sqrt()[:, None], (points @ slope) * weights.sqrt()).solution
+    coefficients = tilts.repeat(4, 1)
+    coefficients[:, 0] += model.centers @ slope
+    values = torch.cat([move.new_zeros(PLACE), coefficients.flatten()])
+    torch.testing.assert_close(values @ model.offset_slopes(lies), move)
+    kernels = model.kernels(lies.matrix)
+    still = model.image(torch.zeros_like(values), lies, kernels).view(25, 25)
+    moved = model.image(values, lies, kernels).view(25, 25)
+    torch.testing.assert_close(moved[:-2, 1:], still[2:, :-1])

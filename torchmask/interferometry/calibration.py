@@ -1,0 +1,274 @@
+"""How a mask lies, and how much light its holes pass, measured on frames of a star or of a pinhole."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.functional import jacobian
+
+from torchmask.grid import Grid
+from torchmask.interferometry.orientation import first_look
+from torchmask.interferometry.star_fit import (
+    Information,
+    StarFit,
+    evaluate,
+    fit_frame,
+    fit_together,
+    start_frame,
+)
+from torchmask.interferometry.star_frames import StarFrames
+from torchmask.interferometry.star_model import MAP, PLACE, Shared, StarModel
+from torchmask.observation import check_frames
+from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.geometry import MaskGeometry, turn_and_stretch
+from torchmask.optics.pixel import PixelResponse
+from torchmask.record import Callback, Record
+
+_REACH = 1.6  # of the pixels compared, in wavelengths over the diameter of a hole: beyond its first dark ring
+_LEAST_EXPLAINED = 0.5  # of the variance of a frame: the fit is of something else otherwise
+_FIRST_MODES = 3  # piston, tip and tilt are found first
+
+
+@dataclass(frozen=True, eq=False)
+class MaskCalibration:
+    """How a mask lies, with standard errors; `print` shows it.
+
+    aperture : the mask where it lies
+    geometry : the map that leads there from the mask as told; a turn by 180 degrees, which no image shows, is left out
+    geometry_errors : (4,) of rotation [rad], magnification_x, magnification_y and shear
+    mirror_seen : False where a mirrored mask would look the same, as one of symmetric baselines; `geometry` says then
+        that it is not mirrored
+    transmissions, transmission_errors : (N,) light through the holes against their mean
+    offset, offset_errors : (2,) where the star stands, mean over the frames, (x, y) from pixel [H // 2, W // 2] [pixel]
+    explained : (T,) of the variance of each frame's pixels around the star, at most 1
+
+    Examples
+    --------
+    >>> mask, geometry = SparseAperture([[0.0, 0.4], [0.3, -0.2]], 0.1, 1.0), MaskGeometry(rotation=0.01)
+    >>> two, frame = torch.ones(2), torch.ones(1)
+    >>> found = MaskCalibration(
+    ...     geometry.apply(mask), geometry, 1e-4 * torch.ones(4), False, two, 0.02 * two, 0 * two, 0.1 * two, frame)
+    >>> print(found)
+    rotation, from x to y    0.5730 +- 0.0057 deg
+    magnification along x    1.000000 +- 0.000100
+    magnification along y    1.000000 +- 0.000100
+    shear                    0.000000 +- 0.000100
+    mirrored                 cannot be seen with this mask
+    star from the middle     x 0.0000 +- 0.1000, y 0.0000 +- 0.1000 pixels
+    light through the holes  1.000 +- 0.020, 1.000 +- 0.020
+    explained of the frames  100.0 % or more
+    """
+
+    aperture: SparseAperture
+    geometry: MaskGeometry
+    geometry_errors: Tensor
+    mirror_seen: bool
+    transmissions: Tensor
+    transmission_errors: Tensor
+    offset: Tensor
+    offset_errors: Tensor
+    explained: Tensor
+
+    def __str__(self) -> str:
+        g, e = self.geometry, self.geometry_errors.tolist()
+        mirror = ("yes" if g.mirrored else "no") if self.mirror_seen else "cannot be seen with this mask"
+        holes = zip(self.transmissions.tolist(), self.transmission_errors.tolist(), strict=True)
+        (x, y), (dx, dy) = self.offset.tolist(), self.offset_errors.tolist()
+        rows = [
+            ("rotation, from x to y", f"{math.degrees(g.rotation):.4f} +- {math.degrees(e[0]):.4f} deg"),
+            ("magnification along x", f"{g.magnification_x:.6f} +- {e[1]:.6f}"),
+            ("magnification along y", f"{g.magnification_y:.6f} +- {e[2]:.6f}"),
+            ("shear", f"{g.shear:.6f} +- {e[3]:.6f}"),
+            ("mirrored", mirror),
+            ("star from the middle", f"x {x:.4f} +- {dx:.4f}, y {y:.4f} +- {dy:.4f} pixels"),
+            ("light through the holes", ", ".join(f"{value:.3f} +- {error:.3f}" for value, error in holes)),
+            ("explained of the frames", f"{100 * float(self.explained.min()):.1f} % or more"),
+        ]
+        width = max(len(name) for name, _ in rows)
+        return "\n".join(f"{name:<{width}}  {value}" for name, value in rows)
+
+
+def calibrate_mask(
+    frames: Tensor | np.ndarray,
+    aperture: SparseAperture,
+    grid: Grid,
+    *,
+    valid: Tensor | np.ndarray | None = None,
+    readout_noise: float = 0.0,
+    pixel: PixelResponse | None = None,
+    n_modes: int = 6,
+    callback: Callback | None = None,
+) -> MaskCalibration:
+    """Measure how a mask lies on short exposures `frames` (T, H, W) [electrons] of a star or pinhole.
+
+    First the power of the fringes, out of which the pistons of turbulence drop, tells mirror, turn and magnification
+    roughly. Then the aberrations of every frame are fitted together with what all frames share: the affine map of the
+    pupil and the light through each hole.
+
+    Parameters
+    ----------
+    frames : (T, H, W) tensor or array
+        In any turbulence, or none; a few tens are enough. The star may move from frame to frame.
+    aperture : SparseAperture
+        As told. It may be wrong by any turn, by a mirror, and by a few percent in size.
+    grid : Grid
+        Of the frames. A pixel scale that is wrong shows as magnification, and does no harm.
+    valid : (H, W) or (T, H, W) boolean tensor or array, optional
+        False where a pixel is dead or saturated.
+    readout_noise : float
+        [electrons rms per pixel].
+    pixel : PixelResponse, optional
+        How the detector's pixels blur the image. None: they are points.
+    n_modes : int
+        Zernike modes of every hole and frame, at least 3.
+    callback : callable, optional
+        Receives a `Record` of stage "calibration" after each frame of the first fit.
+
+    Returns
+    -------
+    MaskCalibration
+        Standard errors are the larger of what noise leaves and what the frames' disagreement tells, if there are two or
+        more. Turbulence in holes wider than r0 has modes beyond `n_modes`, which count in them.
+
+    Raises
+    ------
+    ValueError
+        If the aperture is no single mask of three holes or more, `n_modes` or `readout_noise` are out of range,
+        `check_frames` refuses the frames, or they do not show a point source behind this mask.
+
+    Notes
+    -----
+    A hole's field is integrated by a quadrature, with all derivatives in closed form; elliptic holes, as a stretched
+    image has them, are modelled as such, while `aperture` has holes that are magnified evenly.
+
+    Examples
+    --------
+    >>> from torchmask.optics.detector import Detector
+    >>> from torchmask.simulation.exposures import simulate_observation
+    >>> told = SparseAperture([[0.0, 0.35], [-0.35, -0.2], [0.3, -0.25]], 0.2, 1.0)
+    >>> true = MaskGeometry(rotation=0.02, magnification_x=1.01, magnification_y=1.01)
+    >>> star = torch.zeros(64, 64, dtype=torch.float64); star[32, 32] = 1e7  # electrons per frame
+    >>> grid = Grid.nyquist(1.1, 550e-9, 64)
+    >>> seen = simulate_observation(star, true.apply(told), grid, None, Detector(), n_frames=1)
+    >>> found = calibrate_mask(seen.frames, told, grid)
+    >>> round(found.geometry.rotation, 3), round(found.aperture.subaperture_diameter, 3)
+    (0.02, 0.202)
+    """
+    if aperture.centers.ndim != 2 or aperture.n_subapertures < 3:
+        raise ValueError(f"centers has shape {tuple(aperture.centers.shape)}: one mask of at least 3 holes is needed")
+    if n_modes < _FIRST_MODES:
+        raise ValueError(f"n_modes is {n_modes}: piston, tip and tilt, {_FIRST_MODES}, are the least")
+    if not (math.isfinite(readout_noise) and readout_noise >= 0):
+        raise ValueError(f"readout_noise is {readout_noise}: it must be finite and at least 0, in electrons rms")
+    frames, valid = (values.cpu() for values in check_frames(frames, valid, grid))
+    reach = min(math.ceil(_REACH * grid.period / aperture.subaperture_diameter), (min(grid.shape) - 1) // 2)
+    star = StarFrames.around(frames, valid, reach)
+    centers = aperture.centers.detach().double().cpu()
+    look = first_look(star.light, centers, grid)
+    star.require_fringes(centers @ look.geometry.matrix.T, grid)
+    coarse, model = (StarModel(aperture, grid, reach, number, pixel) for number in (_FIRST_MODES, n_modes))
+    data, counted = star.pixels.flatten(1), star.counted.flatten(1).double()
+    even = _even_weights(data, counted)
+    shared = Shared(look.geometry.matrix, centers.new_zeros(len(centers)))
+    fit = _first_fit(coarse, model, data, even, shared, callback)
+    _require_star(data, counted, fit)
+    fit, _ = fit_together(model, data, even, fit)
+    fit, information = fit_together(model, data, counted / _variance(data, counted, fit, readout_noise), fit)
+    return MaskCalibration(
+        geometry=(geometry := MaskGeometry.from_matrix(fit.shared.matrix)),
+        aperture=geometry.apply(aperture),
+        mirror_seen=look.mirror_seen,
+        explained=_explained(data, counted, fit),
+        **_estimates(model, fit, information, star.middles),
+    )
+
+
+def _first_fit(
+    coarse: StarModel, model: StarModel, data: Tensor, weights: Tensor, shared: Shared, callback: Callback | None
+) -> StarFit:
+    """Every frame fitted by itself, to pistons, tips and tilts first and to all modes then."""
+    coarse_kernels, kernels = coarse.kernels(shared.matrix), model.kernels(shared.matrix)
+    rows = []
+    for frame, weight in zip(data, weights, strict=True):
+        own = start_frame(coarse, frame, weight, shared, coarse_kernels)
+        own = fit_frame(coarse, frame, weight, own, shared, coarse_kernels)
+        modes = own[PLACE:].view(model.n_holes, coarse.n_modes)
+        modes = torch.nn.functional.pad(modes, (0, model.n_modes - coarse.n_modes))
+        own = torch.cat([own[:PLACE], modes.flatten()])
+        rows.append(fit_frame(model, frame, weight, own, shared, kernels))
+        if callback is not None:
+            callback(Record("calibration", len(rows), len(data), {}))
+    return evaluate(model, torch.stack(rows), shared)
+
+
+def _even_weights(data: Tensor, counted: Tensor) -> Tensor:
+    """The same (T, pixels) for all pixels of a frame that count: one over their mean light, or a small part of all."""
+    level = (data * counted).sum(1, keepdim=True) / counted.sum(1, keepdim=True).clamp(min=1)
+    return counted / level.clamp(min=1e-6 * float(data.abs().max()))
+
+
+def _variance(data: Tensor, counted: Tensor, fit: StarFit, readout_noise: float) -> Tensor:
+    """Of the pixels (T, pixels): their noise, and what the frame's fit leaves beyond it, the same in all pixels.
+
+    Modes that the model lacks leave more where there is more light, but pixels weighed by that would count mostly
+    where nearly none is.
+    """
+    noise = fit.images.clamp(min=1e-6 * float(fit.images.max())) + readout_noise**2
+    freedom = (counted.sum(1) - fit.own.shape[1]).clamp(min=1)
+    left = (counted * (data - fit.images) ** 2).sum(1) / freedom - (counted * noise).sum(1) / counted.sum(1)
+    return noise + left.clamp(min=0)[:, None]
+
+
+def _explained(data: Tensor, counted: Tensor, fit: StarFit) -> Tensor:
+    """Share (T,) of the variance of each frame's pixels."""
+    mean = (data * counted).sum(1, keepdim=True) / counted.sum(1, keepdim=True)
+    left, all_of_it = ((counted * (data - level) ** 2).sum(1) for level in (fit.images, mean))
+    return 1 - left / all_of_it
+
+
+def _require_star(data: Tensor, counted: Tensor, fit: StarFit) -> None:
+    """Raise ValueError unless the fit of a star explains most of the variance of most frames."""
+    explained = float(_explained(data, counted, fit).median())
+    if explained < _LEAST_EXPLAINED:
+        raise ValueError(
+            f"a star behind this mask explains only {100 * max(explained, 0.0):.0f} % of the variance of the frames: "
+            "give frames of a point source through this mask, at the scale of the grid"
+        )
+
+
+def _estimates(model: StarModel, fit: StarFit, information: Information, middles: Tensor) -> dict[str, Tensor]:
+    """The fields of a `MaskCalibration` that are numbers with errors."""
+    covariances = [information.noise_covariance, information.covariance]
+
+    def errors(function: Callable[[Tensor], Tensor], at: Tensor, part: slice) -> Tensor:
+        slope = jacobian(function, at)
+        assert isinstance(slope, Tensor)
+        return torch.stack([(slope @ c[part, part] @ slope.T).diagonal().sqrt() for c in covariances]).amax(0)
+
+    def geometry(elements: Tensor) -> Tensor:
+        matrix = elements.view(2, 2)
+        mirror = matrix.new_tensor([-1.0 if float(torch.linalg.det(matrix.detach())) < 0 else 1.0, 1.0])
+        angle, stretch = turn_and_stretch(matrix * mirror)
+        return torch.cat([angle[None], stretch])
+
+    def transmissions(logarithms: Tensor) -> Tensor:
+        return logarithms.exp() / logarithms.exp().mean()
+
+    elements, logarithms = fit.shared.matrix.flatten(), fit.shared.log_transmission
+    tilts = model.offset_slopes(fit.shared)
+    offsets = middles + fit.own @ tilts
+    n = len(offsets)
+    noise = torch.einsum("kx,tkl,lx->tx", tilts, information.own_covariances, tilts).mean(0)
+    scatter = offsets.var(0) if n > 1 else torch.zeros_like(noise)
+    return {
+        "geometry_errors": errors(geometry, elements, slice(0, MAP)),
+        "transmissions": transmissions(logarithms),
+        "transmission_errors": errors(transmissions, logarithms, slice(MAP, None)),
+        "offset": offsets.mean(0),
+        "offset_errors": (torch.maximum(noise, scatter) / n).sqrt(),
+    }

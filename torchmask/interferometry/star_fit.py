@@ -1,0 +1,175 @@
+"""Aberrations of every frame of a star, and what all frames share, fitted together by Gauss-Newton steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchmask.interferometry.star_model import MAP, PLACE, Shared, StarModel
+
+_STEPS = 30  # of each fit, at most
+_ENOUGH = 0.01  # a step that promises to lower the squared residuals by less is the last: no error bar sees it
+_HALVINGS = 8  # of a step that makes the fit worse
+_DAMPING = (1e-3, 1e8)  # of Levenberg and Marquardt: the first, and the one at which a frame rests
+_LOOSE = (10.0, 3.0)  # [rad] rms that pistons and tilts, and higher modes may have: holds what nothing else holds
+_EVEN = 1e-3  # rms of the mean of the logarithms of transmissions, which the light of the frames holds as well
+
+
+@dataclass(frozen=True, eq=False)
+class StarFit:
+    """Where a fit stands.
+
+    own : (T, 2 + N J) parameters of the frames; shared : those of all
+    images : (T, pixels) the model
+    """
+
+    own: Tensor
+    shared: Shared
+    images: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Information:
+    """What frames tell of the shared parameters once their own ones are fitted.
+
+    matrices : (T, S, S) of each frame; scores : (T, S) half the slopes of its squared residuals, downwards
+    own_covariances : (T, K, K) of the own parameters if the shared ones are known
+    prior : (S, S) of what is held besides
+    """
+
+    matrices: Tensor
+    scores: Tensor
+    own_covariances: Tensor
+    prior: Tensor
+
+    @property
+    def noise_covariance(self) -> Tensor:
+        """(S, S) that the noise of the pixels leaves."""
+        return torch.linalg.inv(self.matrices.sum(0) + self.prior)
+
+    @property
+    def covariance(self) -> Tensor:
+        """(S, S) from how much the frames disagree (a sandwich estimate), as soon as there are several."""
+        bread, n = self.noise_covariance, len(self.scores)
+        return bread if n == 1 else bread @ (self.scores.T @ self.scores) @ bread * (n / (n - 1))
+
+
+def start_frame(
+    model: StarModel, frame: Tensor, weight: Tensor, shared: Shared, kernels: tuple[Tensor, Tensor]
+) -> Tensor:
+    """Own parameters (2 + N J,) of a frame (pixels,) without aberrations but the pistons its fringes tell.
+
+    At the baseline of holes m and n a frame carries exp(i (phase_n - phase_m)): the phases of the leading eigenvector
+    of the matrix of all pairs agree best with all of them (angular synchronisation; Singer, Appl. Comput. Harmon. Anal.
+    30, 20, 2011).
+    """
+    carrier = kernels[1]
+    counts = weight > 0
+    pairs = (carrier.T * torch.where(counts, frame - frame[counts].median(), 0.0)) @ carrier.conj()  # (N, N)
+    pairs.fill_diagonal_(0)
+    own = frame.new_zeros(PLACE + model.n_holes * model.n_modes)
+    own[PLACE :: model.n_modes] = -torch.linalg.eigh(pairs).eigenvectors[:, -1].angle()
+    shape = model.image(own, shared, kernels)
+    design = torch.stack([shape, torch.ones_like(shape)], 1)
+    root = weight.sqrt()
+    light, background = torch.linalg.lstsq(root[:, None] * design, (root * frame)[:, None]).solution[:, 0]
+    own[0], own[1] = light.clamp(min=1e-6 * float(frame.abs().max())).log(), background
+    return own
+
+
+def fit_frame(
+    model: StarModel, frame: Tensor, weight: Tensor, own: Tensor, shared: Shared, kernels: tuple[Tensor, Tensor]
+) -> Tensor:
+    """Own parameters (2 + N J,) that fit a frame (pixels,) best, by the method of Levenberg and Marquardt."""
+    hold, damping = _hold(model), _DAMPING[0]
+
+    def cost(own: Tensor) -> float:
+        return float((weight * (frame - model.image(own, shared, kernels)) ** 2).sum() + (hold * own**2).sum())
+
+    now = cost(own)
+    for _ in range(_STEPS):
+        image, by_own, _ = model.linearise(own, shared, kernels)
+        matrix = (by_own.T * weight) @ by_own + hold.diag()
+        slope = by_own.T @ (weight * (frame - image)) - hold * own
+        while True:
+            step = torch.linalg.solve(matrix + damping * matrix.diagonal().diag(), slope)
+            new = cost(own + step)
+            if new < now or damping > _DAMPING[1]:
+                break
+            damping *= 10
+        if not new < now:
+            break
+        own, now, damping = own + step, new, damping / 10
+        if float(slope @ step) < _ENOUGH:
+            break
+    return own
+
+
+def fit_together(model: StarModel, frames: Tensor, weights: Tensor, fit: StarFit) -> tuple[StarFit, Information]:
+    """The best fit of everything to `frames` (T, pixels) whose pixels count with `weights` (T, pixels)."""
+    cost = _cost(model, frames, weights, fit)
+    for _ in range(_STEPS):
+        step, steps, promised, information = _step(model, frames, weights, fit)
+        for halving in range(_HALVINGS):
+            scale = 0.5**halving
+            moved = evaluate(model, fit.own + scale * steps, fit.shared.moved(scale * step))
+            new = _cost(model, frames, weights, moved)
+            if new < cost:
+                fit, cost = moved, new
+                break
+        else:
+            break
+        if promised < _ENOUGH:
+            break
+    return fit, information
+
+
+def evaluate(model: StarModel, own: Tensor, shared: Shared) -> StarFit:
+    """The images of these parameters with them."""
+    kernels = model.kernels(shared.matrix)
+    return StarFit(own, shared, torch.stack([model.image(row, shared, kernels) for row in own]))
+
+
+def _cost(model: StarModel, frames: Tensor, weights: Tensor, fit: StarFit) -> float:
+    held = (_hold(model) * fit.own**2).sum() + fit.shared.log_transmission.mean() ** 2 / _EVEN**2
+    return float((weights * (frames - fit.images) ** 2).sum() + held)
+
+
+def _step(model: StarModel, frames: Tensor, weights: Tensor, fit: StarFit) -> tuple[Tensor, Tensor, float, Information]:
+    """Steps of the shared parameters (S,) and of the frames' own ones (T, K), what they promise, and what is known.
+
+    The own parameters of a frame are eliminated from its normal equations (the Schur complement).
+    """
+    hold, kernels = _hold(model), model.kernels(fit.shared.matrix)
+    matrices, scores, back, ahead, known, promised = [], [], [], [], [], 0.0
+    for frame, weight, own in zip(frames, weights, fit.own, strict=True):
+        image, by_own, by_shared = model.linearise(own, fit.shared, kernels)
+        difference = weight * (frame - image)
+        own_slope = by_own.T @ difference - hold * own
+        factor = torch.linalg.cholesky((by_own.T * weight) @ by_own + hold.diag())
+        mixed = (by_own.T * weight) @ by_shared
+        back.append(torch.cholesky_solve(mixed, factor))
+        ahead.append(torch.cholesky_solve(own_slope[:, None], factor)[:, 0])
+        matrices.append((by_shared.T * weight) @ by_shared - mixed.T @ back[-1])
+        scores.append(by_shared.T @ difference - mixed.T @ ahead[-1])
+        known.append(torch.cholesky_inverse(factor))
+        promised += float(own_slope @ ahead[-1])
+    n = model.n_holes
+    prior = frames.new_zeros(MAP + n, MAP + n)
+    prior[MAP:, MAP:] = (_EVEN * n) ** -2
+    information = Information(torch.stack(matrices), torch.stack(scores), torch.stack(known), prior)
+    slope = information.scores.sum(0)
+    slope[MAP:] -= fit.shared.log_transmission.mean() / (_EVEN**2 * n)
+    step = information.noise_covariance @ slope
+    promised += float(slope @ step)
+    return step, torch.stack(ahead) - torch.stack(back) @ step, promised, information
+
+
+def _hold(model: StarModel) -> Tensor:
+    """Inverse variances of what is expected of a frame's own parameters, (2 + N J,)."""
+    low, high = _LOOSE
+    modes = torch.full((model.n_modes,), high**-2, dtype=torch.float64)
+    modes[:3] = low**-2
+    return torch.cat([modes.new_zeros(PLACE), modes.repeat(model.n_holes)])

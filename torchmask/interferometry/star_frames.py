@@ -1,0 +1,65 @@
+"""The pixels around a star in its frames, and whether it is one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchmask.grid import Grid
+from torchmask.interferometry.orientation import mean_power
+
+_LEAST_CONTRAST = 0.05  # squared visibility of a star, through turbulence that is twice too strong for the holes
+
+
+@dataclass(frozen=True, eq=False)
+class StarFrames:
+    """Squares of pixels around a star.
+
+    pixels : (T, S, S) electrons; counted : (T, S, S) bool, False where a pixel is not valid or lies beyond the frame
+    middles : (T, 2) place (x, y) of the squares' middles from pixel [H // 2, W // 2]
+    """
+
+    pixels: Tensor
+    counted: Tensor
+    middles: Tensor
+
+    @classmethod
+    def around(cls, frames: Tensor, valid: Tensor, reach: int) -> StarFrames:
+        """Squares of 2 reach + 1 pixels around the brightest place of frames (T, H, W)."""
+        blur = 2 * (reach // 4) + 1
+        smooth = torch.nn.functional.avg_pool2d(frames[:, None], blur, 1, blur // 2, count_include_pad=False)
+        height, width = frames.shape[-2:]
+        brightest = smooth.flatten(1).argmax(1)
+        rows, columns = brightest // width, brightest % width
+        frames, valid = (torch.nn.functional.pad(values, 4 * [reach]) for values in (frames, valid))
+        side = 2 * reach + 1
+        parts = [
+            (t, slice(row, row + side), slice(column, column + side))
+            for t, (row, column) in enumerate(zip(rows.tolist(), columns.tolist(), strict=True))
+        ]
+        middles = torch.stack([columns - width // 2, rows - height // 2], 1).double()
+        pixels, counted = (torch.stack([values[part] for part in parts]) for values in (frames, valid))
+        return cls(pixels, counted, middles)
+
+    @property
+    def light(self) -> Tensor:
+        """(T, S, S) electrons above the median of each square, 0 where pixels do not count."""
+        level = torch.stack([square[good].median() for square, good in zip(self.pixels, self.counted, strict=True)])
+        return torch.where(self.counted, self.pixels - level[:, None, None], 0.0)
+
+    def require_fringes(self, centers: Tensor, grid: Grid) -> None:
+        """Raise ValueError unless fringes at the baselines of `centers` (N, 2) [m] have the contrast of a star's.
+
+        It is freed of photon noise, and that of most baselines counts.
+        """
+        light = self.light
+        total = light.sum((1, 2))
+        power = mean_power(light, centers, grid).median() - self.pixels.clamp(min=0).sum((1, 2)).mean()
+        contrast = float(len(centers) ** 2 * power / (total**2).mean().clamp(min=torch.finfo(total.dtype).tiny))
+        if contrast < _LEAST_CONTRAST:
+            raise ValueError(
+                f"the squared visibility of the fringes is {contrast:.2g}, where a star has {_LEAST_CONTRAST} or more: "
+                "give frames of a point source through this mask, bright enough for its fringes to be seen"
+            )

@@ -1,0 +1,147 @@
+"""Images of a star through a mask that lies somewhat otherwise than told, with all derivatives in closed form.
+
+The focal amplitude is the sum of the holes' diffraction integrals, by a quadrature that is exact over each hole. The
+affine map of the pupil stands in its exponent, so holes turn and stretch with it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchmask.grid import Grid
+from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.pixel import PixelResponse
+from torchmask.optics.zernike import aperture_modes, noll
+
+PLACE = 2  # parameters of a frame before its aberrations: logarithm of the light, and background
+MAP = 4  # elements of the affine map, the first of the shared parameters
+_SPARE_DEGREE = 10  # of the quadrature, beyond the phase that turns most: the error falls faster than exponentially
+
+
+@dataclass(frozen=True, eq=False)
+class Shared:
+    """What all frames of a star have in common.
+
+    matrix : (2, 2) from the mask as told to where it lies
+    log_transmission : (N,) logarithm of the light through each hole against the mean
+    """
+
+    matrix: Tensor
+    log_transmission: Tensor
+
+    def moved(self, step: Tensor) -> Shared:
+        """After a step (4 + N,)."""
+        return Shared(self.matrix + step[:MAP].view(2, 2), self.log_transmission + step[MAP:])
+
+
+class StarModel:
+    """Images of a star near the middle of a square of pixels, from its own parameters and shared ones.
+
+    Parameters
+    ----------
+    aperture : SparseAperture
+        As told.
+    grid : Grid
+        Of the frames; coefficients are rad at its wavelength.
+    reach : int
+        The square has 2 reach + 1 pixels to a side.
+    n_modes : int
+        J, Zernike modes of every hole, at least 3.
+    pixel : PixelResponse, optional
+
+    Notes
+    -----
+    The parameters of a frame (2 + N J,) are the logarithm of its light at zero frequency [electrons per pixel], the
+    background [electrons per pixel], and Zernike coefficients [rad rms] hole by hole. The affine map deforms the whole
+    pupil, with the holes and the modes on them.
+    """
+
+    def __init__(
+        self, aperture: SparseAperture, grid: Grid, reach: int, n_modes: int, pixel: PixelResponse | None = None
+    ) -> None:
+        self.side: int = 2 * reach + 1
+        self.n_modes: int = n_modes
+        self.centers: Tensor = aperture.centers.detach().double().cpu()
+        y, x = torch.meshgrid(*2 * [torch.arange(-reach, reach + 1, dtype=torch.float64)], indexing="ij")
+        self.pixels: Tensor = torch.stack([x.flatten(), y.flatten()], -1)
+        self._wave: float = 2 * math.pi / grid.period  # phase per pixel and metre
+        turns = self._wave * math.sqrt(2) * reach * aperture.outer_diameter / 2
+        degree = math.ceil(turns) + _SPARE_DEGREE + 2 * noll(n_modes)[0]
+        self._points, self._weights = aperture.shape.quadrature(degree, aperture.subaperture_diameter)
+        self._modes: Tensor = aperture_modes(aperture, self._points, n_modes)
+        self._transfer: Tensor | None = None
+        if pixel is not None:
+            nu_y, nu_x = torch.fft.fftfreq(self.side).double(), torch.fft.rfftfreq(self.side).double()
+            self._transfer = pixel.transfer(nu_y[:, None], nu_x[None])
+
+    @property
+    def n_holes(self) -> int:
+        """N."""
+        return len(self.centers)
+
+    def kernels(self, matrix: Tensor) -> tuple[Tensor, Tensor]:
+        """exp(-i k x . A r) for the points of a hole (pixels, Q), and for the centres (pixels, N)."""
+        directions = self._wave * self.pixels @ matrix
+        return _phasor(-directions @ self._points.T), _phasor(-directions @ self.centers.T)
+
+    def image(self, own: Tensor, shared: Shared, kernels: tuple[Tensor, Tensor]) -> Tensor:
+        """One frame (pixels,) [electrons]."""
+        amplitude = (self._holes(own, shared) @ kernels[0].T).T * kernels[1]
+        return self._seen(own[0].exp() * amplitude.sum(1).abs() ** 2) + own[1]
+
+    def linearise(self, own: Tensor, shared: Shared, kernels: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        """The image (pixels,), and its derivatives by own (pixels, 2 + N J) and shared parameters (pixels, 4 + N)."""
+        hole, carrier = kernels
+        pupil = self._holes(own, shared)  # (N, Q)
+        columns = torch.cat([self._modes, self._points], 1).to(pupil)  # (Q, J + 2)
+        parts = hole @ (pupil[..., None] * columns).permute(1, 0, 2).flatten(1)  # (pixels, N (J + 2))
+        parts = parts.unflatten(1, (self.n_holes, -1)) * carrier[..., None]
+        single, weighted = parts[..., 0], parts[..., self.n_modes :]  # Noll 1 is 1; the point's place, x and y
+        total = single.sum(1)
+        light = own[0].exp()
+        factor = 2 * light * total.conj()[:, None]
+        by_modes = -(factor[..., None] * parts[..., : self.n_modes]).imag.flatten(1)
+        by_transmission = (factor * single).real / 2
+        radius = (weighted + single[..., None] * self.centers).sum(1)  # sum of amplitudes by their r, (pixels, 2)
+        slope = (factor * radius).imag * self._wave  # by a turn of the phase k x . A r, along r
+        by_map = (self.pixels[:, :, None] * slope[:, None, :]).flatten(1)
+        intensity = light * total.abs() ** 2
+        image = self._seen(intensity)
+        ones = torch.ones_like(image)
+        by_own = torch.cat([image[:, None], ones[:, None], self._seen(by_modes)], 1)
+        by_shared = self._seen(torch.cat([by_map, by_transmission], 1))
+        return image + own[1], by_own, by_shared
+
+    def offset_slopes(self, shared: Shared) -> Tensor:
+        """(2 + N J, 2) pixels (x, y) by which a unit of each own parameter moves the image: the mean tilt of the holes.
+
+        A phase k s . A r moves the image by s, and least squares over a hole take its slope along r out of a mode.
+        """
+        centred = self._points - self._weights @ self._points
+        inertia = (centred.T * self._weights) @ centred
+        slopes = torch.linalg.solve(inertia, (centred.T * self._weights) @ self._modes)  # (2, J) [rad / m]
+        moves = torch.linalg.solve(shared.matrix.T, slopes) / (self._wave * self.n_holes)
+        return torch.cat([moves.new_zeros(PLACE, 2), moves.T.repeat(self.n_holes, 1)])
+
+    def _holes(self, own: Tensor, shared: Shared) -> Tensor:
+        """Field (N, Q) on the points of every hole, of unit sum without aberrations."""
+        phase = own[PLACE:].view(self.n_holes, self.n_modes) @ self._modes.T
+        return (0.5 * shared.log_transmission).exp()[:, None] * self._weights * _phasor(phase)
+
+    def _seen(self, images: Tensor) -> Tensor:
+        """Images (pixels, ...) as the detector's pixels see them."""
+        if self._transfer is None:
+            return images
+        flat = images.view(self.side, self.side, -1)
+        transfer = self._transfer[..., None]
+        return torch.fft.irfft2(torch.fft.rfft2(flat, dim=(0, 1)) * transfer, s=2 * [self.side], dim=(0, 1)).view_as(
+            images
+        )
+
+
+def _phasor(phase: Tensor) -> Tensor:
+    return torch.polar(torch.ones_like(phase), phase)
