@@ -34,6 +34,15 @@ def test_power_law_at_zero_frequency_is_the_squared_flux_on_every_grid() -> None
         assert float(PowerLawPSD(1.5, 1e7)(grid(n_pixels))[0, 0]) == 1e14
 
 
+def test_read_out_noise_counts_the_pixels_of_the_detector_not_those_of_the_frequency_grid() -> None:
+    for n_frequencies in (32, 64):
+        assert float(NoisePSD(1e5, 5.0, n_pixels=48**2)(grid(n_frequencies))[1, 2]) == 1e5 + 48**2 * 25
+        assert float(NoisePSD(1e5, 5.0)(grid(n_frequencies))[1, 2]) == 1e5 + n_frequencies**2 * 25
+    for wrong in (0, -4, 2.5):
+        with pytest.raises(ValueError, match=f"n_pixels is {wrong}"):
+            NoisePSD(1e5, 5.0, n_pixels=wrong)  # type: ignore[arg-type]
+
+
 def test_exponent_zero_is_white() -> None:
     assert torch.equal(PowerLawPSD(0.0, 10.0)(grid()), torch.full((64, 64), 100.0, dtype=torch.float64))
 

@@ -67,7 +67,7 @@ class PowerLawPSD:
 
 @dataclass(frozen=True)
 class NoisePSD:
-    """PSD of photon and read-out noise, white: S_n = n_photons + (number of pixels) readout_noise^2.
+    """PSD of photon and read-out noise, white: S_n = n_photons + (number of the detector's pixels) readout_noise^2.
 
     Parameters
     ----------
@@ -75,6 +75,9 @@ class NoisePSD:
         Photons of one exposure, summed over its pixels.
     readout_noise : float
         [electrons rms per pixel].
+    n_pixels : int, optional
+        That are read out, all together. None: those of the grid, which is right where the grid is the image; a grid of
+        frequencies for an integral may be finer.
 
     Raises
     ------
@@ -91,16 +94,20 @@ class NoisePSD:
 
     n_photons: float
     readout_noise: float = 0.0
+    n_pixels: int | None = None
 
     def __post_init__(self) -> None:
         _require_positive("n_photons", self.n_photons, "in photons per exposure")
         _require_positive("readout_noise", self.readout_noise, "in electrons rms per pixel", zero=True)
+        if self.n_pixels is not None and (self.n_pixels != int(self.n_pixels) or self.n_pixels < 1):
+            raise ValueError(f"n_pixels is {self.n_pixels}: it must be a whole number of at least 1")
 
     def __call__(
         self, grid: Grid, dtype: torch.dtype | None = torch.float64, device: torch.device | str | None = None
     ) -> Tensor:
         """The PSD on the frequencies of `grid`, (H, W) [photons]."""
-        level = self.n_photons + math.prod(grid.shape) * self.readout_noise**2
+        n_pixels = math.prod(grid.shape) if self.n_pixels is None else self.n_pixels
+        level = self.n_photons + n_pixels * self.readout_noise**2
         return torch.full(grid.shape, level, dtype=dtype, device=device)
 
 

@@ -71,6 +71,7 @@ def test_restored_image_lies_where_the_frames_did_on_the_sky(tmp_path, write_fit
     assert cards["CHISQMAX"] == pytest.approx(1.3)
     assert cards["NFRAMES"] == 3
     assert "R0" not in cards
+    assert "SKY" not in cards  # as of version 0.1, which knew none
     assert "crop 8 pixels" in str(cards["HISTORY"])
     # it is itself an image that can be read
     again = read_observation(tmp_path / "r.fits", mask)

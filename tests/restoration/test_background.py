@@ -99,7 +99,12 @@ def test_a_background_that_is_known_is_taken_off_and_its_noise_is_left(five_hole
 
 @pytest.mark.parametrize(
     ("background", "message"),
-    [(math.nan, "not finite"), (torch.zeros(5), "broadcasts"), (torch.zeros(2, 1, 1), "one number")],
+    [
+        (math.nan, "not finite"),
+        (-3.0, "negative .-3 electrons"),
+        (torch.zeros(5), "broadcasts"),
+        (torch.zeros(2, 1, 1), "one number"),
+    ],
 )
 def test_a_background_that_cannot_be_one_is_refused(background, message):
     with pytest.raises(ValueError, match=message):
@@ -113,16 +118,39 @@ def test_frames_that_are_darker_than_their_background_are_refused(observation, f
         )
 
 
+def test_a_sky_is_free_where_the_darkest_part_of_the_field_shows_it(three_holes):
+    """Holes scatter light too: a level below a tenth of the mean may be theirs."""
+    shining = torch.full((4, 40, 40), 1.0, dtype=torch.float64)
+    shining[:, 10:30, 10:30] = 9.0  # 3 on average, 1 where it is darkest
+    for level, seen in ((0.0, True), (-0.8, False), (-1.1, False)):
+        frames = shining + level
+        is_seen = 1 + level > 0.1 * (3 + level)
+        assert is_seen is seen
+        assert Background.IF_SEEN.of(frames) is (FREE if seen else Background.NONE)
+    noisy = shining + 2 * torch.randn(shining.shape, generator=torch.Generator().manual_seed(0)).double()
+    stack = FrameStack.of(noisy, None, Grid(40, 2.3e-7, 550e-9), three_holes, 1.0, Background.IF_SEEN)
+    assert stack.free is FREE
+    for told in (Background.NONE, FREE):
+        assert told.of(shining) is told
+
+
+def test_a_model_beside_a_background_shares_all_else(random_exposures, three_holes):
+    model = ExposureModel(three_holes, GRID, 4)
+    beside = model.beside(FREE)
+    assert (model.background, beside.background) == (Background.NONE, FREE)
+    assert beside.pupil is model.pupil
+
+
 @pytest.mark.filterwarnings("ignore:the frames are bright at the border")  # where the sky is ignored
 def test_a_restoration_finds_the_sky_and_loses_nothing_else(observe, restoring, restored):
     """A sky as bright as the mean pixel: its noise is more, the object is the same."""
     observation = observe()
     sky = float(observation.frames.mean())
     noise = torch.poisson(torch.full_like(observation.frames, sky), generator=torch.Generator().manual_seed(5))
-    result = restoring(background=FREE).restore(observation.frames + noise)
+    result = restoring().restore(observation.frames + noise)
     assert result.background is not None
     assert float((result.background - sky).abs().max()) < 0.05 * sky  # of which the halo of the object is a part
     torch.testing.assert_close(result.transmission, restored.transmission, atol=0.02, rtol=0)
     change = (result.object - restored.object).norm() / restored.object.norm()
-    ignored = restoring().restore(observation.frames + noise)
+    ignored = restoring(background=Background.NONE).restore(observation.frames + noise)
     assert float(change) < 0.5 * float((ignored.object - restored.object).norm() / restored.object.norm())

@@ -74,3 +74,15 @@ def test_border_brightness():
 def test_a_bright_border_is_noticed():
     with pytest.warns(UserWarning, match="does the object reach beyond the field"):
         FrameStack.of(exposures() + 100.0, None, GRID, PUPIL, None)
+
+
+def test_errors_weigh_every_pixel_by_itself():
+    frames, valid = exposures(), torch.ones(GRID.shape, dtype=torch.bool)
+    valid[3, 4] = False
+    errors = (frames.clamp(min=0) + READOUT**2).sqrt()
+    stack = FrameStack.of(frames, valid, GRID, PUPIL, None, errors=errors)
+    assert bool((stack.precision[:, 3, 4] == 0).all())
+    torch.testing.assert_close(stack.precision[:, valid], (stack.unit / errors[:, valid]) ** 2)
+    assert stack.photon_share == 0  # the weights know which pixels are bright
+    single = stack.to(torch.float32, torch.device("cpu"))
+    assert single.precision.dtype == torch.float32

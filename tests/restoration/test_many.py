@@ -44,13 +44,14 @@ def test_each_is_what_it_would_be_by_itself_and_failures_stay_where_they_are(n_w
     assert math.isnan(scalars[1]["chi_square"])
 
 
-def test_observations_keep_their_invalid_pixels_out_and_each_stack_may_have_its_method():
+def test_observations_bring_their_valid_pixels_and_errors_and_each_stack_may_have_its_method():
     valid = torch.ones(32, 32, dtype=torch.bool)
     valid[14, 14] = False
     frames = torch.where(valid, stack(0), math.nan)
-    seen = Observation(frames, MASK, GRID, readout_noise=None, valid=valid)
+    errors = 20 + 10 * torch.rand(3, 32, 32, generator=torch.Generator().manual_seed(0))  # edges count as noise
+    seen = Observation(frames, MASK, GRID, readout_noise=None, valid=valid, errors=errors)
     found = restore_many([method(), method(r0=0.2)], [seen, stack(1)], n_workers=1, n_samples=2, seed=3)
-    assert torch.equal(found[0].object, method().restore(frames, valid=valid, seed=3).object)
+    assert torch.equal(found[0].object, method().restore(frames, valid=valid, errors=errors, seed=3).object)
     assert found[0].object_std is not None
     assert torch.equal(found[1].object, method(r0=0.2).restore(stack(1), seed=3).object)
 

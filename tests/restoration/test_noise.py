@@ -8,7 +8,7 @@ import torch
 from torchmask.grid import Grid
 from torchmask.observation import check_frames
 from torchmask.optics.aperture import FullAperture
-from torchmask.restoration.noise import expected_variance, noise_variance
+from torchmask.restoration.noise import check_errors, expected_variance, noise_variance
 
 GRID = Grid.nyquist(1.0, 550e-9, 32)
 PUPIL = FullAperture(1.0)
@@ -77,3 +77,30 @@ def test_wrong_noise_level_is_noticed():
         expected_variance(frames, GRID, PUPIL, 100.0)
     with pytest.warns(UserWarning, match="check the gain"):
         expected_variance(frames * 10, GRID, PUPIL, 0.0)  # not in electrons
+
+
+def test_errors_that_were_measured_tell_the_variance_of_valid_pixels():
+    frames = torch.poisson(torch.full((8, *GRID.shape), 49.0, dtype=torch.float64))
+    errors, valid = torch.full_like(frames, 7.0), torch.ones_like(frames, dtype=torch.bool)
+    errors[:, 0, :4], errors[:, 1, :4] = 8.0, 1e6
+    valid[:, 1, :4] = False
+    size = math.prod(GRID.shape)
+    mean = (49 * (size - 8) + 64 * 4) / (size - 4)
+    assert expected_variance(frames, GRID, PUPIL, None, valid, errors) == pytest.approx(mean, rel=1e-12)
+    with pytest.warns(UserWarning, match="errors make 14"):
+        expected_variance(frames, GRID, PUPIL, None, None, torch.full_like(frames, 14.0))
+
+
+def test_errors_are_those_of_every_frame_or_of_each():
+    frames, valid = torch.ones(3, *GRID.shape).double(), torch.ones(3, *GRID.shape).bool()
+    each = torch.rand(*GRID.shape) + 1
+    assert torch.equal(check_errors(each, frames, valid), each.double().expand_as(frames))
+    assert torch.equal(check_errors(each.numpy(), frames, valid), each.double().expand_as(frames))
+    errors, holes = torch.ones_like(frames), valid.clone()
+    errors[1, 2, 3], errors[2, 0, 0] = 0.0, math.nan
+    with pytest.raises(ValueError, match=r"not positive at 2 valid pixels, the first is 0 at .* \(1, 2, 3\)"):
+        check_errors(errors, frames, valid)
+    holes[1, 2, 3] = holes[2, 0, 0] = False
+    assert float(check_errors(errors, frames, holes)[holes].min()) == 1
+    with pytest.raises(ValueError, match="errors has shape"):
+        check_errors(errors[:2], frames, valid)

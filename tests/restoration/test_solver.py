@@ -19,6 +19,7 @@ from torchmask.restoration.checkpoint import Ending, Progress, Status
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.myopic import MyopicDeconvolution
+from torchmask.restoration.objective import Free
 from torchmask.restoration.projected_lbfgs import Minimum, ProjectedLBFGS
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.solver import Solver, Traits
@@ -312,6 +313,42 @@ def test_frames_of_a_full_pupil_have_had_their_starts(monkeypatch, explained):
     assert spy.seeds == []
     spy.run(monkeypatch, *explained, many_minima=True, estimated=True)  # unless a sensor said where to begin
     assert spy.seeds != []
+
+
+# --- what it does in the end
+
+
+@pytest.mark.parametrize(
+    ("faint", "traits", "integrated"),
+    [
+        (math.inf, {}, True),
+        (0.0, {}, False),
+        (math.inf, {"max_iterations": 3}, False),  # no time is left
+        (math.inf, {"many_minima": True}, False),
+        (math.inf, {"prior_on_aberrations": False}, False),
+    ],
+)
+def test_aberrations_of_faint_frames_are_integrated_out(faint, traits, integrated, explained):
+    """After the descents, whose costs stay as they are."""
+    schedule = Schedule(faint=faint, rounds=2, moves=2, start_iterations=5, candidates=(), **NONE_MISSED, **BRISK)
+    records: list[Record] = []
+    progress = solver_of(explained[0], records.append, schedule=schedule, **traits).solve(Known())
+    assert progress.integrated is integrated
+    assert [record.step for record in records if record.stage == "integration"] == ([1, 2] if integrated else [])
+    assert len(progress.costs) == min(5, traits.get("max_iterations", 5))
+
+
+def test_frames_are_faint_by_how_they_change(explained):
+    objective, _ = explained
+    change = FrameStack(objective.frames, torch.ones_like(objective.frames, dtype=torch.bool), 1.0, 0.03**2).change
+    for faint, is_faint in ((0.99 * change, False), (1.01 * change, True)):
+        assert solver_of(objective, schedule=Schedule(faint=faint)).is_faint is is_faint
+
+
+def test_nothing_is_integrated_over_what_is_known(explained):
+    objective, _ = explained
+    for free in (Free.OBJECT, Free.ABERRATIONS | Free.COMMON):
+        assert not solver_of(objective.with_changes(free=free), schedule=Schedule(faint=math.inf)).is_faint
 
 
 # --- whole restorations

@@ -78,6 +78,7 @@ def save_restored(
         "CHISQ": (float(result.chi_square.mean()), "mean square residual over noise"),
         "CHISQMAX": (float(result.chi_square.max()), "the same of the worst frame"),
         "NOISE": (result.noise, "[electron] rms per pixel and frame"),
+        "SKY": (result.sky, "[electron] mean light of the sky in a pixel"),
         "PRIOR": (result.prior, "on the object"),
         "R0": (result.r0, "[m] Fried parameter of the prior"),
         "CONVERGD": (result.converged, "whether the restoration came to rest"),

@@ -71,4 +71,4 @@ def _message(progress: Progress) -> str:
         message = f"stopped after the {progress.iterations} iterations that a start may take"
     if progress.starts > 1:
         message += f"; the best of {progress.starts} starts" + (", two of which ended alike" if progress.alike else "")
-    return message
+    return message + ("; then the aberrations were integrated out" if progress.integrated else "")

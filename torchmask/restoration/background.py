@@ -10,6 +10,7 @@ from torch import Tensor
 
 _PRICE = 0.1  # against the weight 1 of total variation: see docs/restoration.md
 _BLOCKS = 8  # along each side of the field, in which its darkest part is looked for
+_SEEN = 0.1  # of the mean light, in the darkest part: holes scatter up to 0.06 there, see docs/restoration.md
 
 
 class Background(Enum):
@@ -22,6 +23,9 @@ class Background(Enum):
     moves such a level to the background as far as the object stays positive: one that is nowhere dark loses the light
     of its darkest part.
 
+    Where the darkest part of the field holds no more than what optics scatter there, nothing is lost without a sky, and
+    the descent is shorter. `IF_SEEN` decides by that.
+
     Examples
     --------
     >>> difference = torch.tensor([[[3.0, 5.0]], [[-1.0, -2.0]]])
@@ -31,6 +35,14 @@ class Background(Enum):
 
     NONE = "none"
     PER_FRAME = "one constant for each frame, not negative"
+    IF_SEEN = "one constant for each frame, if the darkest part of the field shows a sky"
+
+    def of(self, frames: Tensor) -> Background:
+        """What is free once the frames (T, H, W) are there, whose own light alone decides: `NONE` or `PER_FRAME`."""
+        if self is not Background.IF_SEEN:
+            return self
+        is_seen = float(darkest_level(frames).mean()) > _SEEN * float(frames.mean())
+        return Background.PER_FRAME if is_seen else Background.NONE
 
     @property
     def price(self) -> float:
@@ -79,11 +91,16 @@ def darkest_level(frames: Tensor) -> Tensor:
 def check_known_level(level: float | Tensor, frames: Tensor) -> Tensor:
     """A background that is given [electrons] as (T, H, W), for frames of that shape.
 
-    Raises ValueError if it is not finite or does not broadcast to the frames.
+    Raises ValueError if it is not finite, negative, or does not broadcast to the frames.
     """
     given = torch.as_tensor(level, dtype=frames.dtype, device=frames.device)
     if not bool(torch.isfinite(given).all()):
         raise ValueError("background holds values that are not finite: electrons per pixel are needed")
+    if bool((given < 0).any()):
+        raise ValueError(
+            f"background is negative ({float(given.min()):.3g} electrons per pixel), and light is not: if too much was "
+            "subtracted from the frames, add it to them"
+        )
     try:
         return given.expand_as(frames)
     except RuntimeError:

@@ -50,6 +50,7 @@ class Progress:
     starts : how many there were, with the present one; began : iterations before it
     rival : where the best of the earlier starts ended
     alike : whether the last two starts ended alike
+    integrated : whether the aberrations have been integrated out, which is done at the end and not kept on disk
     """
 
     candidates: Candidates
@@ -62,6 +63,7 @@ class Progress:
     began: int = 0
     rival: Ending | None = None
     alike: bool = False
+    integrated: bool = False
 
     @property
     def state(self) -> State:

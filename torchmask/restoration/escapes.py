@@ -82,7 +82,7 @@ def centre_on_pixels(objective: MyopicObjective, state: State, schedule: Schedul
 
     def settle(offset: tuple[float, float]) -> tuple[float, Tensor]:
         image, slope = shift(state.image, offset), shift(gradient, offset)
-        return _settle(image, slope, power, objective.prior, schedule.pixel_iterations)
+        return settle_object(image, slope, power, objective.prior, schedule.pixel_iterations)
 
     stay = best = settle((0.0, 0.0))
     place = (0.0, 0.0)
@@ -97,7 +97,7 @@ def centre_on_pixels(objective: MyopicObjective, state: State, schedule: Schedul
     return replace(state, image=best[1], z=z) if stay[0] - best[0] + held > 0 else state
 
 
-def _settle(
+def settle_object(
     centre: Tensor, gradient: Tensor, power: Tensor, prior: ObjectPrior, max_iterations: int
 ) -> tuple[float, Tensor]:
     """Minimise <gradient, o - centre> + 1/2 |o - centre|^2_power + prior(o) over o >= 0: (value, o)."""

@@ -153,6 +153,12 @@ class ExposureModel(nn.Module):
         twin.pupil.aberrations = self.aberrations
         return twin
 
+    def beside(self, background: Background) -> ExposureModel:
+        """The same model, arrays and all, of frames that may hold such a background."""
+        twin = copy.copy(self)
+        twin.background = background
+        return twin
+
     def chunks(self, n_frames: int) -> Iterator[slice]:
         """Slices of the frames whose work arrays stay small."""
         pixels = len(self.band.wavelengths) * math.prod(self.window.field.shape)

@@ -13,7 +13,9 @@ from torchmask.grid import Grid
 from torchmask.observation import check_frames
 from torchmask.optics.aperture import Aperture
 from torchmask.restoration.background import Background, check_known_level
-from torchmask.restoration.noise import expected_variance
+from torchmask.restoration.noise import check_errors, expected_variance
+
+Array = Tensor | np.ndarray
 
 _BRIGHT_BORDER = 0.5  # of the mean pixel
 _EVEN_LIGHT = 0.6  # of all light: in the darkest part it may be a wide object as well as a sky
@@ -28,7 +30,8 @@ class FrameStack:
     unit : electrons of a mean pixel, without the background
     variance : mean noise variance of a pixel [electrons^2], with that of the background
     known : the background that is given [electrons], broadcasts to the frames
-    free : the one that is not
+    free : the one that is not, `NONE` or `PER_FRAME`
+    errors : (T, H, W) standard deviations of the pixels [electrons] where they were measured; None: all are alike
     """
 
     frames: Tensor
@@ -37,25 +40,28 @@ class FrameStack:
     variance: float
     known: Tensor = field(default_factory=lambda: torch.zeros(1, 1, 1, device="cpu"))
     free: Background = Background.NONE
+    errors: Tensor | None = None
 
     @classmethod
     def of(
         cls,
-        frames: Tensor | np.ndarray,
-        valid: Tensor | np.ndarray | None,
+        frames: Array,
+        valid: Array | None,
         grid: Grid,
         aperture: Aperture,
         readout_noise: float | None,
         background: Background | float | Tensor = Background.NONE,
+        errors: Array | None = None,
     ) -> FrameStack:
         """Check `frames` (T, H, W) [electrons] and measure their noise.
 
         `grid` is that of the shortest wavelength; `readout_noise` [electrons rms] may be None. Raises ValueError as
-        `check_frames` and `expected_variance` do; warns if the object seems to reach beyond the field.
+        `check_frames`, `check_errors` and `expected_variance` do; warns if the object seems to reach beyond the field.
         """
         frames, valid = check_frames(frames, valid, grid)
-        variance = expected_variance(frames, grid, aperture, readout_noise, valid)
-        free = background if isinstance(background, Background) else Background.NONE
+        errors = None if errors is None else check_errors(errors, frames, valid)
+        variance = expected_variance(frames, grid, aperture, readout_noise, valid, errors)
+        free = background.of(frames) if isinstance(background, Background) else Background.NONE
         known = check_known_level(0.0 if isinstance(background, Background) else background, frames)
         frames = frames - known
         guess = free.first_guess(frames)
@@ -66,10 +72,10 @@ class FrameStack:
         if border_brightness(light) > _BRIGHT_BORDER or float(guess.mean()) > _EVEN_LIGHT * float(frames.mean()):
             warnings.warn(
                 "the frames are bright at the border: does the object reach beyond the field? If that is a sky, give "
-                "what is known of it as background, or Background.PER_FRAME",
+                "what is known of it as background [electrons per pixel]",
                 stacklevel=3,
             )
-        return cls(frames / unit, valid, unit, variance, known, free)
+        return cls(frames / unit, valid, unit, variance, known, free, errors)
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -81,11 +87,14 @@ class FrameStack:
             frames=self.frames.to(device, dtype),
             valid=self.valid.to(device),
             known=self.known.to(device, dtype),
+            errors=None if self.errors is None else self.errors.to(device, dtype),
         )
 
     @property
     def precision(self) -> Tensor:
-        """Inverse noise variance of the pixels in units of the stack, (T, H, W), or (1, 1, 1) where all are valid."""
+        """Inverse noise variance of the pixels in units of the stack, (T, H, W), or (1, 1, 1) where all are alike."""
+        if self.errors is not None:
+            return torch.where(self.valid, self.unit / self.errors, 0).square()
         weight = self.valid.new_ones(1, 1, 1) if bool(self.valid.all()) else self.valid
         return weight.to(self.frames) * (self.unit**2 / self.variance)
 
@@ -98,7 +107,9 @@ class FrameStack:
 
     @property
     def photon_share(self) -> float:
-        """The part of the noise variance that is photon noise, at most 1."""
+        """The part of the noise variance that is photon noise, at most 1; 0 where `precision` holds it already."""
+        if self.errors is not None:
+            return 0.0
         return min(1.0, self.unit / self.variance)
 
 

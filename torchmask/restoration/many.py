@@ -30,7 +30,7 @@ def restore_many(
     ----------
     method : MyopicDeconvolution, or one for each stack
     stacks : sequence
-        Frames (T, H, W) [electrons], or observations, whose invalid pixels are left out.
+        Frames (T, H, W) [electrons], or observations, whose valid pixels and errors count.
     n_samples, seed : int
         As for `MyopicDeconvolution.restore`.
     backend : {"loky", "ray"}
@@ -106,7 +106,7 @@ def restore_in_turn(
 def _restore(task: tuple[MyopicDeconvolution, Tensor | Observation], n_samples: int, seed: int) -> RestorationResult:
     method, stack = task
     if isinstance(stack, Observation):
-        return method.restore(stack.frames, valid=stack.valid, n_samples=n_samples, seed=seed)
+        return method.restore(stack.frames, valid=stack.valid, errors=stack.errors, n_samples=n_samples, seed=seed)
     return method.restore(stack, n_samples=n_samples, seed=seed)
 
 

@@ -8,11 +8,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from torchmask.grid import Grid
+from torchmask.interferometry.orientation import warn_of_orientation
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.band import Band
 from torchmask.optics.pixel import PixelResponse
@@ -21,7 +21,8 @@ from torchmask.restoration.assembly import add_deviations, assemble_result
 from torchmask.restoration.background import Background
 from torchmask.restoration.checkpoint import Checkpoint, fingerprint_of
 from torchmask.restoration.forward import ExposureModel
-from torchmask.restoration.frames import FrameStack
+from torchmask.restoration.frames import Array, FrameStack
+from torchmask.restoration.memory import keep_freed_memory
 from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.parallel import each_on_a_core
 from torchmask.restoration.priors import ObjectPrior, TotalVariation, as_prior, check_prior
@@ -43,7 +44,8 @@ class MyopicDeconvolution:
 
     from the clipped mean frame on, with the background b_t that fits best. `torchmask.restoration.solver` tells the
     course of it: how the noise sigma and the transmissions g_t are brought up to date on the way, and how it leaves
-    local minima.
+    local minima. Through a mask and of faint frames, where this object is biased, it ends at the one that is likeliest
+    whatever the aberrations (`torchmask.restoration.marginal`).
 
     Parameters
     ----------
@@ -59,16 +61,16 @@ class MyopicDeconvolution:
     readout_noise : float, optional
         [electrons rms per pixel]. None: the noise is measured beyond the cut-off frequency.
     wavelengths, weights : sequence of float, optional
-        A broad band as a few wavelengths [m], and the share of the light of each (any positive numbers; None: equal).
-        Coefficients are rad at the wavelength of the grid, and path differences the same for all. None: only that.
+        A broad band as a few wavelengths [m] (None: that of the grid), and the light of each, any positive numbers
+        (None: equal). Coefficients are rad at the wavelength of the grid, and path differences the same for all.
     static_modes : int
-        Zernike modes per sub-aperture, Noll 1 to static_modes, of aberrations common to all frames, such as those of
-        the telescope, besides the `n_modes` of each frame. Their prior is turbulence as strong as a hole is wide,
-        whatever `r0`. Coefficients then have max(n_modes, static_modes) modes, and are the sum of both.
+        Zernike modes per sub-aperture, Noll 1 to static_modes, of aberrations common to all frames, such as the
+        telescope's, besides the `n_modes` of each. Their prior is turbulence with r0 as wide as a hole, whatever `r0`.
+        Coefficients then have max(n_modes, static_modes) modes, and are the sum of both.
     background : Background, float or tensor
-        Light on every pixel that is not the object's: none; with `Background.PER_FRAME` a constant of its own in each
-        frame, which is found with the object; or what is known of it [electrons per pixel], a number or a tensor that
-        broadcasts to the frames. Its noise counts in all cases.
+        Light on every pixel that is not the object's: with `Background.PER_FRAME` a constant of its own in each frame,
+        which is found with the object, by default if the frames show a sky, with `Background.NONE` never; or what is
+        known of it [electrons per pixel], a number or a tensor that broadcasts to the frames. Its noise always counts.
     pixel : PixelResponse, optional
         How the detector's pixels blur the image: `SquarePixel(fill_factor)`, or `MappedPixel` with a map of their
         sensitivity. The object is restored without it. None: pixels are points.
@@ -79,9 +81,9 @@ class MyopicDeconvolution:
     aberration_prior : bool
         False leaves out 1/2 ||z||^2; z are the Zernike coefficients then.
     max_iterations : int
-        Of all starts together. One start takes 1000 at most. A restoration that leaves 0.13 % of the change from frame
-        to frame unexplained, and more than the noise can leave, may have missed the object: it starts again from random
-        aberrations, up to three times as long as that is so and no two end alike, and the best is kept.
+        Of all starts together; one takes 1000 at most. A start that leaves more of the frames unexplained than noise
+        can, and 0.13 % of their change from frame to frame, may have missed the object: up to three more begin at
+        random aberrations, until one misses nothing or two end alike, and the best is kept.
     tolerance : float
         Converged when 100 iterations lower the cost by less than this fraction.
     minimizer : Minimizer
@@ -123,7 +125,7 @@ class MyopicDeconvolution:
         wavelengths: Sequence[float] | None = None,
         weights: Sequence[float] | None = None,
         static_modes: int = 0,
-        background: Background | float | Tensor = Background.NONE,
+        background: Background | float | Tensor = Background.IF_SEEN,
         pixel: PixelResponse | None = None,
         prior: Callable[[Tensor], Tensor] | None = None,
         aberration_prior: bool = True,
@@ -154,7 +156,6 @@ class MyopicDeconvolution:
             r0=aperture.subaperture_diameter / (7 if self.many_minima else 1) if r0 is None else r0,
             outer_scale=20 * aperture.mask_diameter if outer_scale is None else outer_scale,
             whitened=aberration_prior,
-            background=background if isinstance(background, Background) else Background.NONE,
             pixel=pixel,
             dtype=dtype,
             device=device,
@@ -180,21 +181,22 @@ class MyopicDeconvolution:
             self._model = self.recipe.turbulent_model()
         return self._model
 
-    def objective(self, frames: Tensor | np.ndarray, *, valid: Tensor | np.ndarray | None = None) -> MyopicObjective:
+    def objective(self, frames: Array, *, valid: Array | None = None, errors: Array | None = None) -> MyopicObjective:
         """The cost of object and aberrations behind `frames` (T, H, W) [electrons], to minimise in a way of your own.
 
         It is differentiable in the centres of the aperture too. Arguments and errors as for `restore`.
         """
-        stack = self._stack(frames, valid)
-        model = self.recipe.turbulent_model(follows_aperture=True)
+        stack = self._stack(frames, valid, errors)
+        model = self.recipe.turbulent_model(follows_aperture=True).beside(stack.free)
         stack = stack.to(model.dtype, model.device)
         return MyopicObjective(model, stack.frames, stack.precision, self.prior)
 
     def restore(
         self,
-        frames: Tensor | np.ndarray,
+        frames: Array,
         *,
-        valid: Tensor | np.ndarray | None = None,
+        valid: Array | None = None,
+        errors: Array | None = None,
         coefficients: Tensor | None = None,
         covariance: Tensor | None = None,
         known_object: Tensor | None = None,
@@ -212,6 +214,8 @@ class MyopicDeconvolution:
             Single pixels may be negative (read-out noise).
         valid : (H, W) or (T, H, W) boolean tensor or array, optional
             False where a pixel is dead or saturated; it is left out, whatever its value.
+        errors : (H, W) or (T, H, W) tensor or array, optional
+            Standard deviations of the pixels' noise [electrons] that were measured. None: the same for all pixels.
         coefficients : (T, N, J) tensor, optional
             Known aberrations [rad rms], which stay as they are: non-blind deconvolution.
         covariance : (N J, N J) tensor, optional
@@ -227,7 +231,7 @@ class MyopicDeconvolution:
             Drawn from the posterior for the standard deviations of object and coefficients, which cost about as much
             as 50 iterations each; 8 are enough. 0: no standard deviations.
         seed : int
-            Of the random starts and candidates.
+            Of the random starts and candidates, and of the samples of aberrations that are integrated out.
         checkpoint : path, optional
             An .npz file, written every 100 iterations. If it exists, the restoration goes on from it, and ends in the
             same result as if it had never been interrupted.
@@ -237,23 +241,25 @@ class MyopicDeconvolution:
         Raises
         ------
         ValueError
-            If a shape is wrong, a valid pixel or what is known is not finite, a frame or the known object holds no
-            light, both object and aberrations are known, `covariance` is not one or stands without coefficients or
-            beside static modes, the prior is no finite and differentiable scalar, or the checkpoint is damaged or
-            belongs to other frames, settings or known values.
+            If a shape is wrong, a valid pixel or what is known is not finite, one of `errors` not positive, a frame or
+            the known object holds no light, both object and aberrations are known, `covariance` is not one or stands
+            without coefficients or beside static modes, the prior is no finite and differentiable scalar, or the
+            checkpoint is damaged or belongs to other frames, settings or known values.
 
         Warns
         -----
         UserWarning
-            If the noise of the frames disagrees with `readout_noise`, or the object seems to reach the border.
+            If noise, border or fringes of the frames do not fit `readout_noise`, the field or the mask's orientation.
         """
         started = time.perf_counter()
-        stack = self._stack(frames, valid)
+        keep_freed_memory()
+        stack = self._stack(frames, valid, errors)
+        warn_of_orientation(stack.frames, self.recipe.aperture, self.recipe.grid)
         if n_samples < 0 or n_samples == 1:
             raise ValueError(f"n_samples is {n_samples}: 0 for no standard deviations, or at least 2")
         known = Known(coefficients, covariance, known_object)
         known.check()
-        model = self.model if covariance is None else self.recipe.estimated_model(covariance)
+        model = (self.model if covariance is None else self.recipe.estimated_model(covariance)).beside(stack.free)
         stack = stack.to(model.dtype, model.device)
         with each_on_a_core(model.device) as parallel:
             objective = MyopicObjective(
@@ -271,16 +277,14 @@ class MyopicDeconvolution:
                 result = add_deviations(result, solver.objective, stack, progress, cutoff, n_samples)
         return replace(result, seconds=time.perf_counter() - started)
 
-    def _stack(self, frames: Tensor | np.ndarray, valid: Tensor | np.ndarray | None) -> FrameStack:
+    def _stack(self, frames: Array, valid: Array | None, errors: Array | None) -> FrameStack:
         bluest = replace(self.recipe.grid, wavelength=self.recipe.band.shortest)
-        return FrameStack.of(frames, valid, bluest, self.recipe.aperture, self.readout_noise, self.background)
+        return FrameStack.of(frames, valid, bluest, self.recipe.aperture, self.readout_noise, self.background, errors)
 
     def _checkpoint(self, path: str | Path | None, solver: Solver, known: Known) -> Checkpoint | None:
-        if path is None:
-            return None
         settings = (self.recipe.whitened, self.known_r0, self.minimizer, self.schedule, solver.traits.seed)
         given = (known.coefficients, known.covariance, known.object)
-        return Checkpoint(Path(path), fingerprint_of(solver.objective, settings, given))
+        return Checkpoint(Path(path), fingerprint_of(solver.objective, settings, given)) if path is not None else None
 
     def _traits(self, known: Known, seed: int) -> Traits:
         estimated = known.covariance is not None

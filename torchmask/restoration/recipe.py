@@ -13,7 +13,6 @@ from torchmask.optics.aperture import Aperture
 from torchmask.optics.band import Band
 from torchmask.optics.pixel import PixelResponse
 from torchmask.restoration.aberrations import AberrationBasis, estimated_basis, turbulent_basis
-from torchmask.restoration.background import Background
 from torchmask.restoration.forward import ExposureModel
 
 
@@ -24,7 +23,6 @@ class ModelRecipe:
     frame_modes, static_modes : Zernike modes per sub-aperture of each frame, and of what all frames have in common
     r0, outer_scale : of the turbulence [m]
     whitened : whether the parameters are white under the prior; False: they are the coefficients themselves
-    background : what frames hold besides
     pixel : the detector's; None: it samples the image
 
     Raises
@@ -43,7 +41,6 @@ class ModelRecipe:
     whitened: bool
     dtype: torch.dtype
     device: torch.device | str | None
-    background: Background = Background.NONE
     pixel: PixelResponse | None = None
 
     def __post_init__(self) -> None:
@@ -82,5 +79,5 @@ class ModelRecipe:
         return self._build(self.aperture.still(), basis)
 
     def _build(self, aperture: Aperture, basis: AberrationBasis) -> ExposureModel:
-        options = {"background": self.background, "pixel": self.pixel, "dtype": self.dtype, "device": self.device}
+        options = {"pixel": self.pixel, "dtype": self.dtype, "device": self.device}
         return ExposureModel(aperture, self.grid, basis, self.band, **options)

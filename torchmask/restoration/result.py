@@ -12,10 +12,11 @@ import torch
 from torch import Tensor
 
 from torchmask.io import load_npz, save_npz
+from torchmask.record import Brief
 
 
-@dataclass(frozen=True, eq=False)
-class RestorationResult:
+@dataclass(frozen=True, eq=False, repr=False)
+class RestorationResult(Brief):
     """A restored object and everything that was found with it.
 
     object : (H, W) electrons per frame and pixel, on the pixels of the frames
@@ -71,6 +72,11 @@ class RestorationResult:
     coefficients_std: Tensor | None = None
     background: Tensor | None = None
 
+    @property
+    def sky(self) -> float:
+        """Mean light of a pixel that is not the object's [electrons]; NaN in files of 0.1."""
+        return math.nan if self.background is None else float(self.background.mean())
+
     def save(self, path: str | Path) -> None:
         """Write everything to a new .npz file, without pickle. Errors as in `torchmask.io.save_npz`."""
         values = {item.name: getattr(self, item.name) for item in fields(self)}
@@ -102,7 +108,8 @@ class RestorationResult:
             f"{self.message} after {len(self.cost)} iterations, {self.n_evaluations} evaluations, {self.seconds:.1f} s",
             f"chi-square per pixel {float(chi.mean()):.3f} (worst frame {int(chi.argmax())}: {float(chi.max()):.3f})",
             f"noise {self.noise:.3g} electrons rms, prior {self.prior}"
-            + ("" if math.isnan(self.r0) else f", r0 {self.r0:.3g} m"),
+            + ("" if math.isnan(self.r0) else f", r0 {self.r0:.3g} m")
+            + (f", sky {self.sky:.3g} electrons" if self.sky > 0 else ""),
         ]
         return "\n".join(lines)
 

@@ -29,6 +29,13 @@ class Schedule:
         falling noise, iterations of a round
     pixel_steps : by which the object is moved along each axis to find its place between the pixels
     pixel_iterations : that settle the object at such a place, at most
+    faint : change from frame to frame, in noise variances, below which the aberrations are integrated out at the end
+    rounds, moves : of that integration, and moves of the aberrations' samples in a round; the object is the mean of
+        the later half of the rounds
+    move_size : of the first moves, in standard deviations of Laplace's approximation
+    renewal : rounds after which that approximation is made anew
+    memory : share of the averages so far that a round keeps
+    settling : iterations that settle the object in a round, at most
     """
 
     segment: int = 100
@@ -49,6 +56,13 @@ class Schedule:
     restart_iterations: int = 30
     pixel_steps: tuple[float, ...] = (0.4, 0.2)
     pixel_iterations: int = 60
+    faint: float = 5.0
+    rounds: int = 80
+    moves: int = 10
+    move_size: float = 0.3
+    renewal: int = 20
+    memory: float = 0.7
+    settling: int = 30
 
     def __post_init__(self) -> None:
         stages = [number for number, _ in self.candidates] + [1]

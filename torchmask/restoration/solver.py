@@ -6,7 +6,7 @@ the strength of the turbulence, and the noise, which falls from what the mean fr
 to what the model cannot explain, if that is more. Once the object is sharp, frames and object escape from local minima;
 when nothing moves any more, each frame counts as it fits. A start ends when a segment brings nothing more or its
 iterations are spent; if it has missed the object, which the stack's chi-square tells, another one begins from random
-aberrations, and the best is kept.
+aberrations, and the best is kept. Of faint frames, the aberrations are integrated out of what has been found.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from torchmask.restoration.candidates import Candidates, play_stage
 from torchmask.restoration.checkpoint import Checkpoint, Ending, Progress, Status
 from torchmask.restoration.descent import Variables, descend
 from torchmask.restoration.frames import FrameStack
+from torchmask.restoration.marginal import integrate_aberrations
 from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.result import RestorationResult
@@ -92,6 +93,8 @@ class Solver:
         self.callback: Callback | None = callback
         change = stack.change
         self.first_inflation: float = max(1.0, change / schedule.first_inflation)
+        held = traits.prior_on_aberrations and not traits.many_minima  # through a full pupil it was not tried
+        self.is_faint: bool = held and Free.OBJECT | Free.ABERRATIONS in objective.free and change < schedule.faint
         noise = (2 / objective.frames.numel()) ** 0.5  # of the chi-square per pixel
         self.tolerable: float = max(schedule.missed * change, schedule.chance * noise)
 
@@ -105,7 +108,15 @@ class Solver:
         blind = known.nothing and start is None
         # Without a prior a poor fit is the method's own.
         may_start_again = blind and self.traits.prior_on_aberrations and len(self.objective.frames) > 1
-        return self.run(begun, may_start_again, file.save if file is not None else lambda progress: None)
+        ended = self.run(begun, may_start_again, file.save if file is not None else lambda progress: None)
+        if self.is_faint and ended.status is not Status.ITERATION_LIMIT:
+            how = {"seed": self.traits.seed, "follow_r0": self.traits.r0_is_open}
+            ended.state, evaluations = integrate_aberrations(
+                self.objective, ended.state, self.schedule, self.minimizer, self.callback, **how
+            )
+            ended.n_evaluations += evaluations
+            ended.integrated = True
+        return ended
 
     def begin(self, known: Known, start: RestorationResult | None) -> Progress:
         """The progress of a restoration that has not begun, or goes on from an earlier result."""

@@ -1,0 +1,158 @@
+"""Aberrations integrated out: their samples against quadrature, their Hessian against autograd, what is gained."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchmask.grid import Grid
+from torchmask.optics.aperture import SparseAperture
+from torchmask.restoration.aberrations import turbulent_basis
+from torchmask.restoration.descent import descend
+from torchmask.restoration.forward import ExposureModel
+from torchmask.restoration.marginal import AberrationSampler, integrate_aberrations, laplace_precision
+from torchmask.restoration.objective import Free, MyopicObjective
+from torchmask.restoration.priors import TotalVariation
+from torchmask.restoration.projected_lbfgs import ProjectedLBFGS, minimize_bounded
+from torchmask.restoration.schedule import Schedule
+from torchmask.restoration.state import Calibration, State
+
+GRID = Grid.nyquist(1.0, 550e-9, 32, oversampling=1.2)
+BRIEF = Schedule(rounds=4, moves=3, renewal=2, segment=3)
+
+
+def one_piston(noise, n_frames, identical=False, weight=1.0):
+    """Frames of a block through two holes, whose only aberration is the one difference of their pistons."""
+    pair = SparseAperture([[-0.3, 0.0], [0.3, 0.05]], 0.36, 1.0)
+    model = ExposureModel(pair, GRID, turbulent_basis(pair, 1, 0, 2.0, 20.0))
+    generator = torch.Generator().manual_seed(0)
+    image = torch.zeros(model.window.field.shape, dtype=torch.float64)
+    image[13:17, 12:15] = 40.0
+    z = torch.randn(n_frames, 1, dtype=torch.float64, generator=generator)
+    frames = model(image, z)
+    frames = frames + noise * torch.randn(frames.shape, dtype=torch.float64, generator=generator)
+    if identical:
+        frames = frames[:1].expand_as(frames).clone()
+    ones = torch.ones(n_frames, dtype=torch.float64)
+    objective = MyopicObjective(model, frames, torch.tensor([[[noise**-2]]]).double(), TotalVariation(weight))
+    return objective, State(image, z, Calibration(ones, ones, 1.0))
+
+
+def energies(objective, state, grid):
+    """Cost (Z, T) of every frame at each piston of `grid` (Z,)."""
+    columns = [z.expand(len(state.z), 1) for z in grid]
+    return torch.stack([objective.frame_costs(state.image, z, state.calibration) for z in columns])
+
+
+def marginal_cost(objective, image):
+    """Minus the logarithm of the object's posterior, by the trapezoidal rule over the piston; autograd goes through."""
+    grid = torch.linspace(-6, 6, 49, dtype=torch.float64)[:, None]
+    errors = objective.model(image, grid)[:, None] - objective.frames
+    energy = 0.5 * (objective.precision * errors**2).sum((-2, -1)) + 0.5 * grid**2
+    return objective.prior(image) - torch.logsumexp(-energy, 0).sum()
+
+
+def least_marginal_cost(objective, image):
+    """What 60 iterations in the object alone lower it to."""
+
+    def cost(x):
+        leaf = x.view_as(image).detach().requires_grad_()
+        value = marginal_cost(objective, leaf)
+        value.backward()
+        return float(value.detach()), leaf.grad.flatten()
+
+    start = image.flatten()
+    return minimize_bounded(cost, start, torch.zeros_like(start), max_iterations=60).value
+
+
+@pytest.mark.parametrize("size", [0.5, 1.9])
+def test_samples_follow_the_posterior_of_a_piston(size):
+    """Which is wide and skew: moments by quadrature, within four standard errors of independent chains."""
+    n_frames = 200
+    objective, state = one_piston(8.0, n_frames, identical=True)
+    grid = torch.linspace(-6, 6, 241, dtype=torch.float64)
+    weights = (-energies(*one_frame(objective, state), grid)[:, 0]).softmax(0)
+    generator = torch.Generator().manual_seed(1)
+    sampler = AberrationSampler(objective, replace(state, z=torch.zeros_like(state.z)), generator)
+    z, accepted = sampler.sample(state, 40, size)
+    assert 0.3 < accepted < 1
+    for moment in (lambda x: x, lambda x: x**2, lambda x: (3 * x).cos()):
+        expected = float((weights * moment(grid)).sum())
+        error = float((weights * moment(grid) ** 2).sum() - expected**2) ** 0.5 / n_frames**0.5
+        assert abs(float(moment(z).mean()) - expected) < 4 * error
+
+
+def one_frame(objective, state):
+    return objective.of_frames(slice(0, 1)), state.of_frames(slice(0, 1))
+
+
+def test_without_data_samples_follow_the_prior(explain):
+    """Around what is expected, with the weight that the prior has."""
+    objective, state = explain(n_frames=60)
+    centre = 0.3 * torch.ones_like(objective.centre)
+    objective = MyopicObjective(
+        objective.model, objective.frames, 0 * objective.precision, objective.prior, centre=centre
+    )
+    state = replace(state, calibration=replace(state.calibration, aberration_weight=4.0))
+    z, _ = AberrationSampler(objective, state, torch.Generator().manual_seed(0)).sample(state, 30, 0.7)
+    n = z.numel()
+    assert abs(float(z.mean()) - 0.3) < 4 * 0.5 / n**0.5
+    assert abs(float(z.var()) / 0.25 - 1) < 4 * (2 / n) ** 0.5
+
+
+def test_the_hessian_is_that_of_autograd(explain):
+    objective, state = explain(n_frames=2)
+    generator = torch.Generator().manual_seed(0)
+    precision = torch.rand(objective.frames.shape, dtype=torch.float64, generator=generator)
+    objective = MyopicObjective(objective.model, objective.frames, precision, objective.prior)
+    calibration = Calibration(torch.tensor([0.8, 1.2]).double(), torch.tensor([1.0, 2.0]).double(), 0.7)
+    state = replace(state, calibration=calibration)
+    found = laplace_precision(objective, state)
+    weights = objective.scaled_data(calibration)[1]
+    for t in range(2):
+        jacobian = torch.autograd.functional.jacobian(
+            lambda z: objective.model(state.image, z[None])[0], state.z[t]
+        ).flatten(0, 1)
+        expected = jacobian.T @ (weights[t].flatten()[:, None] * jacobian) + 0.7 * torch.eye(state.z.shape[1]).double()
+        assert torch.allclose(found[t], expected, rtol=1e-9, atol=1e-9 * float(expected.abs().max()))
+
+
+def test_the_object_is_where_the_marginal_cost_is_least():
+    """Which quadrature tells where a frame has a single aberration: nothing is left of what the joint mode leaves."""
+    objective, state = one_piston(10.0, 40, weight=0.3)
+    joint = descend(objective, state, 400, ProjectedLBFGS(), lambda *_: None)
+    schedule = Schedule(rounds=30, moves=5)
+    found, evaluations = integrate_aberrations(objective, joint, schedule, ProjectedLBFGS(), seed=0, follow_r0=False)
+    before, after = (float(marginal_cost(objective, at.image)) for at in (joint, found))
+    assert before > after
+    assert after - least_marginal_cost(objective, found.image) < 0.05 * (before - after)
+    assert evaluations >= 30 * 5
+
+
+def test_aberrations_end_at_what_fits_the_object_best():
+    objective, state = one_piston(1.5, 6)
+    found, _ = integrate_aberrations(objective, state, Schedule(rounds=4), ProjectedLBFGS(), seed=0, follow_r0=False)
+    slope = objective.with_changes(free=Free.ABERRATIONS).value_and_gradients(found.image, found.z, found.calibration)
+    assert float(slope.aberration_gradient.abs().max()) < 1e-3  # against 1 where the prior alone moves z by its unit
+
+
+def test_common_aberrations_stay_while_those_of_frames_are_sampled(three_holes, explain):
+    basis = turbulent_basis(three_holes, 3, 4, 0.25, 20.0)
+    objective, state = explain(ExposureModel(three_holes, GRID, basis))
+    z, _ = AberrationSampler(objective, state, torch.Generator().manual_seed(0)).sample(state, 3, 0.3)
+    assert torch.equal(z[:, basis.n_own :], state.z[:, basis.n_own :])
+    assert not torch.equal(z, state.z)
+
+
+def test_one_seed_one_result_and_a_record_of_every_round(explain):
+    objective, state = explain()
+    records = []
+    first, again, other = (
+        integrate_aberrations(objective, state, BRIEF, ProjectedLBFGS(), records.append, seed=seed, follow_r0=True)[0]
+        for seed in (0, 0, 1)
+    )
+    assert torch.equal(first.image, again.image)
+    assert torch.equal(first.z, again.z)
+    assert not torch.equal(first.image, other.image)
+    assert [record.step for record in records] == [1, 2, 3, 4] * 3
+    assert all(record.stage == "integration" and 0 <= record.scalars["accepted"] <= 1 for record in records)

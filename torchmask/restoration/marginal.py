@@ -1,0 +1,160 @@
+"""The object that is likeliest whatever the aberrations, which faint frames leave uncertain.
+
+The object that is likeliest together with the aberrations of all frames is biased: every frame brings as many unknowns
+as the last one, and each bends to the noise of its own frame (Neyman & Scott, Econometrica 16, 1, 1948; for blind
+deconvolution Levin et al., IEEE Trans. Pattern Anal. 33, 2354, 2011). So the aberrations are integrated out, by
+expectation maximisation: the object is settled on the misfit averaged over samples of the aberrations, and these are
+moved on at the new object. Both averages forget the past little by little (stochastic approximation; Delyon, Lavielle &
+Moulines, Ann. Stat. 27, 94, 1999).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from torchmask.record import Callback, Record
+from torchmask.restoration.adjoint import data_fidelity
+from torchmask.restoration.calibration import follow_turbulence, unwrap_pistons
+from torchmask.restoration.descent import Variables, descend
+from torchmask.restoration.escapes import settle_object
+from torchmask.restoration.linearization import Linearization
+from torchmask.restoration.objective import Free, MyopicObjective
+from torchmask.restoration.projected_lbfgs import Minimizer
+from torchmask.restoration.schedule import Schedule
+from torchmask.restoration.state import State
+
+_ACCEPTED = 0.8  # of the moves: larger ones are refused too often, smaller ones lead nowhere
+_ADAPTED = 1.05  # factor on their size after a round
+_KEPT = 0.5  # of the momentum
+
+
+class AberrationSampler:
+    """Samples of the aberrations of every frame for a given object, by Hamiltonian Monte Carlo.
+
+    One leapfrog step a move, after which part of the momentum is kept (Horowitz, Phys. Lett. B 268, 247, 1991). A
+    frame's moves are accepted or refused by themselves, since frames depend on each other through the object only. They
+    are taken in units of Laplace's approximation at the state in which the sampler is made. Aberrations common to all
+    frames stay as they are.
+    """
+
+    def __init__(self, objective: MyopicObjective, state: State, generator: torch.Generator) -> None:
+        self.objective: MyopicObjective = objective
+        self.generator: torch.Generator = generator
+        self.factor: Tensor = torch.linalg.cholesky(laplace_precision(objective, state))
+        self.momentum: Tensor = self._normal(state.z)
+
+    def sample(self, state: State, n_moves: int, size: float) -> tuple[Tensor, float]:
+        """The aberrations (T, K) after so many moves of `size` standard deviations, and the share accepted."""
+        z, momentum = state.z, self.momentum
+        energy, slope = self._energy(state, z)
+        accepted = 0.0
+        for _ in range(n_moves):
+            momentum = _KEPT * momentum + (1 - _KEPT**2) ** 0.5 * self._normal(z)
+            push = momentum - size / 2 * self._whiten(slope)
+            there = z + self._unwhiten(size * push)
+            energy_there, slope_there = self._energy(state, there)
+            push = push - size / 2 * self._whiten(slope_there)
+            rise = energy_there - energy + 0.5 * (push.square() - momentum.square()).sum(1)
+            goes = torch.rand(len(z), dtype=z.dtype, device="cpu", generator=self.generator).to(z) < (-rise).exp()
+            momentum = torch.where(goes[:, None], push, -momentum)
+            z, slope = (torch.where(goes[:, None], new, old) for new, old in ((there, z), (slope_there, slope)))
+            energy = torch.where(goes, energy_there, energy)
+            accepted += float(goes.to(z).mean()) / n_moves
+        self.momentum = momentum
+        return z, accepted
+
+    def _energy(self, state: State, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Misfit and prior of each frame (T,), and their gradient (T, own parameters)."""
+        objective = self.objective
+        frames, precision = objective.scaled_data(state.calibration)
+        misfit = data_fidelity(
+            objective.model, state.image, z, frames, precision, want_object=False, parallel=objective.parallel
+        )
+        assert misfit.aberration_gradient is not None
+        held = objective.aberration_weight(state.calibration, z) * (z - objective.centre)
+        energy = misfit.value.to(z) + 0.5 * (held * (z - objective.centre)).sum(1)
+        return energy, (misfit.aberration_gradient + held)[:, : objective.model.aberrations.n_own]
+
+    def _normal(self, z: Tensor) -> Tensor:
+        shape = (len(z), self.objective.model.aberrations.n_own)
+        return torch.randn(shape, dtype=z.dtype, device="cpu", generator=self.generator).to(z)
+
+    def _whiten(self, slope: Tensor) -> Tensor:
+        return torch.linalg.solve_triangular(self.factor, slope[..., None], upper=False)[..., 0]
+
+    def _unwhiten(self, change: Tensor) -> Tensor:
+        own = torch.linalg.solve_triangular(self.factor.mT, change[..., None], upper=True)[..., 0]
+        return pad(own, (0, self.objective.model.aberrations.n_common))
+
+
+@torch.no_grad()
+def laplace_precision(objective: MyopicObjective, state: State) -> Tensor:
+    """Gauss-Newton Hessian (T, K, K) of the cost in each frame's own K aberrations, for the object as it is."""
+    model, z = objective.model, state.z
+    n_own = model.aberrations.n_own
+    precision = objective.scaled_data(state.calibration)[1]
+    weight = torch.zeros_like(z[0]) + objective.aberration_weight(state.calibration, z)
+    still = state.image.expand(n_own, *state.image.shape) * 0
+    each = torch.eye(n_own, z.shape[1], dtype=z.dtype, device=z.device)[:, None]
+
+    @torch.no_grad()  # which holds for one thread only
+    def of_frame(t: int) -> Tensor:
+        changes = Linearization(model, state.image, z[t : t + 1]).forward(still, each)[:, 0]
+        changes = (changes * precision[t if len(precision) > 1 else 0].sqrt()).flatten(1).to(z)
+        return changes @ changes.T + weight[:n_own].diag()
+
+    return torch.stack(list(objective.parallel(of_frame, range(len(z)))))
+
+
+@torch.no_grad()
+def integrate_aberrations(
+    objective: MyopicObjective,
+    state: State,
+    schedule: Schedule,
+    minimizer: Minimizer,
+    callback: Callback | None = None,
+    *,
+    seed: int,
+    follow_r0: bool,
+) -> tuple[State, int]:
+    """The likeliest object whatever the aberrations, with the aberrations that fit it best, and the evaluations spent.
+
+    It begins where a descent has ended; a weight of the aberrations' prior is needed. `follow_r0` lets that follow the
+    samples. The callback gets a `Record` after every round.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    sampler, size, spent = AberrationSampler(objective, state, generator), schedule.move_size, 0
+    pull, power, total = 0.0, 0.0, torch.zeros_like(state.image)
+    for number in range(schedule.rounds):
+        if number and number % schedule.renewal == 0:
+            sampler = AberrationSampler(objective, state, generator)
+        z, accepted = sampler.sample(state, schedule.moves, size)
+        size = size * _ADAPTED if accepted > _ACCEPTED else size / _ADAPTED
+        slope, now = objective.object_quadratic(state.image, z, state.calibration)
+        kept = min(schedule.memory, number / (number + 1))
+        pull = kept * pull + (1 - kept) * (_filter(state.image, now) - slope)
+        power = kept * power + (1 - kept) * now
+        slope = _filter(state.image, power) - pull + objective.model.background.price
+        image = settle_object(state.image, slope, power, objective.prior, schedule.settling)[1]
+        state = unwrap_pistons(objective, replace(state, image=image, z=z))
+        state = follow_turbulence(objective, state) if follow_r0 else state
+        if number >= schedule.rounds // 2:
+            total += image / (schedule.rounds - schedule.rounds // 2)
+        spent += schedule.moves + 2
+        if callback is not None:
+            callback(Record("integration", number + 1, schedule.rounds, {"accepted": accepted}, {}))
+
+    def count(cost: float, evaluations: int, variables: Variables) -> None:
+        nonlocal spent
+        spent += evaluations
+
+    known_object = objective.with_changes(free=objective.free & ~Free.OBJECT)
+    return descend(known_object, replace(state, image=total), schedule.segment, minimizer, count), spent
+
+
+def _filter(image: Tensor, response: Tensor) -> Tensor:
+    return torch.fft.irfft2(torch.fft.rfft2(image) * response, s=image.shape)
