@@ -56,3 +56,52 @@ def test_what_is_no_list_of_rules_is_refused(constraints):
     ):
         with pytest.raises(TypeError, match="a list of rules is needed"):
             call()
+
+
+def test_what_no_area_can_hold_is_refused_at_once():
+    """The number that is stated is that of Oler's inequality, worked out here for the centres, as he has it."""
+    told = []
+    with pytest.raises(ValueError, match=r"300 holes of 0\.1834 m.*gaps of 0\.5 m.*at most \d+ at") as refusal:
+        require_room(300, 8.2, 0.15, [MinimumGap(0.5)], callback=told.append)
+    assert not told  # not a single trial
+    stated = int(str(refusal.value).split("of at most ")[1].split()[0])
+    # Oler: N points at distances of at least t in a disc of radius R; N at this fill factor sets both
+    area = [
+        2 / math.sqrt(3) * math.pi * (radius / apart) ** 2 + math.pi * radius / apart + 1
+        for n in (stated, stated + 1)
+        for hole in [8.2 * math.sqrt(0.15 / n)]
+        for radius, apart in [((8.2 - hole) / 2, hole + 0.5)]
+    ]
+    assert stated <= area[0]
+    assert area[1] < stated + 1
+
+
+@pytest.mark.parametrize(
+    ("n", "gap", "obstruction", "largest"),
+    [
+        # Seven equal discs around one in the middle: with their gaps three to a diameter of 1 + gap.
+        (7, 0.1, 0.0, 7 * ((1 + 0.1) / 3 - 0.1) ** 2),
+        # The middle one stands in a keep-out disc that is a gap wider than it is all around: six are left.
+        (6, 0.1, (1 + 0.1) / 3 + 0.1, 6 * ((1 + 0.1) / 3 - 0.1) ** 2),
+    ],
+)
+def test_the_bound_is_where_the_best_packing_is(n, gap, obstruction, largest):
+    """From both sides: a mask is found just below, and the refusal just above names the largest fill factor."""
+    rules = [MinimumGap(gap)] + ([KeepOutDisc(obstruction - 0.005)] if obstruction else [])
+    check_mask(require_room(n, 1.0, 0.98 * largest, rules)[1], 1e-9, rules)
+    rules = [MinimumGap(gap)] + ([KeepOutDisc(obstruction + 0.005)] if obstruction else [])
+    told = []
+    with pytest.raises(ValueError, match="a fill_factor of at most") as refusal:
+        require_room(n, 1.0, 1.01 * largest, rules, callback=told.append)
+    assert not told
+    stated = float(str(refusal.value).split("a fill_factor of at most ")[1].split()[0])
+    assert 0.999 * largest < stated <= largest
+
+
+def test_trials_that_take_long_are_told_of():
+    told = []
+    with pytest.raises(ValueError, match="fill factor at which one was found"):
+        require_room(3, 1.0, 0.15, [KeepOutDisc(0.7)], callback=told.append)
+    assert [record.step for record in told] == list(range(1, len(told) + 1))
+    assert all(record.preparatory and record.step <= record.n_steps for record in told)
+    assert told[-1].scalars["shortfall"] >= 0

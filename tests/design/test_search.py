@@ -7,7 +7,8 @@ import pytest
 import torch
 from scipy.optimize import linear_sum_assignment
 
-from torchmask.design.constraints import KeepOutDisc, MinimumGap, NFoldSymmetry, check_mask
+from torchmask.design.constraint_base import project
+from torchmask.design.constraints import InsideDisc, KeepOutDisc, MinimumGap, NFoldSymmetry, NoOverlap, check_mask
 from torchmask.design.criterion import AsymptoticMSE
 from torchmask.design.refine import refine_mask
 from torchmask.design.search import search_mask
@@ -78,6 +79,27 @@ def test_records_lead_to_the_result():
     assert all(record.step <= record.n_steps for record in records)
     assert all(record.arrays["centers"].shape == (5, 2) for record in records)
     assert records[-1].scalars["relative_mse"] == pytest.approx(found.relative_mse, rel=1e-2)
+
+
+@pytest.mark.parametrize("method", ["cma", "hybrid"])
+def test_history_is_of_feasible_masks_on_one_grid_and_one_axis(method):
+    """Both stages as the criterion measures what one would get, whatever grid and penalties they work with."""
+    fine, records = reference(128), []
+    found = search_mask(fine, 7, 1.0, 0.15, method=method, budget=640, seed=1, callback=records.append)
+    rules = [InsideDisc(), NoOverlap()]
+    for stage, points in found.history.items():
+        told = [record for record in records if record.stage == stage]
+        assert 1 < len(points) <= len(told)
+        expected = [
+            float(fine.relative(project(found.aperture.replace(centers=record.arrays["centers"]), rules)))
+            for record in (told[0], told[-1])
+        ]
+        # projected twice, and to rounding of the rules: far below the curve's steps
+        torch.testing.assert_close(points[[0, -1], 1].tolist(), expected, rtol=1e-9, atol=0)
+    search, refine = found.history[f"design/{method}"], found.history["design/refine"]
+    assert float(search[-1, 0]) <= float(refine[0, 0])
+    assert float(refine[-1, 0]) == found.evaluations
+    assert float(refine[-1, 1]) == pytest.approx(found.relative_mse, rel=1e-9)
 
 
 def test_extra_rules_are_obeyed_exactly():

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torchmask.design.constraint_base import Constraint, Inequality, LinearEquality, require_constraints
 from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.overlaps import check_overlaps, pair_clearances
 from torchmask.optics.shape_base import safe_length
 
 
@@ -25,6 +26,22 @@ class InsideDisc(Inequality):
 
     def margins(self, aperture: SparseAperture) -> Tensor:
         return aperture.shape.clearance(aperture.centers, aperture.subaperture_diameter, aperture.mask_diameter)
+
+
+@dataclass(frozen=True)
+class RimMargin(Inequality):
+    """Between any hole and the rim of the mask disc at least `margin` [m] of solid material. N margins, one a hole."""
+
+    length: ClassVar[str] = "margin"
+
+    margin: float
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.margin) and self.margin >= 0):
+            raise ValueError(f"margin is {self.margin}: it must be finite and not negative, in m")
+
+    def margins(self, aperture: SparseAperture) -> Tensor:
+        return InsideDisc().margins(aperture) - self.margin
 
 
 @dataclass(frozen=True)
@@ -44,11 +61,7 @@ class MinimumGap(Inequality):
             raise ValueError(f"gap is {self.gap}: it must be finite and not negative, in m")
 
     def margins(self, aperture: SparseAperture) -> Tensor:
-        first, second = torch.triu_indices(aperture.n_subapertures, aperture.n_subapertures, 1).to(
-            aperture.centers.device
-        )
-        difference = aperture.centers[..., first, :] - aperture.centers[..., second, :]
-        return aperture.shape.separation(difference) - (aperture.subaperture_diameter + self.gap)
+        return pair_clearances(aperture) - self.gap
 
 
 class NoOverlap(MinimumGap):
@@ -228,6 +241,8 @@ class NFoldSymmetry(LinearEquality):
 def check_mask(aperture: SparseAperture, tolerance: float = 1e-9, constraints: Sequence[Constraint] = ()) -> None:
     """Raise ValueError unless the holes lie in the mask disc, do not overlap and obey `constraints`.
 
+    The message says by how much, in metres, and of holes that overlap which they are.
+
     Parameters
     ----------
     aperture : SparseAperture
@@ -240,7 +255,8 @@ def check_mask(aperture: SparseAperture, tolerance: float = 1e-9, constraints: S
     >>> check_mask(SparseAperture([[-0.4, 0.0], [0.4, 0.0]], subaperture_diameter=0.2, mask_diameter=1.0))
     """
     require_constraints(constraints)
-    for constraint in (InsideDisc(), NoOverlap(), *constraints):
+    check_overlaps(aperture, tolerance)
+    for constraint in (InsideDisc(), *constraints):
         worst = float(constraint.violation(aperture).max())
         if worst > tolerance * aperture.mask_diameter:
             raise ValueError(

@@ -22,11 +22,12 @@ from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.shape_base import Array, Circle, Contour, Corners, Shape
 from torchmask.optics.shapes import outlined_shape
 
+LIFE_SIZE = 1000.0  # [mm on the plate for a metre of the pupil]
 _SCALE = "torchmask mm per m"
 _NANOMETRE = 1e-6  # [mm]: what rounding may change
 
 
-def save_dxf(path: str | Path, aperture: SparseAperture, scale: float = 1000.0) -> None:
+def save_dxf(path: str | Path, aperture: SparseAperture, scale: float = LIFE_SIZE) -> None:
     """Write a DXF drawing: holes as circles or closed polylines on layer HOLES, the mask's rim on layer OUTLINE.
 
     Parameters
@@ -45,7 +46,7 @@ def save_dxf(path: str | Path, aperture: SparseAperture, scale: float = 1000.0) 
     import ezdxf
     import ezdxf.units
 
-    centers = require_one_mask(aperture).double() * _checked(scale)
+    centers = require_one_mask(aperture).double() * require_scale(scale)
     drawing = ezdxf.new("R2010", units=ezdxf.units.MM)  # pyright: ignore[reportPrivateImportUsage]
     drawing.header.custom_vars.append(_SCALE, repr(float(scale)))
     for layer in ("HOLES", "OUTLINE"):
@@ -64,13 +65,13 @@ def save_dxf(path: str | Path, aperture: SparseAperture, scale: float = 1000.0) 
         file.write(text.getvalue().encode(drawing.output_encoding))
 
 
-def save_svg(path: str | Path, aperture: SparseAperture, scale: float = 1000.0) -> None:
+def save_svg(path: str | Path, aperture: SparseAperture, scale: float = LIFE_SIZE) -> None:
     """Write an SVG drawing in true size: user units are millimetres, the rim and the holes are hairlines.
 
     SVG's y axis points down, so y is written with its sign reversed and the picture shows y up. Same arguments and
     errors as `save_dxf`.
     """
-    centers = require_one_mask(aperture).double() * _checked(scale)
+    centers = require_one_mask(aperture).double() * require_scale(scale)
     width = 1.02 * scale * max(aperture.mask_diameter, 2 * aperture.reach)
     svg = ElementTree.Element(
         "svg",
@@ -113,7 +114,7 @@ def load_dxf(path: Path) -> SparseAperture:
     noted = drawing.header.custom_vars.get(_SCALE)
     if noted is None:
         raise ValueError("the drawing does not say how many millimetres stand for a metre of the pupil")
-    scale = _checked(float(noted))
+    scale = require_scale(float(noted))
     plate = drawing.modelspace()
     rims = list(plate.query('CIRCLE[layer=="OUTLINE"]'))
     if len(rims) != 1:
@@ -167,7 +168,8 @@ def require_one_mask(aperture: SparseAperture) -> Tensor:
     return aperture.centers.detach().cpu()
 
 
-def _checked(scale: float) -> float:
+def require_scale(scale: float) -> float:
+    """The scale itself [mm on the plate for a metre of the pupil]. Raises ValueError unless finite and positive."""
     if not (math.isfinite(scale) and scale > 0):
         raise ValueError(
             f"scale is {scale}: it must be finite and positive, in mm on the plate for a metre of the pupil"

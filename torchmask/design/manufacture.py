@@ -93,8 +93,7 @@ def amplitude_map(aperture: SparseAperture, n_pixels: int) -> tuple[Tensor, floa
     Raises ValueError if a hole is narrower than two pixels.
     """
     require_one_mask(aperture)
-    width = max(aperture.mask_diameter, 2 * aperture.reach)
-    needed = math.ceil(2 * width / aperture.subaperture_diameter) + 2
+    width, needed = max(aperture.mask_diameter, 2 * aperture.reach), least_pixels(aperture)
     if n_pixels != int(n_pixels) or n_pixels < needed:
         raise ValueError(f"n_pixels is {n_pixels}: a hole must span two pixels, so at least {needed} are needed")
     step = width / (n_pixels - 2)
@@ -105,6 +104,11 @@ def amplitude_map(aperture: SparseAperture, n_pixels: int) -> tuple[Tensor, floa
     start = n_pixels - n_pixels // 2
     inner = torch.fft.fftshift(raster)[start : start + n_pixels, start : start + n_pixels]
     return inner.clamp(max=1), step  # holes that overlap are open once
+
+
+def least_pixels(aperture: SparseAperture) -> int:
+    """Pixels a side that `save_fits` needs, so that a hole spans two."""
+    return math.ceil(2 * max(aperture.mask_diameter, 2 * aperture.reach) / aperture.subaperture_diameter) + 2
 
 
 def load_mask(path: str | Path) -> SparseAperture:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from torchmask.design.constraint_base import Constraint, Infeasible, require_constraints
+from torchmask.design.constraint_base import Constraint, Infeasible, project, require_constraints
 from torchmask.design.constraints import InsideDisc, NoOverlap, check_mask
 from torchmask.design.descent import BatchedBFGS
 from torchmask.design.merit import Criterion, Holes, Merit
@@ -26,8 +26,9 @@ class SearchResult:
     aperture : the mask, feasible to 1e-9 of its diameter
     mse, relative_mse : the criterion at this very mask
     evaluations : masks whose error was computed
-    history : for each stage (evaluations so far, best relative MSE so far) (n, 2); a stage that works on a coarse grid
-        or with penalties reports the values it sees there
+    history : for each stage, of its best masks in turn, (evaluations so far in all stages, relative MSE) (n, 2): of the
+        mask moved onto the rules, on the grid of the criterion, whatever grid and penalties it worked with. Masks
+        for which no such move was found are left out. These measurements are not among the evaluations.
 
     Examples
     --------
@@ -47,16 +48,20 @@ class SearchResult:
 
 
 class Monitor:
-    """Keeps the history of a stage and tells the callback, about a hundred times."""
+    """Keeps the best masks of a stage and tells the callback, about a hundred times.
+
+    `before` counts the evaluations of earlier stages.
+    """
 
     stage: str
     budget: int
     holes: Holes
     callback: Callback | None
+    before: int
 
-    def __init__(self, stage: str, budget: int, holes: Holes, callback: Callback | None) -> None:
-        self.stage, self.budget, self.holes, self.callback = stage, budget, holes, callback
-        self.rows: list[tuple[float, float]] = []
+    def __init__(self, stage: str, budget: int, holes: Holes, callback: Callback | None, before: int = 0) -> None:
+        self.stage, self.budget, self.holes, self.callback, self.before = stage, budget, holes, callback, before
+        self.rows: list[tuple[int, Tensor]] = []  # evaluations, centres
         self._merit = self._relative = float("inf")
         self._centers: Tensor | None = None
         self._due = 0.0
@@ -69,12 +74,12 @@ class Monitor:
             self._centers = self.holes.aperture(x[index]).centers
         if self._centers is not None and evaluations >= self._due:
             self._due = evaluations + self.budget / 100
-            self.rows.append((evaluations, self._relative))
+            self.rows.append((self.before + evaluations, self._centers))
             self._tell(evaluations, self._relative, self._centers)
 
     def conclude(self, evaluations: int, relative_mse: float, aperture: SparseAperture) -> None:
         """Tell what the stage returns."""
-        self.rows.append((evaluations, relative_mse))
+        self.rows.append((self.before + evaluations, aperture.centers))
         self._tell(evaluations, relative_mse, aperture.centers)
 
     def _tell(self, evaluations: int, relative_mse: float, centers: Tensor) -> None:
@@ -82,10 +87,23 @@ class Monitor:
             step, scalars = min(evaluations, self.budget), {"relative_mse": relative_mse}
             self.callback(Record(self.stage, step, self.budget, scalars, {"centers": centers.detach().clone()}))
 
-    @property
-    def history(self) -> dict[str, Tensor]:
+    def history(self, criterion: Criterion) -> dict[str, Tensor]:
         """The stage's entry in `SearchResult.history`."""
-        return {self.stage: torch.tensor(self.rows, dtype=torch.float64).reshape(-1, 2)}
+        measured: dict[int, float] = {}  # by the identity of the centres: a mask is the best for many rows
+        for _, centers in self.rows:
+            if id(centers) not in measured:
+                measured[id(centers)] = self._measure(criterion, centers)
+        rows = [(evaluations, measured[id(centers)]) for evaluations, centers in self.rows]
+        found = [row for row in rows if row[1] < float("inf")]
+        return {self.stage: torch.tensor(found, dtype=torch.float64).reshape(-1, 2)}
+
+    def _measure(self, criterion: Criterion, centers: Tensor) -> float:
+        try:
+            mask = project(self.holes.template.replace(centers=centers), self.holes.constraints)
+        except Infeasible:
+            return float("inf")
+        with torch.no_grad():
+            return float(criterion.relative(mask))
 
 
 def refine_mask(
@@ -144,7 +162,7 @@ def refine_mask(
     start = holes.coordinates(still.centers)
     monitor = Monitor("design/refine", budget, holes, callback)
     best, evaluations = polish(criterion, holes, start[None], budget, monitor)
-    return conclude(criterion, best, constraints, evaluations, monitor.history)
+    return conclude(criterion, best, constraints, evaluations, monitor.history(criterion))
 
 
 def polish(

@@ -11,12 +11,13 @@ import numpy as np
 import torch
 
 from torchmask.design.constraint_base import Constraint, Inequality, Infeasible, require_constraints
-from torchmask.design.constraints import InsideDisc, NoOverlap
+from torchmask.design.constraints import InsideDisc, KeepOutDisc, MinimumGap, NoOverlap, RimMargin
 from torchmask.design.descent import BatchedBFGS
 from torchmask.design.merit import Holes
 from torchmask.design.starts import random_mask
 from torchmask.optics.aperture import SparseAperture
-from torchmask.optics.packing import hole_diameter
+from torchmask.optics.packing import certain_number, hole_diameter, largest_number
+from torchmask.record import Callback, Record
 
 _STARTS = 16
 _ROUNDS = 150
@@ -26,30 +27,40 @@ _NEAR = 1e-7  # sum of squared shortfalls from which a projection is tried, in m
 
 
 def require_room(
-    n_subapertures: int, mask_diameter: float, fill_factor: float, constraints: Sequence[Constraint], seed: int = 0
+    n_subapertures: int,
+    mask_diameter: float,
+    fill_factor: float,
+    constraints: Sequence[Constraint],
+    seed: int = 0,
+    callback: Callback | None = None,
 ) -> tuple[Holes, SparseAperture]:
     """The holes of a request with all their rules, and a first mask that obeys them.
+
+    What no packing can hold is refused at once; the rest is tried, of which `callback` gets preparatory records.
 
     Raises
     ------
     ValueError
-        If the holes cannot be packed, or no mask that obeys `constraints` is found: says the largest fill factor at
-        which one was or, if there is none, how much a rule may ask for at this one.
+        If the holes cannot be packed: says how many could, and at which fill factor. If no mask that obeys
+        `constraints` is found: says the largest fill factor at which one was or, if there is none, how much a rule may
+        ask for at this one.
     TypeError
         If `constraints` is no sequence of rules.
     """
     hole_diameter(n_subapertures, mask_diameter, fill_factor)
     require_constraints(constraints)
+    _require_area(n_subapertures, mask_diameter, fill_factor, constraints)
     rng = np.random.default_rng(seed)
     holes = _holes(n_subapertures, mask_diameter, fill_factor, constraints)
+    trials = _Trials(callback)
     try:
-        return holes, _first_mask(holes, rng)
+        return holes, _first_mask(holes, rng, trials)
     except Infeasible:
         pass
 
     def fits(fill: float, rules: Sequence[Constraint]) -> bool:
         try:
-            _first_mask(_holes(n_subapertures, mask_diameter, fill, rules), rng)
+            _first_mask(_holes(n_subapertures, mask_diameter, fill, rules), rng, trials)
         except Infeasible:
             return False
         return True
@@ -59,6 +70,61 @@ def require_room(
         f"no mask of {n_subapertures} holes with fill_factor {fill_factor} was found that obeys {rules}; "
         f"{_advice(fits, fill_factor, list(constraints))}"
     )
+
+
+def _require_area(n: int, mask_diameter: float, fill_factor: float, constraints: Sequence[Constraint]) -> None:
+    """Raise `Infeasible` where there is too little area for N holes with their gaps beside the largest keep-out disc.
+
+    Holes that are half a gap larger all around do not overlap, and lie in a mask that is half a gap larger all around.
+    What fits into the keep-out disc, made half a gap smaller, could stand there beside them.
+    """
+    width = mask_diameter - 2 * max((rule.margin for rule in constraints if isinstance(rule, RimMargin)), default=0.0)
+    gap = max((rule.gap for rule in constraints if isinstance(rule, MinimumGap)), default=0.0)
+    zones = [rule for rule in constraints if isinstance(rule, KeepOutDisc)]
+    zones = [zone for zone in zones if math.hypot(*zone.center) + zone.diameter / 2 <= width / 2]
+    blocked = max((zone.diameter for zone in zones), default=0.0)
+
+    def most(hole: float, gap: float) -> int:
+        """No more holes of this diameter [m] fit."""
+        cell = hole + gap
+        return largest_number(max(0.0, width + gap) / cell) - certain_number(max(0.0, blocked - gap) / cell)
+
+    def may_fit(number: int, fill: float, gap: float) -> bool:
+        return number <= most(mask_diameter * math.sqrt(fill / number), gap)
+
+    if may_fit(n, fill_factor, gap):
+        return
+    hole = mask_diameter * math.sqrt(fill_factor / n)
+    fewer = next((number for number in range(n - 1, 0, -1) if may_fit(number, fill_factor, gap)), 0)
+    smaller = _largest(lambda fill: may_fit(n, fill, gap), fill_factor)
+    closer = _largest(lambda gap: may_fit(n, fill_factor, gap), gap) if gap else 0.0
+    advice = [f"n_subapertures of at most {fewer} at this fill factor"] if fewer else []
+    advice += [f"a fill_factor of at most {smaller:.4g} for {n} holes"] if smaller else []
+    advice += [f"a MinimumGap gap of at most {closer:.4g} m"] if closer else []
+    beside = f" beside a keep-out disc of {blocked:.4g} m" if blocked else ""
+    apart = f" with gaps of {gap:.4g} m" if gap else ""
+    raise Infeasible(
+        f"{n} holes of {hole:.4g} m (fill_factor {fill_factor:.4g}){apart} cannot fit into a disc of "
+        f"{width:.4g} m{beside}, whose area holds {most(hole, gap)} at most; it may have room for "
+        f"{' or '.join(advice) or 'none of them: ask for a smaller keep-out disc or rim margin'}"
+    )
+
+
+class _Trials:
+    """Tells the callback how far the search for a first mask is; a failure costs `_BISECTIONS` trials more at least."""
+
+    def __init__(self, callback: Callback | None) -> None:
+        self.callback = callback
+        self.rounds = 0
+
+    def tell(self, shortfall: float) -> None:
+        """One round of one trial is done; `shortfall` in mask diameters."""
+        self.rounds += 1
+        if self.callback is not None:
+            first = self.rounds <= _ROUNDS
+            budget = _ROUNDS if first else _ROUNDS * max(1 + _BISECTIONS, math.ceil(self.rounds / _ROUNDS))
+            scalars = {"shortfall": shortfall}
+            self.callback(Record("design/room", self.rounds, budget, scalars, preparatory=True))
 
 
 def _advice(
@@ -105,7 +171,7 @@ def _holes(n: int, mask_diameter: float, fill_factor: float, constraints: Sequen
     return Holes(template, (InsideDisc(), NoOverlap(), *constraints))
 
 
-def _first_mask(holes: Holes, rng: np.random.Generator) -> SparseAperture:
+def _first_mask(holes: Holes, rng: np.random.Generator, trials: _Trials) -> SparseAperture:
     """Descend from random masks on the squared shortfalls alone; the first that can be projected is taken."""
     if not any(not isinstance(c, (InsideDisc, NoOverlap)) for c in holes.constraints):
         template = holes.template
@@ -119,6 +185,7 @@ def _first_mask(holes: Holes, rng: np.random.Generator) -> SparseAperture:
         shortfall = (holes.margins(holes.aperture(x)).clamp(max=0) ** 2).sum(-1)
         (gradient,) = torch.autograd.grad(shortfall.sum(), x)
         descent.tell(shortfall.detach(), gradient)
+        trials.tell(float(descent.values.min()) ** 0.5)
         if bool((descent.values < 1e-16).any()):
             break
     failure = Infeasible("no descent on the shortfalls came near zero")

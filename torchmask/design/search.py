@@ -90,15 +90,15 @@ def search_mask(
         raise ValueError(f"budget is {budget}: it must be a whole number of evaluations, at least 1")
     if seed != int(seed) or seed < 0:
         raise ValueError(f"seed is {seed}: it must be a whole number that is not negative")
-    holes, fallback = require_room(n_subapertures, mask_diameter, fill_factor, constraints)
+    holes, fallback = require_room(n_subapertures, mask_diameter, fill_factor, constraints, callback=callback)
     rng = np.random.default_rng(seed)
     monitor = Monitor(f"design/{method}", budget, holes, callback)
     explore = evolve if method == "cma" else basin_hopping
     working = criterion if method == "cma" else coarse_criterion(criterion)
     starts, used = explore(working, holes, budget, rng, monitor)
-    history = monitor.history
+    history = monitor.history(criterion)
     # One evaluation each is what it takes to compare the candidates once they are feasible: no gradient stage.
     allowance = (POLISH if refine else 1) * len(starts)
-    monitor = Monitor("design/refine", allowance, holes, callback)
+    monitor = Monitor("design/refine", allowance, holes, callback, before=used)
     aperture, polished = polish(criterion, holes, starts, allowance, monitor, fallback)
-    return conclude(criterion, aperture, constraints, used + polished, history | monitor.history)
+    return conclude(criterion, aperture, constraints, used + polished, history | monitor.history(criterion))
