@@ -35,6 +35,7 @@ from torchmask.design.table import design_table
 from torchmask.grid import Grid
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.otf import OTF
+from torchmask.optics.overlaps import check_overlaps
 from torchmask.record import Callback
 from torchmask.spectra import NoisePSD, PowerLawPSD
 
@@ -223,6 +224,7 @@ def check(options: Options) -> None:
             raise ValueError(f"{name} is {getattr(options, name)}: a standard error needs at least 2")
     TurbulencePhase(DIAMETER / options.d_over_r0, options.outer_scale * DIAMETER)
     golay = SparseAperture.from_catalog("golay6", DIAMETER, options.fill_factor)
+    check_overlaps(golay)
     OTF(golay, Grid.nyquist(DIAMETER, WAVELENGTH, options.n_pixels), options.oversampling)
 
 

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from mask_vs_full_options import DIAMETER, WAVELENGTH, Options, check, scenes, with_presets
+from mask_vs_full_options import DIAMETER, WAVELENGTH, MaskSearchOptions, Options, check, scenes, with_presets
 from mask_vs_full_report import INSTRUMENTS, figure, findings, markdown, summarise
 from torch import Tensor
 
@@ -43,6 +43,7 @@ from torchmask.metrics import relative_error
 from torchmask.observation import PHASE_OVERSAMPLING, Observation
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.detector import Detector
+from torchmask.optics.overlaps import check_overlaps
 from torchmask.optics.pupil import Aperture
 from torchmask.optics.shapes import Disc
 from torchmask.optics.zernike import zernike_basis
@@ -116,7 +117,7 @@ def measure(task: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def choose_mask(options: Options, callback: Callback) -> SparseAperture:
+def choose_mask(options: MaskSearchOptions, callback: Callback) -> SparseAperture:
     """The mask of --mask, or the one that a search finds for the reference case."""
     if options.mask is not None:
         mask = load_mask(options.mask)
@@ -124,6 +125,7 @@ def choose_mask(options: Options, callback: Callback) -> SparseAperture:
             raise ValueError(
                 f"{options.mask} has {mask.shape} holes in {mask.mask_diameter:g} m: discs in {DIAMETER:g} m are needed"
             )
+        check_overlaps(mask)
         return mask
     space = DesignSpace(
         n_subapertures=(options.n_subapertures,),

@@ -23,7 +23,21 @@ VIEWS = {"satellite, oblique": (25.0, -30.0, 15.0), "satellite, front": (0.0, 0.
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(SweepOptions):
+class MaskSearchOptions(SweepOptions):
+    """The mask."""
+
+    mask: Path | None = None
+    """A mask to use (.json, .dxf or .fits); None: the best that a search finds."""
+    n_subapertures: int = 11
+    """Holes of the mask that is searched."""
+    fill_factor: float = 0.15
+    """Its collecting area N d^2 / D^2."""
+    budget: int = 20_000
+    """Evaluations of the search."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(MaskSearchOptions):
     """What the restorations depend on."""
 
     photons: tuple[float, ...] = (1e5, 1e6, 1e7)
@@ -44,14 +58,6 @@ class Options(SweepOptions):
     """At most, of all starts of a restoration."""
     restarts: int = 1
     """Restorations of the full pupil."""
-    mask: Path | None = None
-    """A mask to use (.json, .dxf or .fits); None: the best that a search finds."""
-    n_subapertures: int = 11
-    """Holes of the mask that is searched."""
-    fill_factor: float = 0.15
-    """Its collecting area N d^2 / D^2."""
-    budget: int = 20_000
-    """Evaluations of the search."""
     readout_noise: float = 1.5
     """Electrons rms per pixel and frame."""
     outer_scale: float = 20.0

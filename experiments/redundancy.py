@@ -33,6 +33,7 @@ from torchmask.cli.run import new_run
 from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture, FullAperture, SparseAperture
 from torchmask.optics.otf import OTF
+from torchmask.optics.overlaps import check_overlaps
 from torchmask.record import Callback, Record
 
 WAVELENGTH = 550e-9
@@ -79,6 +80,7 @@ def pupils(options: Options, grid: Grid) -> dict[str, tuple[Aperture, Sequence[t
     axis = range(0, int(0.93 * radius), max(1, radius // 32))
     full = [((0, k), None) for k in axis] + [((k, 0), None) for k in axis[1:]]
     golay = SparseAperture.from_catalog("golay6", DIAMETER, options.fill_factor)
+    check_overlaps(golay)
     centers = golay.centers.numpy()
     first, second = np.triu_indices(len(centers), 1)
     x, y = np.round((centers[first] - centers[second]).T / step).astype(int)

@@ -28,6 +28,7 @@ from torchmask.grid import Grid
 from torchmask.io import atomic_write, write_json
 from torchmask.metrics import lowpass, relative_error
 from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.overlaps import check_overlaps
 from torchmask.record import Callback, Record
 from torchmask.restoration.wiener import multiframe_wiener
 from torchmask.simulation.dataset import StackDataset, StackRanges
@@ -184,6 +185,7 @@ def restorer(options: Options, output: Run) -> dict[str, float]:
     """Draw, train, score; returns the table."""
     grid = Grid.nyquist(DIAMETER, WAVELENGTH, options.n_pixels)
     mask = SparseAperture.from_catalog(options.mask, DIAMETER, options.fill_factor)
+    check_overlaps(mask)
     cutoff = grid.cutoff(DIAMETER)
     count = options.n_train + options.n_held_out
     stacks = StackDataset(

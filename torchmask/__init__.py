@@ -15,12 +15,14 @@ from torchmask.design.refine import refine_mask
 from torchmask.design.search import SearchResult, search_mask
 from torchmask.design.table import design_table
 from torchmask.grid import Grid
+from torchmask.interferometry.calibration import MaskCalibration, calibrate_mask
 from torchmask.interferometry.fringes import frame_observables
 from torchmask.interferometry.oifits import save_oifits
 from torchmask.interferometry.visibilities import Observables, restored_observables
 from torchmask.observation import Observation
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.detector import Detector
+from torchmask.optics.geometry import MaskGeometry
 from torchmask.optics.otf import OTF
 from torchmask.optics.psf import PSF
 from torchmask.optics.zernike import ZernikePhase
@@ -30,6 +32,7 @@ from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.priors import EdgePreserving, TotalVariation
 from torchmask.restoration.result import RestorationResult
 from torchmask.restoration.wiener import multiframe_wiener
+from torchmask.simulation.conditions import Conditions
 from torchmask.simulation.dataset import StackDataset, StackRanges
 from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
@@ -42,12 +45,15 @@ __all__ = [
     "OTF",
     "PSF",
     "AsymptoticMSE",
+    "Conditions",
     "Detector",
     "EdgePreserving",
     "FullAperture",
     "Grid",
     "LayeredPhase",
     "Layers",
+    "MaskCalibration",
+    "MaskGeometry",
     "MyopicDeconvolution",
     "NoisePSD",
     "Observables",
@@ -64,6 +70,7 @@ __all__ = [
     "TurbulencePhase",
     "ZernikePhase",
     "average_psf",
+    "calibrate_mask",
     "check_mask",
     "design_table",
     "frame_observables",

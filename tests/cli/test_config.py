@@ -30,6 +30,7 @@ class Options:
     inner: Inner = field(default_factory=Inner)
     wavelength: float = 550e-9
     kind: Literal["cma", "hybrid"] = "cma"
+    sky: float | Literal["if-seen", "none"] = "if-seen"
     refine: bool = True
     title: str = ""
     bars: tuple[tuple[float, float], ...] = ()
@@ -47,6 +48,7 @@ OPTIONS = st.builds(
     ),
     wavelength=FINITE,
     kind=st.sampled_from(["cma", "hybrid"]),
+    sky=st.sampled_from(["if-seen", "none"]) | FINITE,
     refine=st.booleans(),
     title=st.text(st.characters(exclude_categories=["Cs"])),
     bars=st.lists(st.tuples(FINITE, FINITE)).map(tuple),
@@ -76,7 +78,7 @@ def test_paths_that_exist_become_absolute_and_places_of_results_are_not_stored(t
     [
         (
             "wavelenght: 1.0",
-            "unknown key wavelenght; known keys are inner, wavelength, kind, refine, title, bars, source$",
+            "unknown key wavelenght; known keys are inner, wavelength, kind, sky, refine, title, bars, source$",
         ),
         ("inner: {siz: 1.0}", r"unknown key inner.siz; known keys are inner.size, inner.count, inner.sun$"),
         ("out: here", "unknown key out"),
@@ -90,6 +92,7 @@ def test_paths_that_exist_become_absolute_and_places_of_results_are_not_stored(t
         ("title: 1", "title is 1: text is needed"),
         ("kind: nelder", "kind is 'nelder': known values are cma, hybrid"),
         ("kind: [cma]", "kind is"),
+        ("sky: dark", "sky is 'dark': known values are if-seen, none"),
         ("bars: [[1, 2], [3]]", r"bars\[1\] has 1 items: 2 are needed"),
         ("bars: 3", "bars is 3: a list is needed"),
         ("inner: {sun: [1, 2]}", "inner.sun has 2 items: 3 are needed"),

@@ -203,6 +203,8 @@ def test_history_is_logarithmic_where_it_helps():
     assert ax.get_yscale() == "log"
     assert ax.lines[0].get_xdata().tolist() == [1, 2, 3]
     np.testing.assert_array_equal(ax.lines[1].get_ydata(), [50, np.nan, np.nan, 2])
+    line = viz.history_figure({"a": torch.tensor([[10.0, 3.0], [20.0, 2.0]])}, "cost").axes[0].lines[0]
+    assert (line.get_xdata().tolist(), line.get_ydata().tolist()) == ([10.0, 20.0], [3.0, 2.0])
     for values in ([3.0, 2.0], [1.0, -1.0], [math.nan]):
         assert viz.history_figure({"a": values}, "cost").axes[0].get_yscale() == "linear"
 

@@ -16,7 +16,7 @@ from rich.table import Table
 
 from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.cli.design import make_criterion, search
-from torchmask.cli.options import ExperimentOptions, SearchOptions
+from torchmask.cli.options import ExperimentOptions, SearchOptions, require_wavelength
 from torchmask.cli.report import log_design, log_observation
 from torchmask.cli.run import Run, new_run
 from torchmask.design.search import SearchResult
@@ -133,6 +133,7 @@ def inversion(options: Options, aperture: Aperture, n_modes: int | None) -> Myop
 
 def check(options: Options) -> None:
     """Raise ValueError for what the stages after the search would refuse: the search takes long."""
+    require_wavelength(options.imaging.wavelength, "--imaging.wavelength")
     outside(options)
     design, diameter = options.design, options.imaging.diameter
     size = hole_diameter(design.n_subapertures, diameter, design.fill_factor)

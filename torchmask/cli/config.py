@@ -6,6 +6,7 @@ that a misspelt key cannot be taken for a default.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import types
 import typing
@@ -103,8 +104,11 @@ def _convert(hint: Any, value: Any, key: str) -> Any:
     if origin in (Union, types.UnionType):
         if value is None and type(None) in arguments:
             return None
-        (hint,) = (argument for argument in arguments if argument is not type(None))
-        return _convert(hint, value, key)
+        *others, last = (argument for argument in arguments if argument is not type(None))
+        for other in others:
+            with contextlib.suppress(ValueError):
+                return _convert(other, value, key)
+        return _convert(last, value, key)
     if origin is Literal:
         if value not in arguments:
             raise ValueError(f"{key} is {value!r}: known values are {', '.join(map(str, arguments))}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 import warnings
 from collections.abc import Sequence
@@ -9,16 +10,19 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
-from torchmask.cli.options import RunOptions, SearchOptions
+import torch
+
+from torchmask.cli.options import RunOptions, SearchOptions, require_wavelength
 from torchmask.cli.report import log_design
 from torchmask.cli.run import new_run
 from torchmask.design.constraint_base import Constraint, project
-from torchmask.design.constraints import InsideDisc, KeepOutDisc, KeepOutSegment, MinimumGap, NoOverlap
+from torchmask.design.constraints import InsideDisc, KeepOutDisc, KeepOutSegment, MinimumGap, NoOverlap, RimMargin
 from torchmask.design.criterion import AsymptoticMSE
-from torchmask.design.drawing import save_svg
-from torchmask.design.manufacture import save_json
+from torchmask.design.drawing import LIFE_SIZE, require_scale, save_dxf, save_svg
+from torchmask.design.manufacture import least_pixels, save_fits, save_json
 from torchmask.design.redundancy import analyse_redundancy
 from torchmask.design.search import SearchResult, search_mask
+from torchmask.design.tolerance import machining_tolerance
 from torchmask.grid import Grid
 from torchmask.io import write_json
 from torchmask.optics.aperture import SparseAperture
@@ -26,13 +30,15 @@ from torchmask.optics.packing import hole_diameter
 from torchmask.record import Callback, Record, fan_out
 from torchmask.spectra import NoisePSD, PowerLawPSD
 
+_GROWTH, _SUCCESS = 0.01, 0.95  # of the MSE by machining errors, and the share of machined masks that stay below it
+
 
 @dataclass(frozen=True, kw_only=True)
 class Options(SearchOptions, RunOptions):
     """Search the positions of the holes that minimise the error of the restored image.
 
-    Writes mask.json (for `torchmask simulate` and `restore`), mask.svg (in millimetres, life-size), figures,
-    metrics.json, config.yaml and the log to a new folder.
+    Writes mask.json (for `torchmask simulate` and `restore`), mask.fits (an image in metres), the drawings mask.dxf and
+    mask.svg (in millimetres), figures, metrics.json, config.yaml and the log to a new folder.
     """
 
     mask_diameter: float = 1.0
@@ -45,14 +51,24 @@ class Options(SearchOptions, RunOptions):
     """Short exposures that the restoration will have."""
     readout_noise: float = 0.0
     """Electrons rms per pixel and frame."""
+    n_pixels: int = 128
+    """Of the detector's field, per side: the read-out noise counts them, not the frequencies of the criterion."""
+    r0: float | None = None
+    """Fried parameter of the turbulence at the wavelength [m], to warn of holes that are wider; None: no such check."""
     method: Literal["hybrid", "cma"] = "hybrid"
     """Descents and basin hopping on a coarse grid, which finds better masks, or CMA-ES, which is published."""
     min_gap: float = 0.0
     """Solid material between any two holes, at least [m]."""
+    rim_margin: float = 0.0
+    """Solid material between any hole and the rim of the mask, at least [m]."""
     central_obstruction: float = 0.0
     """Diameter of the disc in the middle that no hole may reach [m]."""
     spiders: tuple[tuple[float, float, float, float, float], ...] = ()
     """Bars that no hole may reach, five numbers each: from x y to x y, width [m]."""
+    keep_out: tuple[tuple[float, float, float], ...] = ()
+    """Discs that no hole may reach, three numbers each: x y of the centre, diameter [m]."""
+    scale: float = LIFE_SIZE
+    """Of the drawings, in millimetres on the plate for each metre of the pupil; 1000 is life-size."""
     seed: int = 0
     """Of the search."""
 
@@ -87,19 +103,24 @@ def search(
 
 def run(options: Options) -> None:
     """Search, and write the mask; interrupted, the best mask so far."""
+    require_wavelength(options.wavelength)
+    require_scale(options.scale)
     criterion = make_criterion(
         options,
         Grid.nyquist(options.mask_diameter, options.wavelength, options.n_frequencies),
-        NoisePSD(options.n_photons, options.readout_noise),
+        NoisePSD(options.n_photons, options.readout_noise, options.n_pixels**2),
         options.n_frames,
     )
     rules = constraints(options)
+    if options.r0 is not None:
+        warn_of_wide_holes(options, options.r0)
     last: list[Record] = []
     with new_run("design", options, options.seed) as output:
         started = time.perf_counter()
 
         def keep(record: Record) -> None:
-            last[:] = [record]
+            if not record.preparatory:
+                last[:] = [record]
 
         try:
             callback = fan_out(keep, output.callback)
@@ -109,9 +130,12 @@ def run(options: Options) -> None:
                 _save_interrupted(output.directory, options, last[0], rules)
             raise
         seconds = time.perf_counter() - started
-        _save_mask(output.directory, result.aperture)
+        _save_mask(output.directory, result.aperture, options.scale)
         log_design(result, criterion.grid, output.logger, rules)
         table = metrics(result, criterion) | {"evaluations": result.evaluations, "seconds": seconds}
+        table["machining"] = machining(criterion, result.aperture, options.seed)
+        if options.r0 is not None:
+            table["hole_over_r0"] = result.aperture.subaperture_diameter / options.r0
         write_json(output.directory / "metrics.json", table)
         output.summary.append(
             f"{result.aperture.n_subapertures} holes of {result.aperture.subaperture_diameter:.4g} m: relative MSE "
@@ -127,7 +151,37 @@ def constraints(options: Options) -> list[Constraint]:
         rules.append(MinimumGap(options.min_gap))
     if options.central_obstruction:
         rules.append(KeepOutDisc(options.central_obstruction))
+    if options.rim_margin:
+        rules.append(RimMargin(options.rim_margin))
+    rules += [KeepOutDisc(diameter, (x, y)) for x, y, diameter in options.keep_out]
     return rules + [KeepOutSegment((x, y), (to_x, to_y), width) for x, y, to_x, to_y, width in options.spiders]
+
+
+def warn_of_wide_holes(options: Options, r0: float) -> None:
+    """Warn where turbulence aberrates the holes, which the criterion leaves out. Raises ValueError for no r0."""
+    if not (math.isfinite(r0) and r0 > 0):
+        raise ValueError(f"--r0 is {r0}: it must be finite and positive, in m")
+    hole = hole_diameter(options.n_subapertures, options.mask_diameter, options.fill_factor)
+    if hole <= r0 * (1 + 1e-9):
+        return
+    enough = math.ceil(options.fill_factor * (options.mask_diameter / r0) ** 2 * (1 - 1e-9))
+    warnings.warn(
+        f"holes of {hole:.3g} m are {hole / r0:.2f} r0 wide: turbulence aberrates each of them, while the "
+        f"criterion counts a piston for each hole and no more. At this fill factor {enough} holes are no wider than r0",
+        stacklevel=2,
+    )
+
+
+def machining(criterion: AsymptoticMSE, aperture: SparseAperture, seed: int) -> dict[str, float]:
+    """What metrics.json says of the workshop: the rms error [m] of positions and diameter that the mask bears."""
+    generator = torch.Generator().manual_seed(seed)
+    found = machining_tolerance(criterion, aperture, _GROWTH, quantile=_SUCCESS, generator=generator)
+    return {
+        "growth_of_mse": _GROWTH,
+        "success_probability": _SUCCESS,
+        "rms_error_tolerated": found.rms,
+        "rms_error_tolerated_standard_error": found.error,
+    }
 
 
 def metrics(result: SearchResult, criterion: AsymptoticMSE) -> dict[str, object]:
@@ -146,9 +200,11 @@ def metrics(result: SearchResult, criterion: AsymptoticMSE) -> dict[str, object]
     return table
 
 
-def _save_mask(directory: Path, aperture: SparseAperture) -> None:
+def _save_mask(directory: Path, aperture: SparseAperture, scale: float) -> None:
     save_json(directory / "mask.json", aperture)
-    save_svg(directory / "mask.svg", aperture)
+    save_fits(directory / "mask.fits", aperture, max(512, least_pixels(aperture)))
+    save_svg(directory / "mask.svg", aperture, scale)
+    save_dxf(directory / "mask.dxf", aperture, scale)
 
 
 def _save_interrupted(directory: Path, options: Options, record: Record, rules: Sequence[Constraint]) -> None:
@@ -156,6 +212,6 @@ def _save_interrupted(directory: Path, options: Options, record: Record, rules: 
     diameter = hole_diameter(options.n_subapertures, options.mask_diameter, options.fill_factor)
     best = SparseAperture(record.arrays["centers"], diameter, options.mask_diameter)
     try:
-        _save_mask(directory, project(best, (InsideDisc(), NoOverlap(), *rules)))
+        _save_mask(directory, project(best, (InsideDisc(), NoOverlap(), *rules)), options.scale)
     except ValueError as error:  # its centres are still in the checkpoint
         warnings.warn(f"the best mask so far is not feasible, and not written: {error}", stacklevel=2)

@@ -3,38 +3,39 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
-from torchmask.cli.options import DebugOptions
-from torchmask.design.drawing import save_dxf, save_svg
+from torchmask.cli.options import CatalogOptions, DebugOptions, is_mask_file, load_mask_file, require_apart
+from torchmask.design.drawing import LIFE_SIZE, save_dxf, save_svg
 from torchmask.design.manufacture import save_fits, save_json
 from torchmask.design.redundancy import analyse_redundancy
 from torchmask.io import atomic_write
 from torchmask.optics import catalog
 from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.overlaps import describe_overlaps, find_overlaps
 from torchmask.viz import figures as viz
 
 _ANY_SIZE = (1.0, 0.1)  # mask diameter [m] and fill factor at which a mask without a size of its own is shown
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(DebugOptions):
-    """List the catalogue of masks, or show one of them, and write it to a file."""
+class Options(CatalogOptions, DebugOptions):
+    """List the catalogue of masks, or show one mask of the catalogue or of a file, and write it to a file.
 
-    name: tyro.conf.Positional[str | None] = None
-    """Mask to show; None: list all."""
-    mask_diameter: float | None = None
-    """D [m]; None: as built, or 1 m for a mask without a size of its own."""
-    fill_factor: float | None = None
-    """Collecting area N d^2 / D^2; None: as built, or 0.1 where no source gives the size of the holes."""
-    mirrored: bool = False
-    """Reverse x, for instruments that look from the other side."""
+    A mask of the catalogue without a size of its own is shown in a disc of 1 m, at a fill factor of 0.1 where no source
+    gives the size of the holes.
+    """
+
+    name: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="NAME|FILE")] = None
+    """Mask to show: of the catalogue, or of a file (.json, .dxf, .fits); None: list the catalogue."""
     out: Path | None = None
     """New file for the mask (.json, .dxf, .svg, .fits) or for its picture (.png)."""
+    scale: float | None = None
+    """Of a drawing (.dxf, .svg), in millimetres on the plate for each metre of the pupil; None: 1000, life-size."""
 
 
 def run(options: Options) -> None:
@@ -43,7 +44,7 @@ def run(options: Options) -> None:
         show(options.name, options)
         return
     if options.out is not None:
-        raise ValueError("--out is for one mask: give its name")
+        raise ValueError("--out is for one mask: give its name or file")
     print(listing())
 
 
@@ -67,18 +68,26 @@ def listing() -> str:
 
 def show(name: str, options: Options) -> None:
     """Print what is known of a mask, and write it to a file if that is wanted."""
-    mask = catalog.entry(name)
+    if is_mask_file(Path(name)):
+        entry, aperture = None, load_mask_file(name, options)
+    else:
+        entry = catalog.entry(name)
+        aperture = _from_catalog(entry, options)
+    if options.out is not None:
+        write(options.out, require_apart(name, aperture, options.allow_overlap), options.scale)
+    print(describe(aperture, entry))
+    if options.out is not None:
+        print(f"written to {options.out}")
+
+
+def _from_catalog(mask: catalog.CatalogEntry, options: Options) -> SparseAperture:
+    """As built or as the options say; what has no size of its own gets one."""
     diameter, fill = options.mask_diameter, options.fill_factor
     if mask.pupil_diameter is None:
         diameter, fill = diameter or _ANY_SIZE[0], fill or _ANY_SIZE[1]
     elif mask.hole_diameter is None:
         fill = fill or _ANY_SIZE[1]
-    aperture = SparseAperture.from_catalog(name, diameter, fill, options.mirrored)
-    if options.out is not None:
-        write(options.out, aperture)
-    print(describe(aperture, mask))
-    if options.out is not None:
-        print(f"written to {options.out}")
+    return SparseAperture.from_catalog(mask.name, diameter, fill, options.mirrored)
 
 
 def describe(aperture: SparseAperture, mask: catalog.CatalogEntry | None = None) -> str:
@@ -91,24 +100,27 @@ def describe(aperture: SparseAperture, mask: catalog.CatalogEntry | None = None)
     if mask is not None:
         sources = {"source": mask.source, "holes from": mask.hole_source, "note": mask.note}
         lines += [textwrap.fill(f"{key}: {text}", 100, subsequent_indent="  ") for key, text in sources.items() if text]
+    if overlaps := find_overlaps(aperture):
+        lines += ["", describe_overlaps(aperture, overlaps)]
     if aperture.n_subapertures > 1:
         lines += ["", str(analyse_redundancy(aperture))]
     lines += ["", "centres (x, y) [m]", *(f"{x:11.6f} {y:11.6f}" for x, y in aperture.centers.tolist())]
     return "\n".join(lines)
 
 
-def write(path: Path, aperture: SparseAperture) -> None:
-    """Write a mask, or its picture, to a new file of the kind that the suffix says."""
-    writers: dict[str, Callable[[Path, SparseAperture], None]] = {
-        ".json": save_json,
-        ".dxf": save_dxf,
-        ".svg": save_svg,
-        ".fits": save_fits,
-        ".png": _save_png,
-    }
-    if path.suffix.lower() not in writers:
-        raise ValueError(f"{path} does not end in one of {', '.join(writers)}")
-    writers[path.suffix.lower()](path, aperture)
+def write(path: Path, aperture: SparseAperture, scale: float | None = None) -> None:
+    """Write a mask, or its picture, to a new file of the kind that the suffix says; `scale` is for drawings."""
+    drawings = {".dxf": save_dxf, ".svg": save_svg}
+    others = {".json": save_json, ".fits": save_fits, ".png": _save_png}
+    kind = path.suffix.lower()
+    if kind in drawings:
+        drawings[kind](path, aperture, LIFE_SIZE if scale is None else scale)
+    elif kind not in others:
+        raise ValueError(f"{path} does not end in one of {', '.join([*drawings, *others])}")
+    elif scale is not None:
+        raise ValueError(f"--scale is for drawings (.dxf, .svg), and {path} is none: it holds metres in the pupil")
+    else:
+        others[kind](path, aperture)
 
 
 def _save_png(path: Path, aperture: SparseAperture) -> None:

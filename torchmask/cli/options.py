@@ -10,6 +10,7 @@ import tyro
 
 from torchmask.design.manufacture import load_mask
 from torchmask.optics.aperture import Aperture, FullAperture, SparseAperture
+from torchmask.optics.overlaps import check_overlaps
 from torchmask.record import Callback
 
 FULL = "full"  # what stands for a full pupil among the names of masks
@@ -70,6 +71,17 @@ class SweepOptions(WorkerOptions, ExperimentOptions):
     """Where finished tasks are kept: a run that was stopped goes on from there, and others share what they have."""
 
 
+def require_wavelength(metres: float, option: str = "--wavelength") -> None:
+    """Raise ValueError unless this is a wavelength of light in metres: says so where it looks like another unit."""
+    if 1e-8 <= metres <= 1e-2:
+        return
+    meant = ""
+    for unit, power, least, below in (("nm", "e-9", 100, 1e5), ("micrometres", "e-6", 0.1, 100)):
+        if least <= metres < below:
+            meant = f". {metres:g} {unit} are {metres:g}{power}"
+    raise ValueError(f"{option} is {metres:g}: it must be a wavelength of light in m, such as 550e-9{meant}")
+
+
 @dataclass(frozen=True)
 class SearchOptions:
     """The search for the mask, and the criterion it minimises."""
@@ -93,17 +105,27 @@ class SearchOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MaskOptions:
+class CatalogOptions:
+    """How a mask is taken from the catalogue, and whether one with overlapping holes may be."""
+
+    mask_diameter: float | None = None
+    """D of a mask from the catalogue [m]; None: as built."""
+    fill_factor: float | None = None
+    """Collecting area N d^2 / D^2 of a mask from the catalogue; None: as built. Golay arrays need both."""
+    mirrored: bool = False
+    """Reverse x of a mask from the catalogue, for instruments that look from the other side."""
+    allow_overlap: bool = False
+    """Take a mask whose holes overlap, as those of some real masks do; models count the light twice there."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaskOptions(CatalogOptions):
     """The aperture."""
 
     mask: Annotated[Path | None, tyro.conf.arg(metavar="FILE|NAME|full")] = None
     """Mask file (.json, .dxf, .fits), name from `torchmask masks`, or `full`: a full pupil of --mask-diameter."""
     mask_diameter: float | None = None
     """D, of a mask from the catalogue or of a full pupil [m]; None: as built."""
-    fill_factor: float | None = None
-    """Collecting area N d^2 / D^2 of a mask from the catalogue; None: as built. Golay arrays need both."""
-    mirrored: bool = False
-    """Reverse x of a mask from the catalogue, for instruments that look from the other side."""
     central_obstruction: float = 0.0
     """Diameter of the disc that is blocked in the middle of a full pupil [m]."""
 
@@ -123,13 +145,34 @@ def load_aperture(options: MaskOptions) -> Aperture:
         return FullAperture(options.mask_diameter, options.central_obstruction / options.mask_diameter)
     if options.central_obstruction:
         raise ValueError("--central-obstruction is for a full pupil (--mask full); a mask has the holes that it has")
-    if options.mask.is_file() or options.mask.suffix.lower() in MASK_SUFFIXES:
-        if options.mask_diameter is not None or options.fill_factor is not None or options.mirrored:
-            raise ValueError(
-                f"--mask-diameter, --fill-factor and --mirrored are for masks from the catalogue: {name} is a file"
-            )
-        return load_mask(name)
+    if is_mask_file(options.mask):
+        return require_apart(name, load_mask_file(options.mask, options), options.allow_overlap)
     try:
-        return SparseAperture.from_catalog(name, options.mask_diameter, options.fill_factor, options.mirrored)
+        mask = SparseAperture.from_catalog(name, options.mask_diameter, options.fill_factor, options.mirrored)
     except ValueError as error:
         raise ValueError(f"--mask {name}: {error}") from error
+    return require_apart(name, mask, options.allow_overlap)
+
+
+def is_mask_file(path: Path) -> bool:
+    """Whether a file is meant, and not a mask of the catalogue."""
+    return path.is_file() or path.suffix.lower() in MASK_SUFFIXES
+
+
+def load_mask_file(path: str | Path, options: CatalogOptions) -> SparseAperture:
+    """The mask of a file. Raises ValueError for options that are for masks of the catalogue."""
+    if options.mask_diameter is not None or options.fill_factor is not None or options.mirrored:
+        raise ValueError(
+            f"--mask-diameter, --fill-factor and --mirrored are for masks from the catalogue: {path} is a file"
+        )
+    return load_mask(path)
+
+
+def require_apart(name: str, mask: SparseAperture, allow_overlap: bool) -> SparseAperture:
+    """The mask itself. Raises ValueError if its holes overlap, unless that is asked for."""
+    if not allow_overlap:
+        try:
+            check_overlaps(mask)
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}; if it is to be so, --allow-overlap takes it") from error
+    return mask

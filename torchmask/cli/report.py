@@ -32,7 +32,7 @@ def log_design(design: SearchResult, grid: Grid, logger: RunLogger, constraints:
     logger.figure(
         "design/history",
         viz.history_figure(
-            {stage: best[:, 1].tolist() for stage, best in design.history.items()}, "relative MSE", "report"
+            {stage: best for stage, best in design.history.items() if len(best)}, "relative MSE", "evaluations"
         ),
     )
     logger.scalar("design/relative_mse", design.relative_mse)

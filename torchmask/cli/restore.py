@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import tyro
 
@@ -20,6 +20,7 @@ from torchmask.data.restored import save_restored
 from torchmask.io import new_folder, write_json
 from torchmask.metrics import relative_error, ssim
 from torchmask.observation import Observation
+from torchmask.restoration.background import Background
 from torchmask.restoration.many import restore_in_turn
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.priors import TotalVariation
@@ -28,6 +29,8 @@ from torchmask.tracking import RunLogger
 from torchmask.viz import figures as viz
 
 CHECKPOINT = "resume.npz"  # of a run: from here it can go on
+
+SKIES = {"if-seen": Background.IF_SEEN, "per-frame": Background.PER_FRAME, "none": Background.NONE}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +59,8 @@ class Options(StackOptions, WorkerOptions, RunOptions):
     """Share of the light of each of them, any positive numbers; none: equal."""
     static_modes: int = 0
     """Zernike modes per hole of aberrations that all frames share, such as those of the telescope."""
+    sky: float | Literal["if-seen", "per-frame", "none"] = "if-seen"
+    """Its light [electrons per pixel]; or one constant for each frame, to be found always or if the frames show one."""
     prior: bool = True
     """Weigh aberrations by their von Karman statistics."""
     tv_weight: float = 1.0
@@ -107,6 +112,7 @@ def restore_one(files: Sequence[Path], options: Options) -> None:
         result = method.restore(
             observation.frames,
             valid=observation.valid,
+            errors=observation.errors,
             n_samples=options.n_samples,
             checkpoint=state,
             callback=output.callback,
@@ -162,6 +168,7 @@ def deconvolution(observation: Observation, options: Options) -> MyopicDeconvolu
         r0=observation.r0 if options.r0 is None else options.r0,
         outer_scale=observation.outer_scale if options.outer_scale is None else options.outer_scale,
         readout_noise=observation.readout_noise,
+        background=SKIES[options.sky] if isinstance(options.sky, str) else options.sky,
         wavelengths=options.wavelengths or None,
         weights=options.weights or None,
         static_modes=options.static_modes,
@@ -189,6 +196,7 @@ def metrics(observation: Observation, result: RestorationResult) -> dict[str, An
         "chi_square": float(result.chi_square.mean()),
         "worst_frame_chi_square": float(result.chi_square.max()),
         "noise": result.noise,
+        "sky": result.sky,
         "r0": result.r0,
         "photons_per_frame": float(result.object.sum()),
         "cost": float(result.cost[-1]),

@@ -61,16 +61,23 @@ def new_run(command: str, options: RunOptions, seed: int | None = None) -> Itera
     parents = [parent for parent in directory.parents if not parent.exists()]
     useless = False  # until the folder is ours, and again once it holds results
 
-    def note(_: Record) -> None:
-        nonlocal useless
-        useless = False
+    def kept(write: Callback) -> Callback:
+        """Records of results go to the log, and with them the folder is worth keeping."""
+
+        def note(record: Record) -> None:
+            nonlocal useless
+            if not record.preparatory:
+                useless = False
+                write(record)
+
+        return note
 
     try:
         with RunLogger(directory, seed=seed) as logger, Progress() as progress:
             useless = True
             logger.log_config(stored(options))
             save_config(directory / CONFIG, command, options)
-            run = Run(directory, logger, fan_out(logger, progress, note))
+            run = Run(directory, logger, fan_out(kept(logger), progress))
             yield run
     except KeyboardInterrupt:
         print(f"\nwhat was reached is in {directory}", file=sys.stderr)

@@ -2,18 +2,112 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import torch
 
-from torchmask.atmosphere.phase import TurbulencePhase
-from torchmask.cli.options import MaskOptions, RunOptions, load_aperture
+from torchmask.atmosphere.layers import Layers
+from torchmask.atmosphere.phase import LayeredPhase, TurbulencePhase
+from torchmask.atmosphere.profiles import named_layers
+from torchmask.cli.options import MaskOptions, RunOptions, load_aperture, require_wavelength
 from torchmask.cli.report import log_observation
 from torchmask.cli.run import new_run
 from torchmask.grid import ARCSEC, Grid
+from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.band import Band
 from torchmask.optics.detector import Detector
+from torchmask.optics.geometry import MaskGeometry
+from torchmask.optics.pixel import SquarePixel
+from torchmask.optics.pupil import Aperture
+from torchmask.simulation.conditions import Conditions
 from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
+from torchmask.simulation.wavefronts import Turbulence
+
+
+@dataclass(frozen=True)
+class TurbulenceOptions:
+    """The turbulence in height and time."""
+
+    profile: str | None = None
+    """Layers in height: hv57, las_campanas or mauna_kea, at the zenith. None: all turbulence at the pupil."""
+    layers: int = 8
+    """Into which the profile is grouped; theta0 and tau0 do not depend on it."""
+    wind: tuple[float, float] | None = None
+    """Speed towards +x and +y, in place of those of a profile [m/s]; None: no wind without a profile."""
+    frame_interval: float | None = None
+    """From the start of one frame to the next, of turbulence that drifts by [s]; None: all frames independent."""
+    exposure_time: float = 0.0
+    """Of a frame [s]; needs a wind."""
+
+    def make(self, r0: float | None, wavelength: float, outer_scale: float) -> Turbulence:
+        """The turbulence with Fried parameter `r0` [m]; None: that of the profile, or no turbulence."""
+        if self.profile is not None:
+            layers = named_layers(self.profile, self.layers)
+            if r0 is not None or self.wind is not None:
+                winds = layers.winds if self.wind is None else [self.wind] * len(layers.heights)
+                layers = Layers.from_fractions(
+                    layers.r0(wavelength) if r0 is None else r0, wavelength, layers.heights, layers.strengths, winds
+                )
+        elif r0 is None:
+            return None
+        elif self.wind is None:
+            if self.frame_interval is not None:
+                raise ValueError("--turbulence.frame-interval needs --turbulence.wind or --turbulence.profile")
+            return TurbulencePhase(r0, outer_scale)
+        else:
+            layers = Layers.from_fractions(r0, wavelength, [0.0], [1.0], [self.wind])
+        return LayeredPhase(layers, wavelength, outer_scale, self.frame_interval)
+
+
+@dataclass(frozen=True)
+class ConditionOptions:
+    """What else the frames show."""
+
+    sky: float = 0.0
+    """Electrons per pixel and frame."""
+    transparency_scatter: float = 0.0
+    """Of clouds: standard deviation of the logarithm of each frame's transmission."""
+    band_width: float = 0.0
+    """Of a filter of even transmission around the wavelength [m]; 0: one wavelength."""
+    n_wavelengths: int = 5
+    """That stand for the band: 3 are enough for 5 percent of the wavelength, 5 for 15."""
+    pixel_fill_factor: float = 0.0
+    """Sensitive part of the area of a square pixel, at most 1; 0: pixels are points."""
+
+    def make(self, exposure_time: float, wavelength: float) -> Conditions:
+        """The same as `simulate_observation` takes them. Raises ValueError for what cannot be, in these units."""
+        if not (math.isfinite(self.band_width) and 0 <= self.band_width < 2 * wavelength):
+            raise ValueError(
+                f"--conditions.band-width is {self.band_width}: it must be at least 0 m and below twice the wavelength"
+            )
+        return Conditions(
+            sky=self.sky,
+            transparency_scatter=self.transparency_scatter,
+            exposure_time=exposure_time,
+            band=Band.top_hat(wavelength, self.band_width, self.n_wavelengths) if self.band_width else None,
+            pixel=SquarePixel(self.pixel_fill_factor) if self.pixel_fill_factor else None,
+        )
+
+
+@dataclass(frozen=True)
+class TrueMaskOptions:
+    """How the mask lies otherwise than told: the stack names the mask as told, and holds the true one as a truth."""
+
+    rotation_deg: float = 0.0
+    """From x to y [degrees]."""
+    magnification: float = 1.0
+    """Of positions and holes."""
+
+    def apply(self, aperture: Aperture) -> Aperture | None:
+        """The true mask; None where it is as told. Raises ValueError for a full pupil."""
+        if self == TrueMaskOptions():
+            return None
+        if not isinstance(aperture, SparseAperture):
+            raise ValueError("--true-mask.rotation-deg and --true-mask.magnification are for masks, not a full pupil")
+        geometry = MaskGeometry(math.radians(self.rotation_deg), self.magnification, self.magnification)
+        return geometry.apply(aperture)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,11 +125,17 @@ class Options(MaskOptions, RunOptions):
     n_pixels: int = 128
     """Of the image, per side."""
     pixel_scale_arcsec: float | None = None
-    """Angle on the sky of one pixel [arcsec]; None: the largest without aliasing, wavelength / (2 D)."""
+    """Angle on the sky of one pixel [arcsec]; None: the largest without aliasing at the shortest wavelength."""
     r0: float | None = 0.15
-    """Fried parameter of the turbulence at the wavelength [m]; None: no turbulence."""
+    """Fried parameter of the turbulence at the wavelength [m]; None: that of the profile, without one no turbulence."""
     outer_scale: float = 20.0
     """Of the turbulence [m]."""
+    turbulence: TurbulenceOptions = field(default_factory=TurbulenceOptions)
+    """In height and time."""
+    conditions: ConditionOptions = field(default_factory=ConditionOptions)
+    """Sky, clouds, filter and pixels."""
+    true_mask: TrueMaskOptions = field(default_factory=TrueMaskOptions)
+    """Otherwise than told."""
     n_frames: int = 20
     """Short exposures."""
     n_photons: float = 1e7
@@ -48,24 +148,37 @@ class Options(MaskOptions, RunOptions):
 
 def run(options: Options) -> None:
     """Simulate, and write the stack."""
-    aperture = load_aperture(options)
+    told = load_aperture(options)
+    true = options.true_mask.apply(told)
+    aperture = true or told
+    require_wavelength(options.wavelength)
+    conditions = options.conditions.make(options.turbulence.exposure_time, options.wavelength)
+    turbulence = options.turbulence.make(options.r0, options.wavelength, options.outer_scale)
     if options.pixel_scale_arcsec is None:
         # Real masks may reach beyond their nominal pupil.
-        diameter = max(aperture.mask_diameter, aperture.extent)
-        grid = Grid.nyquist(diameter, options.wavelength, options.n_pixels)
+        diameter = max(told.mask_diameter, told.extent, aperture.extent)
+        shortest = options.wavelength if conditions.band is None else conditions.band.shortest
+        finest = Grid.nyquist(diameter, shortest, options.n_pixels)
+        grid = Grid(options.n_pixels, finest.pixel_scale, options.wavelength)
     else:
         grid = Grid(options.n_pixels, options.pixel_scale_arcsec * ARCSEC, options.wavelength)
-    turbulence = None if options.r0 is None else TurbulencePhase(options.r0, options.outer_scale)
     detector = Detector(options.readout_noise)
     scene = make_scene(grid.shape, options.n_photons, options.scene)
     with new_run("simulate", options, options.seed) as output:
         generator = torch.Generator().manual_seed(options.seed)
         observation = simulate_observation(
-            scene, aperture, grid, turbulence, detector, options.n_frames, generator, callback=output.callback
+            *(scene, aperture, grid, turbulence, detector, options.n_frames, generator),
+            conditions=conditions,
+            told=None if true is None else told,
+            callback=output.callback,
         )
         observation.save(output.directory / "stack.npz")
         log_observation("observation", observation, output.logger)
-        kept = float(observation.frames.sum() / (options.n_photons * options.n_frames))
+        if isinstance(turbulence, LayeredPhase):
+            output.summary.append(turbulence.layers.describe(options.wavelength))
+        assert observation.transmission is not None
+        light = observation.frames.mean() - conditions.sky
+        kept = float(light * math.prod(grid.shape) / (options.n_photons * observation.transmission.mean()))
         output.summary.append(
             f"{options.n_frames} frames of {grid.shape[0]} x {grid.shape[1]} pixels of "
             f"{grid.pixel_scale / ARCSEC:.4g} arcsec, {100 * kept:.1f} % of the light inside the field"

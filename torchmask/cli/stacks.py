@@ -11,7 +11,8 @@ from typing import Any, Literal
 from torchmask.cli.options import MaskOptions, load_aperture
 from torchmask.data.observe import read_observation
 from torchmask.grid import ARCSEC, Grid
-from torchmask.observation import Observation
+from torchmask.observation import Observation, check_frames
+from torchmask.restoration.noise import check_errors
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,8 @@ class StackOptions(MaskOptions, FITSOptions):
     """Angle on the sky of one pixel [arcsec]; None: as the file says."""
     readout_noise: float | None = None
     """Electrons rms per pixel and frame; None: as the file says, or else measured on the frames."""
+    errors: bool = True
+    """Weigh pixels by the standard deviations in the file (FITS extension ERR), where it has them."""
 
 
 def group_files(files: Sequence[Path], join: bool) -> dict[str, list[Path]]:
@@ -67,6 +70,17 @@ def group_files(files: Sequence[Path], join: bool) -> dict[str, list[Path]]:
 
 def read_stack(files: Sequence[Path], options: StackOptions) -> Observation:
     """One stack: an .npz file, or FITS files that belong together. Raises ValueError for what is missing or wrong."""
+    observation = _read(files, options)
+    if not options.errors or observation.errors is None:
+        return dataclasses.replace(observation, errors=None)
+    try:
+        check_errors(observation.errors, *check_frames(observation.frames, observation.valid, observation.grid))
+    except ValueError as error:
+        raise ValueError(f"{files[0]}: {error}; or give --no-errors, and all pixels count alike") from error
+    return observation
+
+
+def _read(files: Sequence[Path], options: StackOptions) -> Observation:
     if files[0].suffix.lower() != ".npz":
         return _from_fits(files, options)
     if len(files) > 1:

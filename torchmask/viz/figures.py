@@ -7,7 +7,7 @@ upwards, as drawings of masks do. PSFs and OTFs come in FFT order: only this mod
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -202,8 +202,10 @@ def frames_figure(frames: Any, count: int = 4, pixel_scale: float | None = None)
 
 
 @drawing.styled
-def history_figure(curves: Mapping[str, Sequence[float]], label: str, x_label: str = "iteration") -> Figure:
+def history_figure(curves: Mapping[str, Any], label: str, x_label: str = "iteration") -> Figure:
     """What is being minimised against the iteration, one curve per stage or run; `label` names it.
+
+    A curve is a row of values (n,), one for each iteration, or of points (n, 2) that say where they lie along the axis.
 
     The vertical axis is logarithmic where all values are positive and span more than a factor of 5. Values that are
     not finite leave gaps. Raises ValueError if there is no curve.
@@ -212,11 +214,11 @@ def history_figure(curves: Mapping[str, Sequence[float]], label: str, x_label: s
 
     figure = drawing.new_figure(5.2, 3.2)
     ax = figure.subplots()
-    series = {name: as_array(values).astype(float).ravel() for name, values in drawing.not_empty(curves).items()}
-    for color, (name, values) in zip(drawing.colors(), series.items(), strict=False):
-        shown = np.where(np.isfinite(values), values, np.nan)
-        ax.plot(np.arange(1, len(shown) + 1), shown, color=color, label=name)
-    finite = np.concatenate([values[np.isfinite(values)] for values in series.values()])
+    series = {name: _points(values) for name, values in drawing.not_empty(curves).items()}
+    for color, (name, points) in zip(drawing.colors(), series.items(), strict=False):
+        shown = np.where(np.isfinite(points[:, 1]), points[:, 1], np.nan)
+        ax.plot(points[:, 0], shown, color=color, label=name)
+    finite = np.concatenate([points[np.isfinite(points[:, 1]), 1] for points in series.values()])
     if finite.size and finite.min() > 0 and finite.max() > 5 * finite.min():
         ax.set_yscale("log")
     ax.set(xlabel=x_label, ylabel=label)
@@ -225,6 +227,14 @@ def history_figure(curves: Mapping[str, Sequence[float]], label: str, x_label: s
     ax.margins(x=0.01)
     ax.legend()
     return figure
+
+
+def _points(curve: Any) -> np.ndarray:
+    """(n, 2) of values (n,) counted from 1, or of points as they are."""
+    values = as_array(curve).astype(float)
+    if values.ndim == 2 and values.shape[1] == 2:
+        return values
+    return np.stack([np.arange(1, values.size + 1), values.ravel()], axis=-1)
 
 
 @drawing.styled

@@ -1,0 +1,126 @@
+"""torchmask design: the rules of a telescope, what the workshop gets, and what is said of holes, noise and units."""
+
+import json
+import math
+import re
+
+import pytest
+import torch
+from ezdxf import readfile
+
+from torchmask.cli.design import Options, warn_of_wide_holes
+from torchmask.cli.main import main
+from torchmask.cli.options import require_wavelength
+from torchmask.design.constraints import KeepOutDisc, RimMargin, check_mask
+from torchmask.design.criterion import AsymptoticMSE
+from torchmask.design.manufacture import load_mask
+from torchmask.design.tolerance import machining_tolerance
+from torchmask.grid import Grid
+from torchmask.optics.aperture import SparseAperture
+from torchmask.spectra import NoisePSD, PowerLawPSD
+
+SMALL = ["design", "--n-subapertures", "4", "--fill-factor", "0.1", "--budget", "60", "--n-frequencies", "32"]
+ZONES = ["--rim-margin", "0.03", "--keep-out", "0.2", "0.1", "0.15", "-0.2", "0.1", "0.1"]
+NOISE = ["--n-photons", "1e5", "--readout-noise", "5", "--n-pixels", "48"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    out = tmp_path_factory.mktemp("runs") / "design"
+    assert main([*SMALL, *ZONES, *NOISE, "--r0", "0.5", "--scale", "10", "--out", str(out)]) == 0
+    return out
+
+
+def test_zones_and_margin_are_kept(folder):
+    rules = [RimMargin(0.03), KeepOutDisc(0.15, (0.2, 0.1)), KeepOutDisc(0.1, (-0.2, 0.1))]
+    check_mask(load_mask(folder / "mask.json"), 1e-9, rules)
+
+
+def test_files_for_the_workshop_hold_the_same_mask_at_the_scale(folder):
+    mask = load_mask(folder / "mask.json")
+    for name in ("mask.dxf", "mask.fits"):
+        torch.testing.assert_close(load_mask(folder / name).centers, mask.centers, rtol=0, atol=1e-12)
+    (rim,) = readfile(folder / "mask.dxf").modelspace().query('CIRCLE[layer=="OUTLINE"]')
+    assert rim.dxf.radius == pytest.approx(5.0, rel=1e-12)  # of a disc of 1 m at 10 mm a metre
+    assert 'r="5.0"' in (folder / "mask.svg").read_text()
+
+
+def test_metrics_are_of_the_detector_and_of_the_workshop(folder):
+    metrics = json.loads((folder / "metrics.json").read_text())
+    mask = load_mask(folder / "mask.json")
+    noise = torch.tensor(1e5 + 48**2 * 25, dtype=torch.float64)
+    criterion = AsymptoticMSE(Grid.nyquist(1.0, 550e-9, 32), PowerLawPSD(1.5, 1e5), noise, 20)
+    assert metrics["relative_mse"] == pytest.approx(float(criterion.relative(mask)), rel=1e-12)
+    expected = machining_tolerance(criterion, mask, 0.01, quantile=0.95, generator=torch.Generator().manual_seed(0))
+    assert metrics["machining"] == {
+        "growth_of_mse": 0.01,
+        "success_probability": 0.95,
+        "rms_error_tolerated": expected.rms,
+        "rms_error_tolerated_standard_error": expected.error,
+    }
+    assert metrics["hole_over_r0"] == pytest.approx(math.sqrt(0.1 / 4) / 0.5, rel=1e-12)
+
+
+def test_the_error_does_not_depend_on_the_frequencies_but_by_sampling():
+    """Counted on the grid, the noise of 5 electrons would be 16 times as large at four times the frequencies."""
+    mask = SparseAperture([[0.0, 0.4], [0.3, -0.2], [-0.3, -0.2]], 0.2, 1.0)
+    values = []
+    for n_frequencies in (128, 512):
+        grid = Grid.nyquist(1.0, 550e-9, n_frequencies)
+        noise = NoisePSD(1e5, 5.0, 128**2)
+        criterion = AsymptoticMSE(grid, PowerLawPSD(1.5, 1e5), noise, 20)
+        values.append(float(criterion.relative(mask)))
+    assert values[0] == pytest.approx(values[1], rel=0.01)
+
+
+@pytest.mark.parametrize(("r0", "enough"), [(0.05, 60), (0.1, 15)])
+def test_wide_holes_are_warned_of_with_the_number_that_is_enough(r0, enough):
+    options = Options(n_subapertures=6)  # 0.158 m in 1 m at 0.15
+    with pytest.warns(UserWarning, match=rf"{math.sqrt(0.15 / 6) / r0:.2f} r0 wide.* {enough} holes") as said:
+        warn_of_wide_holes(options, r0)
+    assert len(said) == 1
+    warn_of_wide_holes(Options(n_subapertures=enough), r0)  # as wide as r0: an error here would fail the test
+
+
+def test_an_impossible_r0_is_refused():
+    for r0 in (0.0, -1.0, math.nan):
+        with pytest.raises(ValueError, match="--r0 is"):
+            warn_of_wide_holes(Options(), r0)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ("550", r"--wavelength is 550: .* in m, .*\. 550 nm are 550e-9"),
+        ("2.2", r"--wavelength is 2\.2: .*\. 2\.2 micrometres are 2\.2e-6"),
+        ("-550e-9", r"--wavelength is -5\.5e-07: it must be a wavelength of light in m, such as 550e-9$"),
+        ("0", "--wavelength is 0:"),
+        ("nan", "--wavelength is nan:"),
+    ],
+)
+@pytest.mark.parametrize("command", [SMALL, ["simulate", "--mask", "keck_nirc2_9"]])
+def test_wavelengths_that_are_none_are_named(command, given, said, tmp_path, capsys):
+    assert main([*command, "--wavelength", given, "--out", str(tmp_path / "new")]) == 1
+    assert re.search(said, capsys.readouterr().err.strip())
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("wavelength", [91e-9, 550e-9, 10.5e-6, 1.3e-3])
+def test_wavelengths_of_light_pass(wavelength):
+    require_wavelength(wavelength)
+
+
+@pytest.mark.parametrize(
+    ("option", "said"),
+    [
+        (["--rim-margin", "-0.1"], "margin is -0.1"),
+        (["--rim-margin", "0.45"], r"cannot fit into a disc of 0\.1 m"),
+        (["--keep-out", "0", "0", "-1"], "diameter is -1"),
+        (["--scale", "0"], "scale is 0"),
+        (["--n-pixels", "0"], "n_pixels is 0"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_any_work(option, said, tmp_path, capsys):
+    assert main([*SMALL, *option, "--out", str(tmp_path / "new")]) == 1
+    assert re.search(said, capsys.readouterr().err)
+    assert not (tmp_path / "new").exists()

@@ -1,0 +1,87 @@
+"""`torchmask simulate` with all that a telescope adds, in the units of its options, and what it refuses."""
+
+import re
+
+import pytest
+import torch
+
+from torchmask.atmosphere.profiles import named_layers
+from torchmask.cli.main import main
+from torchmask.cli.simulate import ConditionOptions, TurbulenceOptions
+from torchmask.grid import ARCSEC
+from torchmask.observation import Observation
+from torchmask.optics.aperture import SparseAperture
+
+MASK = ["simulate", "--mask", "golay6", "--mask-diameter", "1", "--fill-factor", "0.15"]
+FINE_ENOUGH = 0.99 * 550e-9 / (2 * SparseAperture.from_catalog("golay6", 1.0, 0.15).extent) / ARCSEC  # at 550 nm alone
+SMALL = ["--n-pixels", "16", "--n-frames", "2", "--scene.size", "0.4"]
+
+
+def test_all_effects_at_once_leave_their_truths_in_the_stack(tmp_path, capsys):
+    turbulence = ["--r0", "0.2", "--turbulence.profile", "hv57", "--turbulence.layers", "2"]
+    turbulence += ["--turbulence.frame-interval", "0.01", "--turbulence.exposure-time", "0.001"]
+    conditions = ["--conditions.sky", "40", "--conditions.transparency-scatter", "0.2"]
+    conditions += ["--conditions.band-width", "5e-8", "--conditions.n-wavelengths", "2"]
+    conditions += ["--conditions.pixel-fill-factor", "0.9", "--n-photons", "1e5"]
+    conditions += ["--true-mask.rotation-deg", "90", "--true-mask.magnification", "0.99"]
+    assert main([*MASK, *SMALL, *turbulence, *conditions, "--out", str(tmp_path / "run")]) == 0
+    stack = Observation.load(tmp_path / "run/stack.npz")
+    assert stack.background == 40.0
+    assert stack.transmission.shape == (2,)
+    assert float(stack.transmission.std()) > 0
+    assert stack.r0 == pytest.approx(0.2)
+    # Nyquist at the shorter of two wavelengths, Gauss and Legendre's
+    shortest = 550e-9 - 25e-9 / 3**0.5
+    assert stack.grid.wavelength == 550e-9
+    assert stack.grid.pixel_scale == pytest.approx(shortest / 2, rel=1e-9)
+    told, true = stack.aperture, stack.true_aperture
+    turned = 0.99 * torch.stack([-told.centers[:, 1], told.centers[:, 0]], dim=-1)
+    torch.testing.assert_close(true.centers, turned)
+    assert true.subaperture_diameter == pytest.approx(0.99 * told.subaperture_diameter)
+    out = capsys.readouterr().out
+    assert "| theta0 |" in out
+    assert "% of the light inside the field" in out
+
+
+def test_options_are_the_turbulence_that_they_name():
+    hv57 = named_layers("hv57", 3)
+    as_it_is = TurbulenceOptions("hv57", 3).make(None, 550e-9, 20.0)
+    assert as_it_is.layers == hv57
+    stronger = TurbulenceOptions("hv57", 3, (3.0, 4.0)).make(0.05, 550e-9, 20.0)
+    assert stronger.r0 == pytest.approx(0.05)
+    assert stronger.layers.heights == hv57.heights
+    assert stronger.layers.winds == ((3.0, 4.0),) * 3
+    assert TurbulenceOptions().make(None, 550e-9, 20.0) is None
+    wind = TurbulenceOptions(wind=(3.0, 4.0), frame_interval=0.02).make(0.1, 550e-9, 20.0)
+    assert (wind.layers.heights, wind.frame_interval) == ((0.0,), 0.02)
+    assert ConditionOptions(pixel_fill_factor=0.5).make(0.0, 550e-9).pixel.fill_factor == 0.5
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--conditions.sky", "-1"], r"sky is -1\.0: it must be finite and at least 0"),
+        (["--turbulence.exposure-time", "-0.1"], r"exposure_time is -0\.1: .* in s"),
+        (["--turbulence.exposure-time", "0.1"], "no wind"),
+        (["--turbulence.profile", "hv58"], "profile 'hv58' is unknown: known ones are hv57, las_campanas, mauna_kea"),
+        (["--turbulence.frame-interval", "0.1"], "--turbulence.frame-interval needs --turbulence.wind"),
+        (["--conditions.band-width", "-1e-9"], r"--conditions.band-width is -1e-09: it must be at least 0 m"),
+        (["--conditions.band-width", "8e-8", "--pixel-scale-arcsec", f"{FINE_ENOUGH:.6f}"], r"undersamples .* 5\.1\d"),
+        (["--conditions.pixel-fill-factor", "1.5"], r"fill_factor is 1\.5"),
+        (["--true-mask.magnification", "0"], "the magnifications positive"),
+    ],
+)
+def test_what_cannot_be_is_one_line_and_leaves_nothing(tmp_path, capsys, options, message):
+    assert main([*MASK, *SMALL, *options, "--out", str(tmp_path / "new" / "run")]) == 1
+    err = capsys.readouterr().err
+    assert err.startswith("torchmask simulate: error: ")
+    assert err.count("\n") == 1
+    assert re.search(message, err), err
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_defaults_are_what_they_were(tmp_path):
+    assert main([*MASK, *SMALL, "--seed", "3", "--out", str(tmp_path / "run")]) == 0
+    stack = Observation.load(tmp_path / "run/stack.npz")
+    assert stack.background == 0
+    assert torch.equal(stack.transmission, torch.ones(2, dtype=stack.transmission.dtype))
