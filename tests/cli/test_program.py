@@ -1,7 +1,10 @@
 """What all programs share: options by falling priority, exit status, one line for a mistake."""
 
+import os
+import signal
 import subprocess
 import sys
+import threading
 import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -129,6 +132,21 @@ def test_an_interruption_is_130(capsys):
     assert capsys.readouterr().err == "program: interrupted\n"
     with pytest.raises(KeyboardInterrupt):
         status(fails(KeyboardInterrupt()), "--debug")
+
+
+def test_termination_interrupts_as_well(capsys):
+    before = signal.getsignal(signal.SIGTERM)
+    assert status(lambda _: os.kill(os.getpid(), signal.SIGTERM)) == 130
+    assert capsys.readouterr().err == "program: interrupted\n"
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_a_program_runs_in_any_thread():
+    ended = []
+    thread = threading.Thread(target=lambda: ended.append(status(lambda _: None)))
+    thread.start()
+    thread.join()
+    assert ended == [0]
 
 
 @pytest.mark.filterwarnings("default::UserWarning")

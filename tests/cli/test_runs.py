@@ -330,7 +330,9 @@ def test_an_interrupted_search_leaves_its_best_mask(tmp_path, monkeypatch, capsy
 def test_an_interrupted_restoration_leaves_the_image_it_reached(runs, tmp_path, monkeypatch, capsys):
     interrupt_at(monkeypatch, "restoration", 11)
     assert main(["restore", str(runs / "simulate/stack.npz"), "--out", str(tmp_path / "run")]) == 130
-    assert capsys.readouterr().err.endswith("torchmask restore: interrupted\n")
+    told = capsys.readouterr().err
+    assert told.endswith("torchmask restore: interrupted\n")
+    assert "--resume" not in told  # there is nothing to go on from yet
     state = load_npz(tmp_path / "run/checkpoints/restoration.npz")
     assert state["object"].shape == (32, 32)
     monkeypatch.undo()
@@ -343,7 +345,9 @@ def test_an_interrupted_restoration_goes_on_to_the_same_result(runs, tmp_path, m
     stack = [runs / "simulate/stack.npz", "--max-iterations", "205", "--tv-weight", "0.5"]
     run("restore", *stack, "--out", tmp_path / "whole")
     interrupt_at(monkeypatch, "restoration", 150)
+    capsys.readouterr()
     assert main(["restore", *map(str, stack), "--out", str(tmp_path / "cut")]) == 130
+    assert f"go on with: torchmask restore --resume {tmp_path / 'cut'}\n" in capsys.readouterr().err
     assert (tmp_path / "cut/resume.npz").is_file()
     assert not (tmp_path / "cut/restored.npz").exists()
     monkeypatch.undo()
@@ -353,6 +357,11 @@ def test_an_interrupted_restoration_goes_on_to_the_same_result(runs, tmp_path, m
     whole, rest = (load_npz(tmp_path / name / "restored.npz") for name in ("whole", "rest"))
     for key in whole.keys() - {"seconds"}:
         np.testing.assert_array_equal(whole[key], rest[key])
+    interrupt_at(monkeypatch, "restoration", 110)  # before the resumed run has written a state of its own
+    assert main(["restore", "--resume", str(tmp_path / "cut"), "--out", str(tmp_path / "again")]) == 130
+    assert f"go on with: torchmask restore --resume {tmp_path / 'again'}\n" in capsys.readouterr().err
+    assert load_npz(tmp_path / "again/resume.npz")["costs"].tolist() == whole["cost"][:100].tolist()
+    monkeypatch.undo()
     steps = [row["step"] for row in read_metrics(tmp_path / "rest") if row["stage"] == "restoration"]
     assert steps == list(range(101, len(whole["cost"]) + 1))
     assert (tmp_path / "rest/config.yaml").read_text() == (tmp_path / "whole/config.yaml").read_text()

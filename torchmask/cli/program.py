@@ -1,7 +1,8 @@
 """A program of the command line: options in, exit status out. Each `torchmask COMMAND` is one, and each script that
 shares its ways.
 
-Exit status: 0 done; 1 something the user can mend, said in one line; 2 wrong usage; 130 interrupted.
+Exit status: 0 done; 1 something the user can mend, said in one line; 2 wrong usage; 130 interrupted, by Ctrl-C or by
+SIGTERM, which batch systems send.
 """
 
 from __future__ import annotations
@@ -9,7 +10,9 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import os
+import signal
 import sys
+import threading
 import typing
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -62,7 +65,8 @@ def exit_status(program: str, work: Callable[[], None], debug: bool) -> int:
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_, **__: _say(program, f"warning: {message}")
         try:
-            work()
+            with _interrupted_by_termination():
+                work()
         except KeyboardInterrupt:
             if debug:
                 raise
@@ -83,6 +87,19 @@ def exit_status(program: str, work: Callable[[], None], debug: bool) -> int:
             _say(program, f"error: {error}")
             return 1
     return 0
+
+
+@contextmanager
+def _interrupted_by_termination() -> Iterator[None]:
+    """SIGTERM interrupts like Ctrl-C while this lasts; only the main thread may ask for that."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def parse(options: type[T], command: str, argv: Sequence[str], *, prog: str, description: str | None = None) -> T:

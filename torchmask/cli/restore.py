@@ -14,7 +14,7 @@ from torchmask import __version__
 from torchmask.cli.config import stored
 from torchmask.cli.options import RunOptions, WorkerOptions
 from torchmask.cli.report import restored_figure
-from torchmask.cli.run import new_run
+from torchmask.cli.run import CHECKPOINT, new_run
 from torchmask.cli.stacks import StackOptions, group_files, read_stack
 from torchmask.data.restored import save_restored
 from torchmask.io import new_folder, write_json
@@ -27,8 +27,6 @@ from torchmask.restoration.priors import TotalVariation
 from torchmask.restoration.result import RestorationResult
 from torchmask.tracking import RunLogger
 from torchmask.viz import figures as viz
-
-CHECKPOINT = "resume.npz"  # of a run: from here it can go on
 
 SKIES = {"if-seen": Background.IF_SEEN, "per-frame": Background.PER_FRAME, "none": Background.NONE}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import shutil
 import sys
 from collections.abc import Iterator, Mapping
@@ -20,6 +21,8 @@ from torchmask.tracking import RunLogger
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+CHECKPOINT = "resume.npz"  # of a run that can go on from there
 
 
 @dataclass(frozen=True)
@@ -80,9 +83,7 @@ def new_run(command: str, options: RunOptions, seed: int | None = None) -> Itera
             run = Run(directory, logger, fan_out(kept(logger), progress))
             yield run
     except KeyboardInterrupt:
-        print(f"\nwhat was reached is in {directory}", file=sys.stderr)
-        if isinstance(options, SweepOptions):
-            print(f"with --sweep {options.sweep} the next run goes on from there", file=sys.stderr)
+        print("", *_ways_on(command, directory, options), sep="\n", file=sys.stderr)
         raise
     except ValueError:
         if useless:
@@ -93,3 +94,13 @@ def new_run(command: str, options: RunOptions, seed: int | None = None) -> Itera
             print(*run.summary, f"what was reached is in {directory}", sep="\n", file=sys.stderr)
         raise
     print(*run.summary, f"written to {directory}", sep="\n")
+
+
+def _ways_on(command: str, directory: Path, options: RunOptions) -> list[str]:
+    """What an interrupted run tells its user: only what is there is named."""
+    lines = [f"what was reached is in {directory}"] if directory.is_dir() else []
+    if all((directory / name).is_file() for name in (CONFIG, CHECKPOINT)):
+        lines.append(f"go on with: torchmask {command} --resume {shlex.quote(str(directory))}")
+    if isinstance(options, SweepOptions):
+        lines.append(f"with --sweep {options.sweep} the next run goes on from there")
+    return lines
