@@ -72,6 +72,14 @@ UNITS = {
     "scene.size": "fraction of the field",
     "imaging.wavelength": r"\[m\]",
     "keep": "Fraction",
+    "sky": "[Ee]lectrons per pixel",
+    "turbulence.wind": r"\[m/s\]",
+    "turbulence.frame_interval": r"\[s\]",
+    "turbulence.exposure_time": r"\[s\]",
+    "conditions.sky": "Electrons per pixel and frame",
+    "conditions.band_width": r"\[m\]",
+    "conditions.pixel_fill_factor": "part of the area",
+    "true_mask.rotation_deg": r"\[degrees\]",
     "scale": "millimetres on the plate for each metre",
     "fill_factor": r"N d\^2 / D\^2",
     "design.fill_factor": r"N d\^2 / D\^2",
@@ -79,6 +87,7 @@ UNITS = {
 WITHOUT_UNIT = {
     *("exponent", "design.exponent", "tv_weight", "tolerance", "weights", "imaging.d_over_r0"),
     "scene.sun",  # of any length
+    *("conditions.transparency_scatter", "true_mask.magnification"),
 }
 
 

@@ -15,6 +15,7 @@ from torchmask.grid import Grid
 from torchmask.metrics import relative_error
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.detector import Detector
+from torchmask.restoration.background import Background
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.simulation.exposures import simulate_observation
 
@@ -86,8 +87,12 @@ def test_constant_frames_hold_no_noise():
     flat = torch.full((3, *GRID.shape), 100.0)
     with pytest.raises(ValueError, match=r"noise cannot be measured .*: give readout_noise"):
         method().restore(flat)
-    with pytest.warns(UserWarning, match="noise is 0 electrons"), pytest.warns(UserWarning, match="beyond the field"):
-        result = method(readout_noise=READOUT, max_iterations=20).restore(flat, n_samples=2)
+    with pytest.warns(UserWarning, match="noise is 0 electrons"):
+        with pytest.raises(ValueError, match="nothing but their background"):
+            method(readout_noise=READOUT).restore(flat)
+        with pytest.warns(UserWarning, match="beyond the field"):
+            without_sky = method(readout_noise=READOUT, max_iterations=20, background=Background.NONE)
+            result = without_sky.restore(flat, n_samples=2)
     for image in (result.object, result.object_std, result.coefficients):
         assert bool(torch.isfinite(image).all())
 

@@ -75,6 +75,7 @@ _OTHERS = {
     "turned by 90 degrees": MaskGeometry(math.pi / 2),
 }
 _AT_A_TIME = 32  # frames
+_CERTAIN = 2.0  # standard errors, from which a correlation is no accident
 _SEEN = 2.0  # standard errors of the noise's power, above which a frequency tells something
 
 
@@ -90,9 +91,10 @@ def orientation_warning(frames: Tensor, aperture: SparseAperture, grid: Grid) ->
     """What is wrong if the power of frames (T, H, W) fits another orientation of the mask better; None if nothing is.
 
     Power that fringes bring stands where the mask has baselines, whatever the object: its logarithm over frequencies,
-    without its trend along the radius, correlates with that of the power a point source would have. Of two orientations
-    the one that correlates better by more than (N (N - 1))^(-1/2) wins, the standard error over so many patches. A turn
-    by 180 degrees, and a mirror of symmetric baselines, change nothing there.
+    without its trend along the radius, correlates with that of the power a point source would have. The standard error
+    of such a correlation over N (N - 1) patches is (N (N - 1))^(-1/2). Another orientation is told if its correlation
+    is above twice that and better than the given one's by more than that. A turn by 180 degrees, and a mirror of
+    symmetric baselines, change nothing there.
     """
     nu_y, nu_x = grid.frequencies(torch.float64, frames.device)
     radius = torch.hypot(nu_y, nu_x)
@@ -123,7 +125,7 @@ def orientation_warning(frames: Tensor, aperture: SparseAperture, grid: Grid) ->
     name = max(others, key=lambda key: others[key])
     n = aperture.n_subapertures
     error = (n * (n - 1)) ** -0.5
-    if others[name] > told + error:
+    if others[name] > max(told + error, _CERTAIN * error):
         return (
             f"the fringes of the frames fit the mask better {name} than as told (correlation {others[name]:.2f} "
             f"against {told:.2f}): check how it lies, or measure it by calibrate_mask on frames of a star"
