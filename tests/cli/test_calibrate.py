@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchmask.cli.main import main
-from torchmask.design.manufacture import load_mask
+from torchmask.design.manufacture import load_mask, mask_wavelength
 from torchmask.grid import Grid
 from torchmask.observation import Observation
 from torchmask.optics.aperture import FullAperture, SparseAperture
@@ -34,6 +34,7 @@ def test_the_mask_where_it_lies_is_written(star, tmp_path, capsys):
     numbers = json.loads((tmp_path / "run" / "calibration.json").read_text())
     assert abs(numbers["rotation"] - 0.02) < 4 * numbers["errors"]["rotation"] + 1e-4
     mask = load_mask(tmp_path / "run" / "mask.json")
+    assert mask_wavelength(tmp_path / "run" / "mask.json") == GRID.wavelength
     expected = MaskGeometry(**{name: numbers[name] for name in TRUE.__dataclass_fields__}).apply(TOLD)
     assert torch.equal(mask.centers, expected.centers)
     assert f"{math.degrees(numbers['rotation']):.4f}" in capsys.readouterr().out

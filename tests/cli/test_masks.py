@@ -7,7 +7,7 @@ import torch
 from ezdxf import readfile
 
 from torchmask.cli.main import main
-from torchmask.design.manufacture import load_mask
+from torchmask.design.manufacture import load_mask, mask_wavelength, save_json
 from torchmask.optics.aperture import SparseAperture
 
 GOLAY = ["masks", "golay9", "--mask-diameter", "2", "--fill-factor", "0.1"]
@@ -26,6 +26,13 @@ def test_a_file_is_shown_and_written_as_the_mask_it_holds(tmp_path, capsys):
     for name in ("golay.dxf", "again.json", "third.fits"):
         found = load_mask(tmp_path / name)
         torch.testing.assert_close(found.centers, mask.centers, rtol=0, atol=1e-12)
+
+
+def test_the_wavelength_of_a_mask_goes_with_it(tmp_path, capsys):
+    save_json(tmp_path / "first.json", SparseAperture.from_catalog("golay9", 2.0, 0.1), 2.2e-6)
+    assert run("masks", tmp_path / "first.json", "--out", tmp_path / "second.json") == 0
+    assert mask_wavelength(tmp_path / "second.json") == 2.2e-6
+    assert "for light of 2.2e-06 m" in capsys.readouterr().out
 
 
 def test_drawings_are_as_large_as_the_scale_says(tmp_path):

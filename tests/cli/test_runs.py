@@ -119,7 +119,7 @@ def test_simulate_takes_its_units_as_they_are_called(runs, tmp_path):
     assert (observation.r0, observation.outer_scale, observation.readout_noise) == (0.3, 20.0, 1.5)
     telescope = ["--mask", "full", "--mask-diameter", "2.0", "--central-obstruction", "0.5"]
     sky = ["--pixel-scale-arcsec", "0.02", "--n-pixels", "16", "--n-frames", "1", "--r0", "None"]
-    run("simulate", *telescope, *sky, "--out", tmp_path / "full")
+    run("simulate", *telescope, "--wavelength", "550e-9", *sky, "--out", tmp_path / "full")
     observation = Observation.load(tmp_path / "full/stack.npz")
     assert isinstance(observation.aperture, FullAperture)
     assert (observation.aperture.mask_diameter, observation.aperture.central_obstruction) == (2.0, 0.25)
@@ -198,7 +198,8 @@ def test_errors_of_a_cube_and_the_sky_are_those_of_the_library_call(runs, cube, 
     [
         ([], "--mask is missing"),
         (["--mask", "golay6"], "golay6 has no size of its own"),
-        (["--mask", "MASK"], "give --wavelength"),
+        (["--mask", "keck_nirc2_9"], "give --wavelength"),
+        (["--mask", "MASK"], "give --pixel-scale-arcsec"),
         (["--mask", "MASK", "--wavelength", "1e-6"], "give --pixel-scale-arcsec"),
         (["--mask", "MASK", "--wavelength", "1e-6", "--pixel-scale-arcsec", "9"], "undersamples"),
         (["--mask", "MASK", "--wavelength", "-1e-6", "--pixel-scale-arcsec", "0.1"], "wavelength is -1e-06"),
@@ -258,7 +259,8 @@ def test_impossible_requests_are_refused_and_leave_nothing(tmp_path, capsys):
     refused([*DESIGN, "--min-gap", "-1"], tmp_path, capsys, "gap is -1.0")
     refused([*DESIGN, "--budget", "0"], tmp_path, capsys, "budget is 0")
     refused(["simulate", "--mask", "none.json"], tmp_path, capsys, "there is no mask file none.json")
-    refused(["simulate", "--mask", "keck_nirc2_9", "--n-photons", "0"], tmp_path, capsys, "n_photons is 0")
+    dark = ["--wavelength", "2e-6", "--n-photons", "0"]
+    refused(["simulate", "--mask", "keck_nirc2_9", *dark], tmp_path, capsys, "n_photons is 0")
     (tmp_path / "bad.yaml").write_text("n_holes: 4")
     refused(
         ["design", "--config", tmp_path / "bad.yaml"], tmp_path, capsys, "unknown key n_holes; known keys are n_sub"

@@ -8,11 +8,13 @@ import torch
 from torchmask.atmosphere.profiles import named_layers
 from torchmask.cli.main import main
 from torchmask.cli.simulate import ConditionOptions, TurbulenceOptions
+from torchmask.design.manufacture import save_json
 from torchmask.grid import ARCSEC
 from torchmask.observation import Observation
 from torchmask.optics.aperture import SparseAperture
 
 MASK = ["simulate", "--mask", "golay6", "--mask-diameter", "1", "--fill-factor", "0.15"]
+MASK += ["--wavelength", "550e-9"]
 FINE_ENOUGH = 0.99 * 550e-9 / (2 * SparseAperture.from_catalog("golay6", 1.0, 0.15).extent) / ARCSEC  # at 550 nm alone
 SMALL = ["--n-pixels", "16", "--n-frames", "2", "--scene.size", "0.4"]
 
@@ -85,3 +87,21 @@ def test_the_defaults_are_what_they_were(tmp_path):
     stack = Observation.load(tmp_path / "run/stack.npz")
     assert stack.background == 0
     assert torch.equal(stack.transmission, torch.ones(2, dtype=stack.transmission.dtype))
+
+
+def test_the_wavelength_is_the_masks_unless_another_is_given(tmp_path, capsys):
+    mask = SparseAperture.from_catalog("golay6", 1.0, 0.15)
+    save_json(tmp_path / "mask.json", mask, 633e-9)
+    save_json(tmp_path / "old.json", mask)
+    simulate = ["simulate", *SMALL, "--mask"]
+    assert main([*simulate, str(tmp_path / "mask.json"), "--out", str(tmp_path / "run")]) == 0
+    assert Observation.load(tmp_path / "run/stack.npz").grid.wavelength == 633e-9
+    given = ["--wavelength", "1e-6", "--out", str(tmp_path / "other")]
+    assert main([*simulate, str(tmp_path / "mask.json"), *given]) == 0
+    assert Observation.load(tmp_path / "other/stack.npz").grid.wavelength == 1e-6
+    for mask_without in (str(tmp_path / "old.json"), "keck_nirc2_9"):
+        capsys.readouterr()
+        assert main([*simulate, mask_without, "--out", str(tmp_path / "new")]) == 1
+        said = f"--wavelength is missing: give it in m, such as 550e-9. --mask {mask_without} holds none"
+        assert said in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()

@@ -2,7 +2,11 @@
 
 from pathlib import Path
 
-from torchmask.cli.stacks import group_files
+import pytest
+
+from torchmask.cli.stacks import StackOptions, group_files, read_stack
+from torchmask.design.manufacture import save_json
+from torchmask.optics.aperture import SparseAperture
 
 FILES = [Path("a/cube.fits"), Path("b/cube.fits"), Path("b/other.npz"), Path("c/cube.fits")]
 
@@ -27,3 +31,13 @@ def test_joined_files_are_one_stack_with_the_name_of_the_first():
 
 def test_no_files_are_no_stack():
     assert group_files([], join=False) == group_files([], join=True) == {}
+
+
+def test_a_cube_without_wavelength_has_that_of_the_mask_file(write_fits, fits_cube, tmp_path):
+    mask = SparseAperture.from_catalog("golay6", 1.0, 0.15)
+    save_json(tmp_path / "mask.json", mask, 633e-9)
+    save_json(tmp_path / "old.json", mask)
+    bare = [write_fits("bare.fits", fits_cube, WAVELEN=None)]
+    assert read_stack(bare, StackOptions(mask=tmp_path / "mask.json")).grid.wavelength == 633e-9
+    with pytest.raises(ValueError, match=r"bare\.fits has no WAVELEN.*: give --wavelength \[m\]"):
+        read_stack(bare, StackOptions(mask=tmp_path / "old.json"))

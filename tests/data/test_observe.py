@@ -53,6 +53,13 @@ def test_options_stand_for_missing_cards_and_win_over_present_ones(write_fits, m
         assert torch.equal(observation.frames, 2 * torch.from_numpy(cube).double())
 
 
+def test_the_masks_wavelength_counts_where_the_header_tells_none(write_fits, mask, cube):
+    bare, known = write_fits("bare.fits", cube, WAVELEN=None), write_fits("known.fits", cube)
+    assert read_observation(bare, mask, design_wavelength=2e-6).grid.wavelength == 2e-6
+    assert read_observation(known, mask, design_wavelength=2e-6).grid.wavelength == 550e-9
+    assert read_observation(bare, mask, wavelength=1e-6, design_wavelength=2e-6).grid.wavelength == 1e-6
+
+
 def test_units_time_and_filter_come_from_the_header(write_fits, mask, cube):
     cards = {"BUNIT": "DN/s", "GAIN": 1.6, "XPOSURE": 10.0, "WAVELEN": None, "INSTRUME": "NIRISS", "FILTER": "F380M"}
     observation = read_observation(write_fits("a.fits", cube, **cards), mask)

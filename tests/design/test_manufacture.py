@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchmask.design.drawing import save_dxf, save_svg
-from torchmask.design.manufacture import amplitude_map, load_mask, save_fits, save_json
+from torchmask.design.manufacture import amplitude_map, load_mask, mask_wavelength, save_fits, save_json
 from torchmask.optics.aperture import FullAperture, SparseAperture
 
 SAVE = {".json": save_json, ".dxf": save_dxf, ".svg": save_svg, ".fits": save_fits}
@@ -176,3 +176,21 @@ def test_maps_too_coarse_for_the_holes_are_refused(golay6):
 def test_files_of_no_folder_are_refused(tmp_path):
     with pytest.raises(ValueError, match="no folder"):
         save_json(Path(tmp_path / "absent" / "mask.json"), masks()["discs"])
+
+
+def test_json_holds_the_wavelength_and_does_without(tmp_path):
+    mask = masks()["niriss"]
+    for name, wavelength in (("with.json", 4.8e-6), ("without.json", None)):
+        save_json(tmp_path / name, mask, wavelength)
+        assert mask_wavelength(tmp_path / name) == wavelength
+        assert same_bits(load_mask(tmp_path / name), mask)
+    save_fits(tmp_path / "mask.fits", mask)
+    assert mask_wavelength(tmp_path / "mask.fits") is None
+    record = json.loads((tmp_path / "with.json").read_text())
+    for wrong in ("4.8 um", -1.0, 0, True, [4.8e-6]):
+        (tmp_path / "wrong.json").write_text(json.dumps(record | {"wavelength": wrong}))
+        with pytest.raises(ValueError, match=r"wrong\.json: its wavelength is .*, which is no length in m"):
+            mask_wavelength(tmp_path / "wrong.json")
+    with pytest.raises(ValueError, match=r"wavelength is -1\.0: it must be finite and positive, in m"):
+        save_json(tmp_path / "new.json", mask, -1.0)
+    assert not (tmp_path / "new.json").exists()

@@ -55,7 +55,7 @@ def run(options: Options) -> None:
             n_modes=options.n_modes,
             callback=output.callback,
         )
-        save_json(output.directory / "mask.json", found.aperture)
+        save_json(output.directory / "mask.json", found.aperture, seen.grid.wavelength)
         write_json(output.directory / "calibration.json", estimates(found, options.stacks))
         output.summary.append(str(found))
 

@@ -130,7 +130,7 @@ def run(options: Options) -> None:
                 _save_interrupted(output.directory, options, last[0], rules)
             raise
         seconds = time.perf_counter() - started
-        _save_mask(output.directory, result.aperture, options.scale)
+        _save_mask(output.directory, result.aperture, options)
         log_design(result, criterion.grid, output.logger, rules)
         table = metrics(result, criterion) | {"evaluations": result.evaluations, "seconds": seconds}
         table["machining"] = machining(criterion, result.aperture, options.seed)
@@ -200,11 +200,11 @@ def metrics(result: SearchResult, criterion: AsymptoticMSE) -> dict[str, object]
     return table
 
 
-def _save_mask(directory: Path, aperture: SparseAperture, scale: float) -> None:
-    save_json(directory / "mask.json", aperture)
+def _save_mask(directory: Path, aperture: SparseAperture, options: Options) -> None:
+    save_json(directory / "mask.json", aperture, options.wavelength)
     save_fits(directory / "mask.fits", aperture, max(512, least_pixels(aperture)))
-    save_svg(directory / "mask.svg", aperture, scale)
-    save_dxf(directory / "mask.dxf", aperture, scale)
+    save_svg(directory / "mask.svg", aperture, options.scale)
+    save_dxf(directory / "mask.dxf", aperture, options.scale)
 
 
 def _save_interrupted(directory: Path, options: Options, record: Record, rules: Sequence[Constraint]) -> None:
@@ -212,6 +212,6 @@ def _save_interrupted(directory: Path, options: Options, record: Record, rules: 
     diameter = hole_diameter(options.n_subapertures, options.mask_diameter, options.fill_factor)
     best = SparseAperture(record.arrays["centers"], diameter, options.mask_diameter)
     try:
-        _save_mask(directory, project(best, (InsideDisc(), NoOverlap(), *rules)), options.scale)
+        _save_mask(directory, project(best, (InsideDisc(), NoOverlap(), *rules)), options)
     except ValueError as error:  # its centres are still in the checkpoint
         warnings.warn(f"the best mask so far is not feasible, and not written: {error}", stacklevel=2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -11,7 +12,7 @@ import tyro
 
 from torchmask.cli.options import CatalogOptions, DebugOptions, is_mask_file, load_mask_file, require_apart
 from torchmask.design.drawing import LIFE_SIZE, save_dxf, save_svg
-from torchmask.design.manufacture import save_fits, save_json
+from torchmask.design.manufacture import mask_wavelength, save_fits, save_json
 from torchmask.design.redundancy import analyse_redundancy
 from torchmask.io import atomic_write
 from torchmask.optics import catalog
@@ -69,13 +70,15 @@ def listing() -> str:
 def show(name: str, options: Options) -> None:
     """Print what is known of a mask, and write it to a file if that is wanted."""
     if is_mask_file(Path(name)):
-        entry, aperture = None, load_mask_file(name, options)
+        entry, aperture, wavelength = None, load_mask_file(name, options), mask_wavelength(name)
     else:
-        entry = catalog.entry(name)
+        entry, wavelength = catalog.entry(name), None
         aperture = _from_catalog(entry, options)
     if options.out is not None:
-        write(options.out, require_apart(name, aperture, options.allow_overlap), options.scale)
+        write(options.out, require_apart(name, aperture, options.allow_overlap), options.scale, wavelength)
     print(describe(aperture, entry))
+    if wavelength is not None:
+        print(f"for light of {wavelength:.4g} m")
     if options.out is not None:
         print(f"written to {options.out}")
 
@@ -108,10 +111,13 @@ def describe(aperture: SparseAperture, mask: catalog.CatalogEntry | None = None)
     return "\n".join(lines)
 
 
-def write(path: Path, aperture: SparseAperture, scale: float | None = None) -> None:
-    """Write a mask, or its picture, to a new file of the kind that the suffix says; `scale` is for drawings."""
+def write(path: Path, aperture: SparseAperture, scale: float | None = None, wavelength: float | None = None) -> None:
+    """Write a mask, or its picture, to a new file of the kind that the suffix says.
+
+    `scale` is for drawings; a .json file holds the wavelength [m].
+    """
     drawings = {".dxf": save_dxf, ".svg": save_svg}
-    others = {".json": save_json, ".fits": save_fits, ".png": _save_png}
+    others = {".json": partial(save_json, wavelength=wavelength), ".fits": save_fits, ".png": _save_png}
     kind = path.suffix.lower()
     if kind in drawings:
         drawings[kind](path, aperture, LIFE_SIZE if scale is None else scale)

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from torchmask.design.manufacture import load_mask
+from torchmask.design.manufacture import load_mask, mask_wavelength
 from torchmask.optics.aperture import Aperture, FullAperture, SparseAperture
 from torchmask.optics.overlaps import check_overlaps
 from torchmask.record import Callback
@@ -152,6 +152,11 @@ def load_aperture(options: MaskOptions) -> Aperture:
     except ValueError as error:
         raise ValueError(f"--mask {name}: {error}") from error
     return require_apart(name, mask, options.allow_overlap)
+
+
+def told_wavelength(options: MaskOptions) -> float | None:
+    """The wavelength [m] that the file of the mask holds; None for a mask without one."""
+    return mask_wavelength(options.mask) if options.mask is not None and is_mask_file(options.mask) else None
 
 
 def is_mask_file(path: Path) -> bool:

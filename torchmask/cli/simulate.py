@@ -10,7 +10,7 @@ import torch
 from torchmask.atmosphere.layers import Layers
 from torchmask.atmosphere.phase import LayeredPhase, TurbulencePhase
 from torchmask.atmosphere.profiles import named_layers
-from torchmask.cli.options import MaskOptions, RunOptions, load_aperture, require_wavelength
+from torchmask.cli.options import MaskOptions, RunOptions, load_aperture, require_wavelength, told_wavelength
 from torchmask.cli.report import log_observation
 from torchmask.cli.run import new_run
 from torchmask.grid import ARCSEC, Grid
@@ -120,8 +120,8 @@ class Options(MaskOptions, RunOptions):
 
     scene: SceneOptions = field(default_factory=SceneOptions)
     """The target."""
-    wavelength: float = 550e-9
-    """Of the observation [m]."""
+    wavelength: float | None = None
+    """Of the observation [m]; None: that which the mask was designed for, as its .json file says."""
     n_pixels: int = 128
     """Of the image, per side."""
     pixel_scale_arcsec: float | None = None
@@ -146,22 +146,36 @@ class Options(MaskOptions, RunOptions):
     """Of the turbulence and the noise."""
 
 
+def observing_wavelength(options: Options) -> float:
+    """The wavelength [m] that is given, or else the mask's. Raises ValueError if there is neither."""
+    if options.wavelength is not None:
+        require_wavelength(options.wavelength)
+        return options.wavelength
+    told = told_wavelength(options)
+    if told is None:
+        raise ValueError(
+            f"--wavelength is missing: give it in m, such as 550e-9. --mask {options.mask} holds none, "
+            "unlike the mask.json of `torchmask design`"
+        )
+    return told
+
+
 def run(options: Options) -> None:
     """Simulate, and write the stack."""
     told = load_aperture(options)
     true = options.true_mask.apply(told)
     aperture = true or told
-    require_wavelength(options.wavelength)
-    conditions = options.conditions.make(options.turbulence.exposure_time, options.wavelength)
-    turbulence = options.turbulence.make(options.r0, options.wavelength, options.outer_scale)
+    wavelength = observing_wavelength(options)
+    conditions = options.conditions.make(options.turbulence.exposure_time, wavelength)
+    turbulence = options.turbulence.make(options.r0, wavelength, options.outer_scale)
     if options.pixel_scale_arcsec is None:
         # Real masks may reach beyond their nominal pupil.
         diameter = max(told.mask_diameter, told.extent, aperture.extent)
-        shortest = options.wavelength if conditions.band is None else conditions.band.shortest
+        shortest = wavelength if conditions.band is None else conditions.band.shortest
         finest = Grid.nyquist(diameter, shortest, options.n_pixels)
-        grid = Grid(options.n_pixels, finest.pixel_scale, options.wavelength)
+        grid = Grid(options.n_pixels, finest.pixel_scale, wavelength)
     else:
-        grid = Grid(options.n_pixels, options.pixel_scale_arcsec * ARCSEC, options.wavelength)
+        grid = Grid(options.n_pixels, options.pixel_scale_arcsec * ARCSEC, wavelength)
     detector = Detector(options.readout_noise)
     scene = make_scene(grid.shape, options.n_photons, options.scene)
     with new_run("simulate", options, options.seed) as output:
@@ -175,7 +189,7 @@ def run(options: Options) -> None:
         observation.save(output.directory / "stack.npz")
         log_observation("observation", observation, output.logger)
         if isinstance(turbulence, LayeredPhase):
-            output.summary.append(turbulence.layers.describe(options.wavelength))
+            output.summary.append(turbulence.layers.describe(wavelength))
         assert observation.transmission is not None
         light = observation.frames.mean() - conditions.sky
         kept = float(light * math.prod(grid.shape) / (options.n_photons * observation.transmission.mean()))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from torchmask.cli.options import MaskOptions, load_aperture
+from torchmask.cli.options import MaskOptions, load_aperture, told_wavelength
 from torchmask.data.observe import read_observation
 from torchmask.grid import ARCSEC, Grid
 from torchmask.observation import Observation, check_frames
@@ -46,7 +46,7 @@ class StackOptions(MaskOptions, FITSOptions):
     """What an observer may know better than the files."""
 
     wavelength: float | None = None
-    """Of the observation [m]; None: as the file says."""
+    """Of the observation [m]; None: as the file says, or else the .json file of the mask."""
     pixel_scale_arcsec: float | None = None
     """Angle on the sky of one pixel [arcsec]; None: as the file says."""
     readout_noise: float | None = None
@@ -108,6 +108,7 @@ def _from_fits(files: Sequence[Path], options: StackOptions) -> Observation:
     scale = options.pixel_scale_arcsec
     given = {item.name: getattr(options, item.name) for item in dataclasses.fields(FITSOptions)}
     given |= {"wavelength": options.wavelength, "readout_noise": options.readout_noise}
+    given |= {"design_wavelength": told_wavelength(options)}
     try:
         return read_observation(files, aperture, pixel_scale=None if scale is None else scale * ARCSEC, **given)
     except ValueError as error:

@@ -59,8 +59,8 @@ def pixel_scale(header: Any, path: Any, given: float | None) -> float:
     return math.sqrt(abs(np.linalg.det(matrix)))
 
 
-def wavelength(header: Any, path: Any, given: float | None) -> float:
-    """Wavelength [m]: WAVELEN or WAVELNTH, else the FILTER of a known INSTRUME (`FILTERS`).
+def wavelength(header: Any, path: Any, given: float | None, fallback: float | None = None) -> float:
+    """Wavelength [m]: WAVELEN or WAVELNTH, else the FILTER of a known INSTRUME (`FILTERS`), else `fallback`.
 
     Raises ValueError if nothing tells it, or the card can not be in metres.
     """
@@ -74,6 +74,8 @@ def wavelength(header: Any, path: Any, given: float | None) -> float:
     band = filter_of_header(header)
     if band is not None:
         return band.wavelength
+    if fallback is not None:
+        return fallback
     instrument, name = (str(header.get(card, "")).strip().upper() for card in ("INSTRUME", "FILTER"))
     known = ", ".join(" ".join(names) for names in FILTERS)
     what = f" (FILTER is {name!r} of INSTRUME {instrument!r}; known: {known})" if name else ""

@@ -25,6 +25,7 @@ def read_observation(
     aperture: Aperture,
     *,
     wavelength: float | None = None,
+    design_wavelength: float | None = None,
     pixel_scale: float | None = None,
     unit: str | None = None,
     gain: float | None = None,
@@ -51,6 +52,8 @@ def read_observation(
         That they were taken through, in metres on the pupil, x and y along the image's columns and rows.
     wavelength : float, optional
         [m]. Header: WAVELEN, or the FILTER of a known instrument.
+    design_wavelength : float, optional
+        That the mask was made for [m]: it counts where the header tells none.
     pixel_scale : float, optional
         [rad]. Header: PIXELSCL [arcsec], or CD, PC or CDELT.
     unit : str, optional
@@ -90,13 +93,13 @@ def read_observation(
     >>> observation.frames.shape, observation.readout_noise
     (torch.Size([5, 32, 32]), 1.5)
     """
-    _check_options(wavelength, pixel_scale, gain, exposure_time, readout_noise, crop, keep, keep_by)
+    _check_options(wavelength, design_wavelength, pixel_scale, gain, exposure_time, readout_noise, crop, keep, keep_by)
     if target is not None and crop is None:
         raise ValueError(f"target is {target}, the middle of the field to cut out: give crop [pixels] too")
     files = [read_fits(path) for path in ([paths] if isinstance(paths, str | Path) else list(paths))]
     if not files:
         raise ValueError("paths is empty: give at least one FITS file")
-    lengths = [keywords.wavelength(file.header, file.path, wavelength) for file in files]
+    lengths = [keywords.wavelength(file.header, file.path, wavelength, design_wavelength) for file in files]
     scales = [keywords.pixel_scale(file.header, file.path, pixel_scale) for file in files]
     _check_alike(files, lengths, scales)
     options = (unit, gain, exposure_time)
@@ -146,6 +149,7 @@ def _mean_exposure(files: Sequence[FITSImages], times: Sequence[float | None]) -
 
 def _check_options(
     wavelength: float | None,
+    design_wavelength: float | None,
     pixel_scale: float | None,
     gain: float | None,
     exposure_time: float | None,
@@ -156,6 +160,7 @@ def _check_options(
 ) -> None:
     positive = {
         "wavelength": (wavelength, "m"),
+        "design_wavelength": (design_wavelength, "m"),
         "pixel_scale": (pixel_scale, "rad"),
         "gain": (gain, "electrons per adu"),
         "exposure_time": (exposure_time, "s"),

@@ -26,15 +26,20 @@ _FORMAT = "torchmask mask, version 1"
 _DTYPES = {"float64": torch.float64, "float32": torch.float32}
 
 
-def save_json(path: str | Path, aperture: SparseAperture) -> None:
+def save_json(path: str | Path, aperture: SparseAperture, wavelength: float | None = None) -> None:
     """Write a mask as JSON, in metres and radians; `load_mask` gives back every bit of it.
+
+    `wavelength` [m] is the one that the mask was designed or measured at; `mask_wavelength` gives it back.
 
     Raises
     ------
     ValueError
-        If `path` exists, its folder does not, or the aperture is a population of masks.
+        If `path` exists, its folder does not, the aperture is a population of masks, or the wavelength is not finite
+        and positive.
     """
     centers = require_one_mask(aperture)
+    if wavelength is not None and not (math.isfinite(wavelength) and wavelength > 0):
+        raise ValueError(f"wavelength is {wavelength}: it must be finite and positive, in m")
     record = {
         "format": _FORMAT,
         "units": {"length": "m", "angle": "rad"},
@@ -42,6 +47,8 @@ def save_json(path: str | Path, aperture: SparseAperture) -> None:
         "dtype": str(centers.dtype).removeprefix("torch."),
         "centers": centers.tolist(),
     }
+    if wavelength is not None:
+        record["wavelength"] = wavelength
     with atomic_write(path) as file:
         file.write(json.dumps(record, indent=1, allow_nan=False).encode())
 
@@ -146,16 +153,47 @@ def load_mask(path: str | Path) -> SparseAperture:
         raise ValueError(f"{path} is no mask that can be read: {error}") from error
 
 
+def mask_wavelength(path: str | Path) -> float | None:
+    """The wavelength [m] that a mask was written with; None if its file holds none, which only JSON can.
+
+    Raises
+    ------
+    ValueError
+        If `load_mask` could not read the file, or what it holds is no wavelength.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> path = Path(tempfile.mkdtemp()) / "golay6.json"
+    >>> save_json(path, SparseAperture.from_catalog("golay6", 1.0, 0.15), wavelength=550e-9)
+    >>> mask_wavelength(path)
+    5.5e-07
+    """
+    path = Path(path)
+    load_mask(path)
+    if path.suffix.lower() != ".json":
+        return None
+    value = _json_record(path).get("wavelength")
+    if value is not None and not (type(value) in (int, float) and math.isfinite(value) and value > 0):
+        raise ValueError(f"{path}: its wavelength is {value!r}, which is no length in m")
+    return value
+
+
 def _read_json(path: Path) -> SparseAperture:
-    record = json.loads(path.read_text(encoding="utf-8"))
-    if not isinstance(record, dict) or record.get("format") != _FORMAT:
-        raise ValueError(f"it does not say {_FORMAT!r} under 'format'")
+    record = _json_record(path)
     needed = ("shape", "subaperture_diameter", "mask_diameter", "centers", "dtype")
     missing = [key for key in needed if key not in record]
     if missing:
         raise ValueError(f"it lacks {', '.join(missing)}")
     centers = torch.tensor(record["centers"], dtype=torch.float64).to(_dtype(record["dtype"]))
     return read_mask(record | {"centers": centers})
+
+
+def _json_record(path: Path) -> dict[str, Any]:
+    record = json.loads(path.read_text(encoding="utf-8"))
+    if not isinstance(record, dict) or record.get("format") != _FORMAT:
+        raise ValueError(f"it does not say {_FORMAT!r} under 'format'")
+    return record
 
 
 def _read_fits(path: Path) -> SparseAperture:
