@@ -131,7 +131,7 @@ def test_unknown_things_are_said_to_be_unknown(tmp_path, mask, grid, expose_poin
 def test_what_is_not_finite_is_flagged(tmp_path, mask, grid, expose_points):
     observation = Observation(expose_points(mask, grid), mask, grid, 0.0)
     whole = frame_observables(observation)
-    broken = Observables(**{**vars(whole), "vis2_errors": torch.tensor([math.nan, 1, 1, 1, 1, 1])})
+    broken = Observables(**{**vars(whole), "vis2_covariance": torch.diag(torch.tensor([math.nan, 1, 1, 1, 1, 1]))})
     save_oifits(tmp_path / "a.fits", broken, observation, bandwidth=1e-8)
     flags = fits.getdata(tmp_path / "a.fits", "OI_VIS2")["FLAG"]
     assert flags.ravel().tolist() == [True] + 5 * [False]

@@ -1,59 +1,60 @@
-"""Visibilities and closure phases straight from the frames, by a fit of all fringes."""
+"""Visibilities and closure phases straight from the frames, by a fit of all fringes, freed of what noise adds."""
 
 from __future__ import annotations
-
-import math
 
 import torch
 from torch import Tensor
 
-from torchmask.grid import Grid
-from torchmask.interferometry.visibilities import (
-    Observables,
-    fringe_waves,
-    pairs_and_triangles,
-    sky_stations,
-    triangle_sides,
+from torchmask.interferometry.fringe_fit import (
+    FringeFit,
+    FringeModel,
+    PixelNoise,
+    complex_covariances,
+    fit_fringes,
 )
+from torchmask.interferometry.visibilities import Observables, sky_stations, triangle_sides
 from torchmask.observation import Observation, check_frames
-from torchmask.optics.aperture import Aperture
-
-_FIELD = 4  # the envelope of the fringes is computed on a field this many times as wide, against its wrap-around
-_WORST_CONDITION = 1e6  # of the normal equations of the fringes
+from torchmask.optics.noise import noise_variance
+from torchmask.optics.pixel import PixelResponse
 
 
-def frame_observables(observation: Observation) -> Observables:
+def frame_observables(observation: Observation, pixel: PixelResponse | None = None) -> Observables:
     """Visibilities and closure phases straight from the frames, without a restoration.
 
-    In each frame the fringes of all baselines are fitted together, by least squares over the valid pixels, under the
-    diffraction pattern of one hole: this averages the frame's Fourier transform over each baseline's patch with the
-    patch's own shape as weight. Products are then averaged over the frames, so that pistons cancel in |V|^2 and
-    closure phases.
+    In each frame the fringes of all baselines are fitted together, by least squares over the valid pixels weighed by
+    their noise, under the diffraction pattern of one hole: this averages the frame's Fourier transform over each
+    baseline's patch. Products are then averaged over the frames, so that pistons cancel in |V|^2 and closure phases.
 
     Parameters
     ----------
     observation : Observation
         Of a mask of two holes or more whose baselines can be told apart. Subtract the sky beforehand: it counts as
-        light without fringes.
+        light without fringes. Where its `readout_noise` is None it is measured, beyond the cut-off frequency.
+    pixel : PixelResponse, optional
+        How the detector's pixels blur the image, which lowers the fringes of long baselines most. None: pixels are
+        points.
 
     Returns
     -------
     Observables
-        As measured: not calibrated for what lowers the contrast of a point source (band width, aberrations within a
-        hole). Errors are the larger of the scatter over the frames and the noise (`errors`, or photon and read-out
-        noise) carried through the fit.
+        As measured: not calibrated for what lowers the contrast of a point source (band width, motion within an
+        exposure, aberrations within a hole): `Observables.calibrate` divides by a star. Variances are the larger of
+        the scatter over the frames and of the noise (`errors`, or photon and read-out noise) carried through the fit,
+        correlations are the mean of both, weighed as so many frames as there are observables count for the noise.
 
     Raises
     ------
     ValueError
         If the aperture has fewer than two sub-apertures, two baselines lie too close together for this field and
-        band to tell, or a frame is refused by `check_frames`.
+        band to tell, a frame is refused by `check_frames`, or the read-out noise is neither known nor measurable.
 
     Notes
     -----
-    What lies at an angle s from the brightest point is dimmed as the overlap of a hole's diffraction pattern with
-    itself shifted by s: a companion must lie well within wavelength / (hole diameter). |V|^2 is freed of its noise
-    bias; the triple product is not (its bias is of relative size N / electrons per frame).
+    The light's and the fringes' variances are subtracted from their squares, and of products of three all that the
+    noise of the pixels adds on average (Wirnitzer 1985, J. Opt. Soc. Am. A 2, 14, for photon noise): no mean is biased
+    by noise, however few the photons. All frames are centred where their mean is. What lies at an angle s from there
+    is dimmed as the overlap of a hole's diffraction pattern with itself shifted by s: a companion must lie well within
+    wavelength / (hole diameter).
 
     Examples
     --------
@@ -69,145 +70,146 @@ def frame_observables(observation: Observation) -> Observables:
     (True, True)
     """
     aperture, grid = observation.aperture, observation.grid
-    pairs, triangles = pairs_and_triangles(aperture)
+    model = FringeModel(aperture, grid, pixel)
     frames, valid = (values.cpu() for values in check_frames(observation.frames, observation.valid, grid))
-    readout, errors = observation.readout_noise or 0.0, observation.errors
-    variance = frames.clamp(min=0) + readout**2 if errors is None else errors.double().cpu() ** 2
-    envelope = _Envelope(aperture, grid)
-    waves = fringe_waves(aperture, grid, pairs)
-    fits = [_fit_fringes(*frame, envelope, waves, aperture) for frame in zip(frames, valid, variance, strict=True)]
-    light, fringes, covariance = (torch.stack(values) for values in zip(*fits, strict=True))
-    size = len(pairs)
-    diagonal = covariance.diagonal(dim1=1, dim2=2)
-    noise = diagonal[:, 1 : 1 + size] + diagonal[:, 1 + size :]  # E|n|^2
-    logarithms = _log_jacobian(light, fringes)
+    fit = fit_fringes(frames, valid, _pixel_noise(observation, frames, valid), model)
     n = aperture.n_subapertures
-    values, noise = fringes * n, noise * n**2
-    visibilities, visibility_errors = _ratio(values, light, noise / 2)
-    power = (values.abs() ** 2 - noise).clamp(min=0)
-    vis2, vis2_errors = _ratio(
-        values.abs() ** 2 - noise, light**2, 4 * power**2 * _variance(logarithms.real, covariance) + noise**2
-    )
-    first, second, third = triangle_sides(pairs, triangles)
-    one, two, three = logarithms[:, first], logarithms[:, second], logarithms[:, third]
-    product = values[:, first] * values[:, second] * values[:, third].conj()
-    triple = product.sum(0)
-    turned = product * torch.polar(torch.ones_like(triple.abs()), -triple.angle())
-    _, sideways = _ratio(turned.imag, light**3, product.abs() ** 2 * _variance((one + two - three).imag, covariance))
-    amplitudes, triple_errors = _ratio(
-        turned.real, light**3, product.abs() ** 2 * _variance((one + two + three).real, covariance)
-    )
+    values, noise = fit.fringes * n, fit.fringe_noise * n**2
+    visibilities, visibility_errors = _ratio(values, fit.light, noise / 2)
+    vis2, vis2_covariance = _squares(fit, n)
+    triple, amplitudes_covariance, phases_covariance = _triples(fit, model, n)
     return Observables(
-        pairs,
-        triangles,
+        model.pairs,
+        model.triangles,
         sky_stations(observation),
         visibilities,
         visibility_errors,
         vis2,
-        vis2_errors,
+        vis2_covariance,
         triple.angle(),
-        sideways / amplitudes,
-        amplitudes,
-        triple_errors,
+        phases_covariance,
+        triple.abs(),
+        amplitudes_covariance,
     )
 
 
-class _Envelope:
-    """The diffraction pattern of one hole, at any place in the field."""
-
-    def __init__(self, aperture: Aperture, grid: Grid) -> None:
-        self.shape = grid.shape
-        self.wide = Grid((grid.shape[0] * _FIELD, grid.shape[1] * _FIELD), grid.pixel_scale, grid.wavelength)
-        self.nu_y, self.nu_x = self.wide.frequencies(torch.float64)
-        shift = torch.stack(torch.broadcast_tensors(self.nu_x, self.nu_y), -1) * grid.period
-        self.transfer = aperture.shape.otf(shift, aperture.subaperture_diameter)
-
-    def at(self, x: float, y: float) -> Tensor:
-        """(P,) the pattern around (x, y), pixels from [H // 2, W // 2]."""
-        height, width = self.shape
-        ramp = -2 * math.pi * (self.nu_x * (x + width // 2) + self.nu_y * (y + height // 2))
-        pattern = torch.fft.ifft2(self.transfer * torch.polar(torch.ones_like(ramp), ramp)).real
-        return pattern[:height, :width].flatten()
-
-    def centre(self, frame: Tensor) -> tuple[float, float]:
-        """(x, y) where a frame, blurred by the pattern, is brightest: to a fraction of a pixel, by a parabola."""
-        blurred = torch.fft.ifft2(torch.fft.fft2(frame, s=self.wide.shape) * self.transfer).real
-        blurred = blurred[: self.shape[0], : self.shape[1]]
-        row, column = divmod(int(blurred.argmax()), self.shape[1])
-        offsets = []
-        for place, line in ((column, blurred[row]), (row, blurred[:, column])):
-            offset = 0.0
-            if 0 < place < len(line) - 1:
-                before, here, after = line[place - 1 : place + 2].tolist()
-                offset = (before - after) / (2 * (before - 2 * here + after)) if before + after < 2 * here else 0.0
-            offsets.append(place + offset - len(line) // 2)
-        return offsets[0], offsets[1]
+def _pixel_noise(observation: Observation, frames: Tensor, valid: Tensor) -> PixelNoise:
+    """The noise of frames (T, H, W), without bias where it is counted from the frames themselves."""
+    if observation.errors is not None:
+        return PixelNoise(observation.errors.double().cpu() ** 2, is_own=False, light=frames)
+    readout = observation.readout_noise
+    if readout is None:
+        measured = noise_variance(frames, observation.grid, observation.aperture, valid)
+        if measured is None:
+            raise ValueError(
+                "readout_noise is None, and the grid has no frequencies beyond the cut-off to measure it at: give it "
+                "[electrons rms], or errors"
+            )
+        readout = max(0.0, measured - float(frames.mean())) ** 0.5
+    return PixelNoise(frames + readout**2, is_own=True, light=frames)
 
 
-def _fit_fringes(
-    frame: Tensor, valid: Tensor, variance: Tensor, envelope: _Envelope, waves: Tensor, aperture: Aperture
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Light (), fringes (B,) complex, and the covariance (1 + 2 B, 1 + 2 B) of light, real and imaginary parts.
-
-    frame = envelope (light + 2 Re sum of fringes exp(2 pi i nu . x)), linear in light, real and imaginary parts.
-    """
-    good = valid.flatten().double()
-    pattern = envelope.at(*envelope.centre(frame)) * good
-    columns = torch.cat([torch.ones_like(waves[:1].real), 2 * waves.real, -2 * waves.imag]) * pattern
-    normal = columns @ columns.T
-    values = torch.linalg.eigvalsh(normal)
-    if not values[0] * _WORST_CONDITION > values[-1]:
-        raise ValueError(
-            f"the fringes of some of the {len(waves)} baselines cannot be told apart: {_closest(aperture)}; use "
-            "restored_observables, a mask without redundant baselines or a wider field"
-        )
-    estimator = torch.linalg.solve(normal, columns)
-    light, real, imaginary = (estimator @ frame.flatten()).split([1, len(waves), len(waves)])
-    covariance = (estimator * torch.where(valid, variance, 0.0).flatten()) @ estimator.T
-    return light[0], torch.complex(real, imaginary), covariance
+def _squares(fit: FringeFit, n_holes: int) -> tuple[Tensor, Tensor]:
+    """|V|^2 (B,) and its covariance (B, B)."""
+    squares = fit.values**2 - fit.covariance.diagonal(dim1=1, dim2=2)
+    light = squares[:, :1]
+    real, imaginary = squares[:, 1:].chunk(2, 1)
+    power = n_holes**2 * (real + imaginary)
+    ratio = power.sum(0) / light.sum()
+    # rest_b = sum over the parameters of weights_b (x^2 - variance), a quadratic form of Gaussian variables
+    each = n_holes**2 * torch.eye(len(ratio), dtype=ratio.dtype)
+    weights = torch.cat([-ratio[:, None], each, each], 1)
+    noise = torch.zeros_like(each)
+    for values, covariance in zip(fit.values, fit.covariance, strict=True):
+        slopes = weights * values
+        # the slopes' own noise counts 4 tr(M C M C) too many, of which 2 tr(M C M C) belong there
+        noise += 4 * slopes @ covariance @ slopes.T - 2 * weights @ covariance**2 @ weights.T
+    return ratio, _covariance(power - ratio * light, noise) / light.sum() ** 2
 
 
-def _log_jacobian(light: Tensor, fringes: Tensor) -> Tensor:
-    """(T, B, 1 + 2 B) complex: derivatives of ln(fringe / light) by light, real and imaginary parts of the fringes.
-
-    Photon noise ties the baselines of a triangle together, and all of them to the light; this carries it on.
-    """
-    inverse = torch.diag_embed(1 / fringes)
-    by_light = (-1 / light).to(fringes)[:, None, None].expand(*fringes.shape, 1)
-    return torch.cat([by_light, inverse, 1j * inverse], dim=-1)
-
-
-def _variance(rows: Tensor, covariance: Tensor) -> Tensor:
-    """Variance (T, M) of what has derivatives `rows` (T, M, P) by parameters with `covariance` (T, P, P)."""
-    return ((rows @ covariance) * rows).sum(-1)
-
-
-def _closest(aperture: Aperture) -> str:
-    """Words for the two baselines, of either direction, that lie closest together."""
-    centers = aperture.centers.detach().double()
-    pairs, _ = pairs_and_triangles(aperture)
-    baselines = centers[pairs[:, 1]] - centers[pairs[:, 0]]
-    both = torch.cat([baselines, -baselines])
-    distance = torch.linalg.vector_norm(both[:, None] - both, dim=-1).fill_diagonal_(math.inf)
-    first, second = divmod(int(distance.argmin()), len(both))
-    names = ["-".join(map(str, pairs[index % len(pairs)].tolist())) for index in (first, second)]
-    return (
-        f"those of holes {names[0]} and {names[1]} lie {float(distance.min()):.3g} m apart, with holes of "
-        f"{aperture.subaperture_diameter:.3g} m"
+def _triples(fit: FringeFit, model: FringeModel, n_holes: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Triple products (C,) complex, and the covariances (C, C) of their amplitudes and phases."""
+    sides = triangle_sides(model.pairs, model.triangles)
+    first, second, third = sides
+    a, b, c = fit.fringes[:, first], fit.fringes[:, second], fit.fringes[:, third].conj()
+    ab, _ = complex_covariances(fit.covariance, first, second)
+    _, ac = complex_covariances(fit.covariance, first, third)
+    _, bc = complex_covariances(fit.covariance, second, third)
+    products = n_holes**3 * (a * b * c - a * bc - b * ac - c * ab + fit.cubes[:, 1:])
+    light = fit.light**3 - 3 * fit.light * fit.covariance[:, 0, 0] + fit.cubes[:, 0].real
+    triple = products.sum(0) / light.sum()
+    turn = torch.polar(torch.ones_like(triple.abs()), -triple.angle())
+    noise = _triple_noise(fit, sides, turn, n_holes)
+    rest = products * turn - triple.abs() * light[:, None]
+    along, across = (
+        _covariance(part, of) / light.sum() ** 2 for part, of in zip((rest.real, rest.imag), noise, strict=True)
     )
+    amplitudes = triple.abs()
+    return triple, along, across / (amplitudes[:, None] * amplitudes)
+
+
+def _triple_noise(
+    fit: FringeFit, sides: tuple[Tensor, Tensor, Tensor], turn: Tensor, n_holes: int
+) -> tuple[Tensor, Tensor]:
+    """Covariances (C, C), summed over frames, that the noise leaves along the mean triple products and across them.
+
+    To first order, which is right for bright frames; where the noise is as strong as the fringes, variances are set
+    right by what independent fringes of the same power and noise have.
+    """
+    n_triangles, size = len(turn), fit.fringes.shape[1]
+    rows = torch.arange(n_triangles)
+    along = torch.zeros(n_triangles, n_triangles, dtype=torch.float64)
+    across = torch.zeros_like(along)
+    for values, light, covariance in zip(fit.fringes, fit.light, fit.covariance, strict=True):
+        a, b, c = (values[side] for side in sides)
+        slopes = torch.zeros(n_triangles, 1 + 2 * size, dtype=torch.complex128)
+        for side, others, sign in zip(sides, (b * c.conj(), a * c.conj(), a * b), (1, 1, -1), strict=True):
+            slopes[rows, 1 + side] += others
+            slopes[rows, 1 + size + side] += sign * 1j * others
+        slopes = n_holes**3 * turn[:, None] * slopes
+        slopes[:, 0] = -3 * n_holes**3 * (turn * a * b * c.conj()).real / light
+        along += slopes.real @ covariance @ slopes.real.T
+        across += slopes.imag @ covariance @ slopes.imag.T
+    noise = fit.fringe_noise.mean(0)
+    power = ((fit.fringes.abs() ** 2).mean(0) - noise).clamp(min=0)
+    p, e = (torch.stack([values[side] for side in sides]) for values in (power, noise))
+    whole = (p + e).prod(0)
+    naive = whole * (e / (p + e)).sum(0)
+    share = ((whole - p.prod(0)) / naive.clamp(min=torch.finfo(p.dtype).tiny)).clamp(max=1).sqrt()
+    return along * share[:, None] * share, across * share[:, None] * share
+
+
+def _covariance(rest: Tensor, noise: Tensor) -> Tensor:
+    """Covariance (M, M) of sums over frames: their scatter, `rest` (T, M), or `noise` (M, M) where that is more.
+
+    Few frames leave a covariance that is singular and full of chance. As a prior the noise's correlations count like M
+    frames.
+    """
+    n, size = rest.shape
+    variance = noise.diagonal()
+    if n > 1:
+        scatter = rest.T @ rest * (n / (n - 1))
+        variance = torch.maximum(variance, scatter.diagonal())
+        noise = (size * _correlation(noise) + n * _correlation(scatter)) / (size + n)
+    deviation = variance.clamp(min=0).sqrt()
+    return _correlation(noise) * deviation[:, None] * deviation
+
+
+def _correlation(covariance: Tensor) -> Tensor:
+    scale = covariance.diagonal().clamp(min=torch.finfo(covariance.dtype).tiny).rsqrt()
+    return covariance * scale[:, None] * scale
 
 
 def _ratio(values: Tensor, scale: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
     """sum(values) / sum(scale) over frames and its error: scatter over the frames or noise, whichever is larger.
 
-    values (T, M) real or complex; scale (T,) positive; noise (T, M) the variance of a real part.
+    values (T, M) complex; scale (T,) positive; noise (T, M) the variance of a real part.
     """
     total = scale.sum()
     ratio = values.sum(0) / total
-    error = noise.sum(0).sqrt() / total
+    error = noise.sum(0).clamp(min=0).sqrt() / total
     n = len(values)
     if n > 1:
-        rest = values - ratio * scale[:, None]
-        square = (rest.abs() ** 2).sum(0) / (2 if rest.is_complex() else 1)
+        square = ((values - ratio * scale[:, None]).abs() ** 2).sum(0) / 2
         error = torch.maximum(error, (square * n / (n - 1)).sqrt() / total)
     return ratio, error

@@ -38,9 +38,10 @@ class Observables(Brief):
     stations : (N, 2) centres of the holes, (u, v) towards east and north [m]
     visibilities : (B,) complex; from frames, pistons and all
     visibility_errors : (B,) rms of the amplitude, and of the phase times the amplitude
-    vis2, vis2_errors : (B,) |V|^2
-    closure_phases, closure_errors : (C,) rad
-    triple_amplitudes, triple_errors : (C,) |V_ij V_jk V_ki|
+    vis2, vis2_covariance : (B,) and (B, B), |V|^2
+    closure_phases, closure_covariance : (C,) rad and (C, C); triangles share baselines, so it has no inverse from four
+        holes on unless each triangle has noise of its own
+    triple_amplitudes, triple_covariance : (C,) and (C, C), |V_ij V_jk V_ki|
 
     Examples
     --------
@@ -48,9 +49,9 @@ class Observables(Brief):
     >>> one, none = torch.ones(1, dtype=torch.float64), torch.zeros(0, dtype=torch.float64)
     >>> point = Observables(
     ...     torch.tensor([[0, 1]]), torch.zeros(0, 3, dtype=torch.int64), stations, one + 0j, 0.01 * one,
-    ...     one, 0.02 * one, none, none, none, none)
-    >>> float(point.vis2[0])
-    1.0
+    ...     one, 0.0004 * one[:, None], none, none[:, None], none, none[:, None])
+    >>> float(point.vis2[0]), float(point.vis2_errors[0])
+    (1.0, 0.02)
     """
 
     pairs: Tensor
@@ -59,11 +60,26 @@ class Observables(Brief):
     visibilities: Tensor
     visibility_errors: Tensor
     vis2: Tensor
-    vis2_errors: Tensor
+    vis2_covariance: Tensor
     closure_phases: Tensor
-    closure_errors: Tensor
+    closure_covariance: Tensor
     triple_amplitudes: Tensor
-    triple_errors: Tensor
+    triple_covariance: Tensor
+
+    @property
+    def vis2_errors(self) -> Tensor:
+        """(B,) rms of |V|^2."""
+        return self.vis2_covariance.diagonal().sqrt()
+
+    @property
+    def closure_errors(self) -> Tensor:
+        """(C,) rms of the closure phases [rad]."""
+        return self.closure_covariance.diagonal().sqrt()
+
+    @property
+    def triple_errors(self) -> Tensor:
+        """(C,) rms of the amplitudes of triple products."""
+        return self.triple_covariance.diagonal().sqrt()
 
     @property
     def baselines(self) -> Tensor:
@@ -142,8 +158,10 @@ def restored_observables(result: Restored, observation: Observation) -> Observab
     power = values.abs() ** 2
     first, second, third = triangle_sides(pairs, triangles)
     triple = values[first] * values[second] * values[third].conj()
-    relative = total / power.clamp(min=torch.finfo(power.dtype).tiny) / 2
-    relative = relative[first] + relative[second] + relative[third]
+    relative = total / power.clamp(min=torch.finfo(power.dtype).tiny) / 2  # of an amplitude's, and a phase's, variance
+    sides = torch.nn.functional.one_hot(torch.stack([first, second, third]), len(pairs)).to(relative)
+    signs = torch.tensor([1.0, 1.0, -1.0], dtype=relative.dtype)
+    amplitudes, phases = sides.sum(0), (signs[:, None, None] * sides).sum(0)  # (C, B), of the logarithm
     return Observables(
         pairs,
         triangles,
@@ -151,11 +169,11 @@ def restored_observables(result: Restored, observation: Observation) -> Observab
         values,
         (total / 2).sqrt(),
         power,
-        (2 * power * total + total**2 + 4 * power**2 * of_light).sqrt(),
+        (2 * power * total + total**2).diag() + 4 * of_light * power[:, None] * power,
         triple.angle(),
-        relative.sqrt(),
+        (phases * relative) @ phases.T,
         triple.abs(),
-        triple.abs() * (relative + 9 * of_light).sqrt(),
+        triple.abs()[:, None] * triple.abs() * ((amplitudes * relative) @ amplitudes.T + 9 * of_light),
     )
 
 

@@ -1,8 +1,7 @@
-"""How strong the noise of a stack of frames is, told by the frames themselves."""
+"""How strong the noise of a stack of frames is: what is known of it beside what the frames tell."""
 
 from __future__ import annotations
 
-import math
 import warnings
 
 import numpy as np
@@ -11,48 +10,9 @@ from torch import Tensor
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture
-from torchmask.restoration.conjugate import conjugate_gradients
+from torchmask.optics.noise import noise_variance
 
-_ITERATIONS = 30  # of the search for what dead pixels would hold
 _CLEARLY_MORE = 1.1  # than expected: a few times the error of what one small frame tells
-
-
-def noise_variance(frames: Tensor, grid: Grid, aperture: Aperture, valid: Tensor | None = None) -> float | None:
-    """Mean noise variance of a pixel [electrons^2], from the frequencies that the aperture cannot transmit.
-
-    White noise has the same power at all frequencies, and beyond the cut-off there is nothing else. The median over
-    frequencies (of the power averaged over T frames, a gamma variable) leaves out the cross of a bright border.
-    None if fewer than eight frequencies lie beyond the cut-off.
-
-    Pixels that are not `valid` (T, H, W) take the values that leave the least power there. That takes some of the
-    noise with it: as much as of white noise with the same holes.
-    """
-    nu_y, nu_x = grid.frequencies(frames.dtype, frames.device)
-    beyond = torch.hypot(nu_y, nu_x) > grid.cutoff(aperture.extent)
-    if int(beyond.sum()) < 8:
-        return None
-    n = len(frames)
-    median_over_mean = math.log(2) if n == 1 else (1 - 1 / (9 * n)) ** 3  # Wilson & Hilferty 1931
-    if valid is not None and not bool(valid.all()):
-        generator = torch.Generator().manual_seed(0)
-        white = torch.randn(frames.shape, dtype=frames.dtype, device="cpu", generator=generator).to(frames.device)
-        frames = _least_power(frames, valid, beyond)
-        median_over_mean = _median_power(_least_power(white * valid, valid, beyond), beyond)
-    return _median_power(frames, beyond) / median_over_mean
-
-
-def _median_power(frames: Tensor, beyond: Tensor) -> float:
-    return float((torch.fft.fft2(frames, norm="ortho").abs() ** 2)[..., beyond].mean(0).median())
-
-
-def _least_power(frames: Tensor, valid: Tensor, beyond: Tensor) -> Tensor:
-    """Frames whose pixels that are not valid make the power at the frequencies `beyond` (H, W) least."""
-    half = beyond[:, : beyond.shape[1] // 2 + 1]
-
-    def gradient(x: Tensor) -> Tensor:
-        return torch.where(valid, 0.0, torch.fft.irfft2(torch.fft.rfft2(x) * half, s=beyond.shape))
-
-    return frames + conjugate_gradients(gradient, -gradient(frames), lambda x: x, _ITERATIONS)
 
 
 def expected_variance(

@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from torchmask.metrics import lowpass
+from torchmask.optics.conjugate import Operator, conjugate_gradients
 from torchmask.restoration.adjoint import curvature
-from torchmask.restoration.conjugate import Operator, conjugate_gradients
 from torchmask.restoration.linearization import Linearization
 from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.priors import divergence, gradient

@@ -2,7 +2,7 @@
 
 import torch
 
-from torchmask.restoration.conjugate import conjugate_gradients
+from torchmask.optics.conjugate import conjugate_gradients
 
 
 def test_conjugate_gradients_solve():

@@ -1,0 +1,234 @@
+"""The fringes of all baselines fitted together to each frame, with the covariance that noise leaves."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchmask.grid import Grid
+from torchmask.interferometry.visibilities import fringe_waves, pairs_and_triangles, triangle_sides
+from torchmask.optics.aperture import Aperture
+from torchmask.optics.pixel import PixelResponse
+
+_FIELD = 4  # the envelope of the fringes is computed on a field this many times as wide, against its wrap-around
+_WORST_CONDITION = 1e6  # of the normal equations of the fringes
+_DARKEST = 1e-3  # of the largest noise variance: no pixel counts as less noisy than this
+
+
+@dataclass(frozen=True, eq=False)
+class FringeFit:
+    """The fringes of T frames: K = 1 + 2 B parameters each, the light and the fringes' real and imaginary parts.
+
+    values : (T, K) [electrons]
+    covariance : (T, K, K), by the noise of the pixels
+    cubes : (T, 1 + C) complex, what that noise adds to the cube of the light and to the product of the fringes of each
+        triangle, on average
+    """
+
+    values: Tensor
+    covariance: Tensor
+    cubes: Tensor
+
+    @property
+    def light(self) -> Tensor:
+        """(T,)"""
+        return self.values[:, 0]
+
+    @property
+    def fringes(self) -> Tensor:
+        """(T, B) complex."""
+        return as_complex(self.values[:, 1:])
+
+    @property
+    def fringe_noise(self) -> Tensor:
+        """(T, B) mean square of what noise adds to a fringe."""
+        return torch.stack(self.covariance.diagonal(dim1=1, dim2=2)[:, 1:].chunk(2, 1)).sum(0)
+
+
+@dataclass(frozen=True, eq=False)
+class PixelNoise:
+    """The noise of each pixel of the frames (T, H, W).
+
+    variance : [electrons^2]; it may be negative where it is an unbiased estimate
+    is_own : whether it is counted from the pixel's own light, with whose noise it then goes up and down
+    light : [electrons], whose third central moment is that of the noise, as that of a Poisson variable is its mean
+    """
+
+    variance: Tensor
+    is_own: bool
+    light: Tensor
+
+    @property
+    def third(self) -> Tensor:
+        """What the triple product of estimates needs once the products with their covariances have been taken off.
+
+        E(xyz) - XYZ = X cov(y, z) + Y cov(x, z) + Z cov(x, y) + third moment. Measured values in place of X, Y and Z
+        and a measured covariance whose noise goes with theirs take off three covariances (v, x) too many.
+        """
+        return 3 * self.variance - self.light if self.is_own else -self.light
+
+
+class FringeModel:
+    """The pattern of light and fringes of a mask, under the diffraction pattern of one hole and seen by pixels."""
+
+    def __init__(self, aperture: Aperture, grid: Grid, pixel: PixelResponse | None = None) -> None:
+        self.aperture, self.grid = aperture, grid
+        self.pairs, self.triangles = pairs_and_triangles(aperture)
+        height, width = grid.shape
+        self._wide = Grid((height * _FIELD, width * _FIELD), grid.pixel_scale, grid.wavelength)
+        self._nu_y, self._nu_x = self._wide.frequencies(torch.float64)
+        shift = torch.stack(torch.broadcast_tensors(self._nu_x, self._nu_y), -1) * grid.period
+        self._transfer = aperture.shape.otf(shift, aperture.subaperture_diameter)
+        self._seen = None if pixel is None else pixel.transfer(self._nu_y, self._nu_x)
+
+    def blur(self, image: Tensor) -> Tensor:
+        """An image (H, W), dark outside, through one hole."""
+        height, width = self.grid.shape
+        wide = torch.fft.ifft2(torch.fft.fft2(image, s=self._wide.shape) * self._transfer).real
+        return wide[:height, :width]
+
+    def centre(self, image: Tensor) -> tuple[float, float]:
+        """(x, y) where an image, blurred by one hole, is brightest: to a fraction of a pixel, by a parabola.
+
+        In pixels from [H // 2, W // 2].
+        """
+        blurred = self.blur(image)
+        row, column = divmod(int(blurred.argmax()), self.grid.shape[1])
+        offsets = []
+        for place, line in ((column, blurred[row]), (row, blurred[:, column])):
+            offset = 0.0
+            if 0 < place < len(line) - 1:
+                before, here, after = line[place - 1 : place + 2].tolist()
+                offset = (before - after) / (2 * (before - 2 * here + after)) if before + after < 2 * here else 0.0
+            offsets.append(place + offset - len(line) // 2)
+        return offsets[0], offsets[1]
+
+    def columns(self, x: float, y: float) -> Tensor:
+        """(K, P): frame = columns^T (light, real and imaginary parts of the fringes), around (x, y) [pixel].
+
+        A fringe of frequency nu, envelope(x) 2 Re(fringe exp(2 pi i nu . x)), goes through the pixels' response with
+        its envelope, so that patches of frequencies are seen as a whole.
+        """
+        height, width = self.grid.shape
+        ramp = -2 * math.pi * (self._nu_x * (x + width // 2) + self._nu_y * (y + height // 2))
+        spectrum = self._transfer * torch.polar(torch.ones_like(ramp), ramp)
+        envelope = torch.fft.ifft2(spectrum).real
+        waves = fringe_waves(self.aperture, self.grid, self.pairs)
+        if self._seen is None:
+            light, fringes = envelope[:height, :width].flatten(), waves * envelope[:height, :width].flatten()
+        else:
+            light = self._through_pixels(envelope).real
+            wide = self._wide_waves()
+            fringes = torch.stack([self._through_pixels(envelope * row[:, None] * column) for row, column in wide])
+        return torch.cat([light[None], 2 * fringes.real, -2 * fringes.imag])
+
+    def _wide_waves(self) -> list[tuple[Tensor, Tensor]]:
+        """exp(2 pi i nu . x) of every baseline on the wide field, as a factor for its rows and one for its columns."""
+        centers = self.aperture.centers.detach().double().cpu()
+        nu = (centers[self.pairs[:, 1]] - centers[self.pairs[:, 0]]) / self.grid.period
+        places = [
+            torch.arange(wide, dtype=torch.float64) - n // 2
+            for wide, n in zip(self._wide.shape, self.grid.shape, strict=True)
+        ]
+
+        def wave(turns: Tensor) -> Tensor:
+            return torch.polar(torch.ones_like(turns), 2 * math.pi * turns)
+
+        return [(wave(float(v) * places[0]), wave(float(u) * places[1])) for u, v in nu]
+
+    def _through_pixels(self, wide: Tensor) -> Tensor:
+        """(P,) of an image on the wide field."""
+        height, width = self.grid.shape
+        assert self._seen is not None
+        return torch.fft.ifft2(torch.fft.fft2(wide) * self._seen)[:height, :width].flatten()
+
+
+def fit_fringes(frames: Tensor, valid: Tensor, noise: PixelNoise, model: FringeModel) -> FringeFit:
+    """Weighted least squares over the valid pixels of each of `frames` (T, H, W), all centred where their mean is.
+
+    A centre of its own would follow the noise of a faint frame. Weights are one over the variance of the mean frame,
+    blurred by one hole: weights that know the noise of a pixel would prefer the low ones.
+
+    Raises ValueError if two baselines lie too close together to be told apart.
+    """
+    columns = model.columns(*model.centre(frames.mean(0)))
+    weights = _weights(noise.variance, valid, model)
+    values = frames.new_empty(len(frames), len(columns))
+    covariance = frames.new_empty(len(frames), len(columns), len(columns))
+    cubes = torch.empty(len(frames), 1 + len(model.triangles), dtype=torch.complex128)
+    same, group = torch.unique(valid.flatten(1), dim=0, return_inverse=True)
+    for number, good in enumerate(same):
+        chosen = (group == number).nonzero().flatten()
+        estimator = _estimator(columns, weights * good, model)
+        values[chosen] = frames[chosen].flatten(1) @ estimator.T
+        for frame in chosen.tolist():
+            covariance[frame] = (estimator * noise.variance[frame].flatten()) @ estimator.T
+        cubes[chosen] = _cubes(estimator, noise.third[chosen].flatten(1), model)
+    return FringeFit(values, covariance, cubes)
+
+
+def as_complex(parts: Tensor) -> Tensor:
+    """(..., B) complex from (..., 2 B) real and imaginary parts."""
+    real, imaginary = parts.chunk(2, -1)
+    return torch.complex(real, imaginary)
+
+
+def complex_covariances(covariance: Tensor, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
+    """E(f g) and E(f g*) of the fringes number `first` and `second` (M,), both (T, M), from `covariance` (T, K, K)."""
+    size = covariance.shape[-1] // 2
+    real, imaginary = slice(1, 1 + size), slice(1 + size, None)
+    rr, ii = covariance[:, real, real][:, first, second], covariance[:, imaginary, imaginary][:, first, second]
+    ri, ir = covariance[:, real, imaginary][:, first, second], covariance[:, imaginary, real][:, first, second]
+    return torch.complex(rr - ii, ri + ir), torch.complex(rr + ii, ir - ri)
+
+
+def _weights(variance: Tensor, valid: Tensor, model: FringeModel) -> Tensor:
+    """(P,) one over the variance of a pixel of the mean frame."""
+    counted = valid.double().mean(0)
+    mean = torch.where(valid, variance, 0.0).mean(0)
+    smooth = model.blur(mean) / model.blur(counted).clamp(min=torch.finfo(torch.float64).tiny)
+    smooth = smooth.clamp(min=_DARKEST * float(smooth.max()))
+    return 1 / smooth.flatten()
+
+
+def _estimator(columns: Tensor, weights: Tensor, model: FringeModel) -> Tensor:
+    """(K, P): parameters = estimator frame."""
+    weighted = columns * weights
+    normal = weighted @ columns.T
+    values = torch.linalg.eigvalsh(normal)
+    if not values[0] * _WORST_CONDITION > values[-1]:
+        raise ValueError(
+            f"the fringes of some of the {len(model.pairs)} baselines cannot be told apart: {_closest(model.aperture)};"
+            " use restored_observables, a mask without redundant baselines or a wider field"
+        )
+    return torch.linalg.solve(normal, weighted)
+
+
+def _cubes(estimator: Tensor, third: Tensor, model: FringeModel) -> Tensor:
+    """(T, 1 + C) sums over the pixels of the product of three estimators and `third` (T, P)."""
+    light, fringes = estimator[0], as_complex(estimator[1:].T).T
+    one, two, three = triangle_sides(model.pairs, model.triangles)
+    of_light = third @ light**3
+    found = [of_light.to(fringes)[:, None]]
+    for index in zip(one, two, three, strict=True):
+        a, b, c = (fringes[side] for side in index)
+        found.append((third.to(fringes) @ (a * b * c.conj()))[:, None])
+    return torch.cat(found, 1)
+
+
+def _closest(aperture: Aperture) -> str:
+    """Words for the two baselines, of either direction, that lie closest together."""
+    centers = aperture.centers.detach().double()
+    pairs, _ = pairs_and_triangles(aperture)
+    baselines = centers[pairs[:, 1]] - centers[pairs[:, 0]]
+    both = torch.cat([baselines, -baselines])
+    distance = torch.linalg.vector_norm(both[:, None] - both, dim=-1).fill_diagonal_(math.inf)
+    first, second = divmod(int(distance.argmin()), len(both))
+    names = ["-".join(map(str, pairs[index % len(pairs)].tolist())) for index in (first, second)]
+    return (
+        f"those of holes {names[0]} and {names[1]} lie {float(distance.min()):.3g} m apart, with holes of "
+        f"{aperture.subaperture_diameter:.3g} m"
+    )
