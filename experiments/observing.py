@@ -1,4 +1,7 @@
-"""What `anisoplanatism`, `exposure` and `band` share: one restoration under given conditions, and means over seeds."""
+"""What `anisoplanatism`, `exposure`, `band` and `rival_modes` share.
+
+One restoration under given conditions, and means over seeds.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,9 @@ from torchmask.optics.band import Band
 from torchmask.optics.detector import Detector
 from torchmask.optics.packing import hole_diameter
 from torchmask.record import Callback
+from torchmask.restoration.background import Background
 from torchmask.restoration.myopic import MyopicDeconvolution
+from torchmask.restoration.schedule import Schedule
 from torchmask.simulation.conditions import Conditions
 from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
@@ -95,7 +100,8 @@ def measure(task: Mapping[str, Any]) -> dict[str, Any]:
     """Simulate under the conditions of the task, restore by the library's defaults, and score.
 
     A task may say `layers` (heights [m] and their shares of the turbulence), `exposure` [tau0] and `band` [width over
-    wavelength]. The restoration is told the band; the rest it must bear.
+    wavelength]. The restoration is told the band; the rest it must bear. With `modes` it is the method as first
+    published, with so many modes for each hole, or of the full pupil.
     """
     aperture, mask = instrument(task), instrument({**task, "instrument": "mask"})
     grid = Grid.nyquist(DIAMETER, WAVELENGTH, task["n_pixels"], task.get("oversampling", 1.0))
@@ -114,8 +120,11 @@ def measure(task: Mapping[str, Any]) -> dict[str, Any]:
         conditions=conditions,
     )
     told = Band.top_hat(WAVELENGTH, width, 3) if width else Band.of([WAVELENGTH])
+    published = {"aberration_prior": False, "background": Background.NONE, "schedule": Schedule.plain()}
     method = MyopicDeconvolution(
-        aperture, grid, wavelengths=told.wavelengths, weights=told.shares, max_iterations=task["iterations"]
+        *(aperture, grid, task.get("modes")),
+        **{"wavelengths": told.wavelengths, "weights": told.shares, "max_iterations": task["iterations"]},
+        **(published if "modes" in task else {}),
     )
     result = method.restore(observation.frames)
     return {"score": relative_error(result.object, scene, grid.cutoff(DIAMETER)), "seconds": result.seconds}

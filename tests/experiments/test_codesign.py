@@ -7,10 +7,17 @@ from pathlib import Path
 import codesign
 import numpy as np
 import pytest
+import torch
 
-from torchmask.cli.codesign import Options, with_presets
+from torchmask.cli.codesign import ImagingOptions, Options, RestorationOptions, design_mask, inversion, with_presets
+from torchmask.cli.options import SearchOptions
 from torchmask.io import load_npz
+from torchmask.optics.aperture import FullAperture
 from torchmask.record import Record
+from torchmask.restoration.background import Background
+from torchmask.restoration.schedule import Schedule
+from torchmask.simulation.scene import SceneOptions
+from torchmask.spectra import PowerLawPSD
 from torchmask.tracking import RunLogger, read_metrics
 
 FIGURES = [
@@ -120,7 +127,31 @@ def test_the_paper_preset_is_the_published_method():
     config = with_presets(Options(preset="paper"))
     assert (config.design.method, config.design.refine) == ("cma", False)
     assert (config.restoration.n_modes, config.restoration.prior) == (3, False)
+    method = inversion(config, FullAperture(1.0), config.restoration.n_modes)
+    assert method.schedule == Schedule.plain()
+    assert method.background is Background.NONE
     assert with_presets(Options()) == Options()
+
+
+def test_the_inversion_is_told_the_turbulence_only_if_asked_for():
+    options, mask = Options(), FullAperture(1.0)
+    assert not inversion(options, mask, 6).known_r0
+    told = inversion(dataclasses.replace(options, restoration=RestorationOptions(told_turbulence=True)), mask, 6)
+    assert (told.recipe.r0, told.recipe.outer_scale) == (1 / 7, 20.0)
+
+
+def test_the_mask_is_designed_for_the_noise_and_the_scene_that_are_simulated(monkeypatch):
+    seen = []
+    monkeypatch.setattr("torchmask.cli.codesign.search", lambda options, criterion, *rest: seen.append(criterion))
+    imaging = ImagingOptions(n_pixels=40, n_photons=1e5, readout_noise=3.0)
+    options = Options(imaging=imaging, scene=SceneOptions(size=0.5))
+    design_mask(options, lambda record: None)
+    given = dataclasses.replace(options, design=SearchOptions(knee=1 / 7, n_frequencies=64))
+    design_mask(given, lambda record: None)
+    for criterion, knee in zip(seen, (1 / 20, 1 / 7), strict=True):
+        expected = PowerLawPSD(1.5, 1e5, knee)(criterion.grid)
+        torch.testing.assert_close(criterion.object_psd, expected)
+        assert float(criterion.noise_psd[0, 0]) == pytest.approx(1e5 + 40**2 * 3.0**2)
 
 
 def test_configurations_are_frozen():

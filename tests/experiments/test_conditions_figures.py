@@ -1,4 +1,4 @@
-"""The experiments on field, exposure and band: their closed forms, what they conclude, and tiny runs."""
+"""The experiments on field, exposure, band and modes: their closed forms, what they conclude, and tiny runs."""
 
 import json
 
@@ -7,10 +7,11 @@ import band
 import exposure
 import observing
 import pytest
+import rival_modes
 
 from torchmask.atmosphere.layers import Layers
 
-SCRIPTS = {"anisoplanatism": anisoplanatism, "exposure": exposure, "band": band}
+SCRIPTS = {"anisoplanatism": anisoplanatism, "exposure": exposure, "band": band, "rival_modes": rival_modes}
 
 
 @pytest.mark.parametrize(("ratio", "kept"), [(0.5, 0.940), (1.0, 0.832), (2.0, 0.620), (4.0, 0.378)])

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 
 import pytest
 import torch
@@ -16,6 +17,7 @@ from torchmask.record import Record
 from torchmask.restoration.calibration import calibrate, fit_of_frames, recalibrate, sharpen_noise_inflation
 from torchmask.restoration.candidates import Candidates, play_stage, with_candidates
 from torchmask.restoration.checkpoint import Ending, Progress, Status
+from torchmask.restoration.descent import descend
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.myopic import MyopicDeconvolution
@@ -83,6 +85,26 @@ def test_a_start_that_spends_its_iterations_ends(explained):
     assert progress.status is Status.START_LIMIT
     assert progress.decrease is None
     assert len(progress.costs) == 12
+
+
+@pytest.mark.parametrize("many_minima", [False, True])
+@pytest.mark.parametrize("segment", [1000, 6])
+def test_a_plain_course_is_one_cost_lowered_and_nothing_else(many_minima, segment, explained, explain):
+    objective = full_pupil(explain)[0] if many_minima else explained[0]
+    schedule = replace(Schedule.plain(), segment=segment)
+    traits = {"many_minima": many_minima, "prior_on_aberrations": False, "r0_is_open": True, "max_iterations": 12}
+    solver = solver_of(objective, schedule=schedule, **traits)
+    begun = solver.begin(Known(), None)
+    state = first = begun.state
+    for n_iterations in (6, 6) if segment == 6 else (12,):
+        state = descend(objective, state, n_iterations, ProjectedLBFGS(), lambda *news: None)
+    progress = solver.run(begun, True, lambda now: None)
+    assert (progress.starts, progress.escapes, len(progress.costs)) == (1, 0, 12)
+    torch.testing.assert_close(progress.state.image, state.image, rtol=0, atol=0)
+    torch.testing.assert_close(progress.state.z, state.z, rtol=0, atol=0)
+    assert first.calibration.noise_inflation.tolist() == [1.0] * len(objective.frames)
+    assert progress.state.calibration == first.calibration
+    assert all(after < before for before, after in pairwise(progress.costs))
 
 
 @pytest.mark.parametrize("max_iterations", [1, 3, 6, 7, 13, 18, 40])

@@ -28,8 +28,10 @@ from torchmask.optics.aperture import Aperture, FullAperture, SparseAperture
 from torchmask.optics.detector import Detector
 from torchmask.optics.packing import hole_diameter
 from torchmask.record import Callback, label_stage
+from torchmask.restoration.background import Background
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.result import RestorationResult
+from torchmask.restoration.schedule import Schedule
 from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
 from torchmask.spectra import NoisePSD
@@ -68,6 +70,10 @@ class RestorationOptions:
     """Weigh aberrations by their von Karman statistics."""
     max_iterations: int = 2800
     """Upper limit of iterations, of all starts together; one start takes 1000 at most."""
+    plain: bool = False
+    """One bounded L-BFGS on one cost: no further starts, repairs, frame weights or falling noise, and no sky."""
+    told_turbulence: bool = False
+    """Tell the restoration r0 and the outer scale of the simulation, which an observer does not know."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +90,7 @@ class Options(ExperimentOptions):
     """The target."""
     restoration: RestorationOptions = field(default_factory=RestorationOptions)
     preset: Literal["default", "paper"] = "default"
-    """`paper`: CMA-ES alone, piston and tip-tilt only, no aberration prior, as the seed method has it."""
+    """`paper`: CMA-ES alone, piston and tip-tilt only, no aberration prior, one plain L-BFGS, as first published."""
     seed: int = 0
     """Of the search, the turbulence and the noise."""
 
@@ -94,7 +100,7 @@ def with_presets(options: Options) -> Options:
     design, imaging, restoration = options.design, options.imaging, options.restoration
     if options.preset == "paper":
         design = dataclasses.replace(design, method="cma", refine=False)
-        restoration = dataclasses.replace(restoration, n_modes=3, prior=False)
+        restoration = dataclasses.replace(restoration, n_modes=3, prior=False, plain=True)
     if options.smoke:
         design = dataclasses.replace(design, n_subapertures=5, budget=200, n_frequencies=64)
         imaging = dataclasses.replace(imaging, n_pixels=64, n_frames=3)
@@ -117,15 +123,18 @@ def outside(options: Options) -> tuple[TurbulencePhase, Detector]:
 
 
 def inversion(options: Options, aperture: Aperture, n_modes: int | None) -> MyopicDeconvolution:
-    """The restoration, told what an observer knows: instrument, read-out noise and turbulence."""
+    """The restoration, told what an observer knows: instrument and read-out noise; turbulence only if asked for."""
     imaging, wanted = options.imaging, options.restoration
+    told = wanted.told_turbulence
     return MyopicDeconvolution(
         aperture,
         image_grid(options),
         n_modes=n_modes,
-        r0=imaging.diameter / imaging.d_over_r0,
-        outer_scale=imaging.outer_scale * imaging.diameter,
+        r0=imaging.diameter / imaging.d_over_r0 if told else None,
+        outer_scale=imaging.outer_scale * imaging.diameter if told else None,
         readout_noise=imaging.readout_noise,
+        background=Background.NONE if wanted.plain else Background.IF_SEEN,
+        schedule=Schedule.plain() if wanted.plain else None,
         aberration_prior=wanted.prior,
         max_iterations=wanted.max_iterations,
     )
@@ -142,11 +151,19 @@ def check(options: Options) -> None:
 
 
 def design_mask(options: Options, callback: Callback) -> SearchResult:
-    """Search for the mask that minimises MSE_a, with photon noise alone as in the reference case."""
+    """Search for the mask that minimises MSE_a, with the noise of the simulated detector and the size of the scene."""
     imaging = options.imaging
     grid = Grid.nyquist(imaging.diameter, imaging.wavelength, options.design.n_frequencies)
-    criterion = make_criterion(options.design, grid, NoisePSD(imaging.n_photons), imaging.n_frames)
-    return search(options.design, criterion, imaging.diameter, options.seed, callback)
+    noise = NoisePSD(imaging.n_photons, imaging.readout_noise, imaging.n_pixels**2)
+    wanted = dataclasses.replace(options.design, knee=scene_knee(options))
+    criterion = make_criterion(wanted, grid, noise, imaging.n_frames)
+    return search(wanted, criterion, imaging.diameter, options.seed, callback)
+
+
+def scene_knee(options: Options) -> float:
+    """What --design.knee says, or one over the larger side of the scene [cycles/pixel]."""
+    knee = options.design.knee
+    return 1 / (options.scene.size * options.imaging.n_pixels) if knee is None else knee
 
 
 def observe(options: Options, scene: torch.Tensor, aperture: Aperture, callback: Callback) -> Observation:

@@ -75,7 +75,8 @@ class Options(SearchOptions, RunOptions):
 
 def make_criterion(search: SearchOptions, grid: Grid, noise: NoisePSD, n_frames: int) -> AsymptoticMSE:
     """The asymptotic MSE that the options ask for."""
-    return AsymptoticMSE(grid, PowerLawPSD(search.exponent, noise.n_photons, search.knee), noise, n_frames=n_frames)
+    knee = PowerLawPSD.knee if search.knee is None else search.knee
+    return AsymptoticMSE(grid, PowerLawPSD(search.exponent, noise.n_photons, knee), noise, n_frames=n_frames)
 
 
 def search(

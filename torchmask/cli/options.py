@@ -100,8 +100,9 @@ class SearchOptions:
     """Frequency grid of the criterion, per side."""
     exponent: float = 1.5
     """Of the power-law power spectrum of the object."""
-    knee: float = 1 / 64
-    """Frequency below which that spectrum is flat [cycles/pixel]: one over the object's size in pixels."""
+    knee: float | None = None
+    """Frequency below which that spectrum is flat [cycles/pixel]: one over the object's size in pixels; None: 1/64, or
+    that of the scene which `codesign` simulates."""
 
 
 @dataclass(frozen=True, kw_only=True)

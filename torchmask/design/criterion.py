@@ -26,7 +26,8 @@ class AsymptoticMSE(nn.Module):
 
     MSE_a = mean over nu of S_o S_n / (K S_o (N^2 |h(nu)|^2 + sum_{m != n} |h(nu + nu_m - nu_n)|^2) + S_n), with h the
     OTF of one centred sub-aperture over the number of sub-apertures N, K the number of frames, S_o and S_n the PSDs.
-    Baselines wrap around the frequency torus. No linear restoration does better, whatever the pistons (Jensen).
+    Baselines wrap around the frequency torus. On average over the pistons no linear restoration does better (Jensen);
+    with single draws of them it may.
 
     Parameters
     ----------

@@ -102,7 +102,8 @@ class MyopicDeconvolution:
 
     Examples
     --------
-    The method as first published is `MyopicDeconvolution(mask, grid, n_modes=3, aberration_prior=False)`.
+    The method as first published is `MyopicDeconvolution(mask, grid, n_modes=3, aberration_prior=False,
+    background=Background.NONE, schedule=Schedule.plain())`.
 
     >>> from torchmask.optics.aperture import SparseAperture
     >>> mask = SparseAperture([[0.0, 0.3], [-0.3, -0.2], [0.3, -0.2]], 0.2, 1.0)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import pairwise
+
+_NO_LIMIT = 10**9  # iterations
 
 
 @dataclass(frozen=True)
@@ -11,6 +14,7 @@ class Schedule:
     """The course of a restoration, in iterations of its descents. All values were measured: docs/restoration.md.
 
     segment : iterations between two recalibrations of scales, transmissions, noise and turbulence
+    recalibrates : whether transmissions, noise and turbulence are, beside the scales of the variables
     start_iterations : of one start, at most
     sharp_after : iterations after which the object is sharp enough to look for its place and for lost frames
     escapes : how often that is done in one start, at most
@@ -39,6 +43,7 @@ class Schedule:
     """
 
     segment: int = 100
+    recalibrates: bool = True
     start_iterations: int = 1000
     sharp_after: int = 300
     escapes: int = 7
@@ -71,6 +76,25 @@ class Schedule:
         for name in ("segment", "start_iterations", "starts"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}: it must be at least 1")
+
+    @classmethod
+    def plain(cls) -> Schedule:
+        """One bounded L-BFGS on one cost: nothing is repaired, moved, weighed anew or drawn at random on its way.
+
+        The noise is what it is said to be from the first iteration on, frames are divided by their mean light, and
+        there is one start: from zero aberrations through a mask, from small random ones through a full pupil, for which
+        zero is a saddle point. The descent begins anew every 1000 iterations as long as those lower the cost.
+        """
+        return cls(
+            segment=1000,
+            recalibrates=False,
+            start_iterations=_NO_LIMIT,
+            escapes=0,
+            first_inflation=math.inf,
+            candidates=(),
+            starts=1,
+            faint=0.0,
+        )
 
     @property
     def n_candidates(self) -> int:

@@ -203,7 +203,7 @@ class Solver:
             progress.status, progress.decrease = Status.CONVERGED, decrease
             return
         progress.status = limit
-        if goes_on:
+        if goes_on and schedule.recalibrates:
             sharpen = progress.escapes == schedule.escapes
             progress.state = self._recalibrate(objective, progress.state, sharpen=sharpen)
 
