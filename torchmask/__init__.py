@@ -14,6 +14,7 @@ from torchmask.design.manufacture import load_mask
 from torchmask.design.refine import refine_mask
 from torchmask.design.search import SearchResult, search_mask
 from torchmask.design.table import design_table
+from torchmask.design.turbulent import TurbulentMSE
 from torchmask.grid import Grid
 from torchmask.interferometry.calibration import MaskCalibration, calibrate_mask
 from torchmask.interferometry.fringes import frame_observables
@@ -68,6 +69,7 @@ __all__ = [
     "StackRanges",
     "TotalVariation",
     "TurbulencePhase",
+    "TurbulentMSE",
     "ZernikePhase",
     "average_psf",
     "calibrate_mask",

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -127,7 +127,7 @@ class AsymptoticMSE(nn.Module):
         beyond = torch.hypot(nu_y, nu_x) >= self.grid.cutoff(mask_diameter)
         return (self.object_psd * beyond).mean()
 
-    def on_grid(self, n_pixels: int | tuple[int, int]) -> AsymptoticMSE:
+    def on_grid(self, n_pixels: int | tuple[int, int]) -> Self:
         """The same criterion with the integral sampled on another grid of the same pixel scale.
 
         For searches, which a coarse grid makes fast. The image stays what it was: the noise keeps its level, also its
@@ -136,14 +136,17 @@ class AsymptoticMSE(nn.Module):
         grid = replace(self.grid, n_pixels=n_pixels)
         noise = resample_psd(self.noise_psd, grid.shape)
         model = resample_psd(self.object_psd, grid.shape) if self._object_model is None else self._object_model
-        other = AsymptoticMSE(grid, model, noise, self.n_frames)
-        return other.to(self.object_psd.device, self.object_psd.dtype)
+        return self._like(grid, model, noise).to(self.object_psd.device, self.object_psd.dtype)
+
+    def _like(self, grid: Grid, object_psd: PSD, noise_psd: PSD) -> Self:
+        """The same criterion but for these."""
+        return type(self)(grid, object_psd, noise_psd, self.n_frames)
 
     def _geometry(self, aperture: Aperture) -> Geometry:
         if isinstance(aperture, FullAperture):
             raise ValueError(
                 "MSE_a is defined for masks (SparseAperture): a full pupil has aberrations that a piston per "
-                "sub-aperture does not describe; take wiener_mse of drawn OTFs instead"
+                "sub-aperture does not describe; take TurbulentMSE with the r0 of the site, or wiener_mse of drawn OTFs"
             )
         centers = aperture.centers
         if centers.dtype not in (torch.float32, torch.float64) or centers.device != self.object_psd.device:

@@ -34,7 +34,7 @@ class Geometry(NamedTuple):
     reach: float  # radius of the support of a sub-aperture's OTF [m], at most half the period
 
 
-class _Plan(NamedTuple):
+class PatchPlan(NamedTuple):
     """Index arithmetic that depends on the geometry and the number of sub-apertures alone.
 
     The plane has `above` rows before those of the half-plane and some below, and is flat.
@@ -56,7 +56,7 @@ class _Plan(NamedTuple):
     mirrored: Tensor  # of the half-plane: where those are reflected to
 
 
-def _make_plan(geometry: Geometry, n: int, dtype: torch.dtype, device: torch.device) -> _Plan:
+def make_plan(geometry: Geometry, n: int, dtype: torch.dtype, device: torch.device) -> PatchPlan:
     (rows, columns), period = geometry.grid, geometry.period
     zero = torch.zeros(1, dtype=torch.long, device=device)
     first, second = (torch.cat([zero, i]) for i in torch.triu_indices(n, n, 1, device=device))
@@ -69,7 +69,7 @@ def _make_plan(geometry: Geometry, n: int, dtype: torch.dtype, device: torch.dev
     outside = torch.cat([torch.arange(-above, 1), torch.arange(lowest, height + below)]).to(device)
     mirrored = torch.where(outside <= 0, -outside, rows - outside).clamp(0, height - 1)
     every = torch.arange(columns, device=device)
-    return _Plan(
+    return PatchPlan(
         geometry.shape.patches(dtype, device),
         torch.ones((), dtype=dtype, device=device),
         first,
@@ -87,7 +87,7 @@ def _make_plan(geometry: Geometry, n: int, dtype: torch.dtype, device: torch.dev
     )
 
 
-_cached_plan = lru_cache(maxsize=32)(_make_plan)
+cached_plan = lru_cache(maxsize=32)(make_plan)
 
 
 def baseline_mse(centers: Tensor, weight: Tensor, ratio: Tensor, geometry: Geometry) -> Tensor:
@@ -107,7 +107,7 @@ class _BaselineMSE(torch.autograd.Function):
     def forward(
         centers: Tensor, weight: Tensor, ratio: Tensor, geometry: Geometry, differentiate: bool
     ) -> tuple[Tensor, Tensor]:
-        plan_of = _make_plan if torch.compiler.is_compiling() else _cached_plan
+        plan_of = make_plan if torch.compiler.is_compiling() else cached_plan
         plan = plan_of(geometry, centers.shape[-2], centers.dtype, centers.device)
         pixels = len(plan.first) * len(plan.row) * len(plan.column)
         masks = max(1, _CHUNK.get(centers.device.type, 2**24) // pixels)
@@ -166,7 +166,7 @@ class _DifferentiatedOnce(torch.autograd.Function):
 
 
 def _mse_and_gradient(
-    centers: Tensor, weight: Tensor, ratio: Tensor, geometry: Geometry, plan: _Plan, differentiate: bool
+    centers: Tensor, weight: Tensor, ratio: Tensor, geometry: Geometry, plan: PatchPlan, differentiate: bool
 ) -> tuple[Tensor, Tensor]:
     """MSE_a (B,) and its gradient by the centres (B, N, 2), or (0, N, 2) if it is not asked for."""
     (rows, columns), period = geometry.grid, geometry.period

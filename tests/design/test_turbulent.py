@@ -1,0 +1,258 @@
+"""The criterion under turbulence: against the general integral, draws, MSE_a, and its own laws."""
+
+import copy
+import math
+import pickle
+
+import pytest
+import torch
+from exact_turbulence import drawn_mean_square
+
+from torchmask.atmosphere.seeing import Seeing
+from torchmask.atmosphere.transfer import mean_square_otf
+from torchmask.design.criterion import AsymptoticMSE
+from torchmask.design.refine import refine_mask
+from torchmask.design.search import search_mask
+from torchmask.design.tolerance import machining_errors
+from torchmask.design.turbulent import TurbulentMSE
+from torchmask.grid import Grid
+from torchmask.optics.aperture import FullAperture, SparseAperture
+from torchmask.optics.pixel import SquarePixel
+from torchmask.spectra import NoisePSD, PowerLawPSD
+
+GRID = Grid.nyquist(1.0, 550e-9, 48)
+
+
+def criterion_of(grid=GRID, n_photons=1e5, n_frames=20, **turbulence):
+    return TurbulentMSE(grid, PowerLawPSD(1.5, n_photons), NoisePSD(n_photons), n_frames, **turbulence)
+
+
+def mask_of(n, seed=0, fill=0.15, shape="disc"):
+    mask = SparseAperture.random(n, 1.0, fill, torch.Generator().manual_seed(seed))
+    narrower = 1.0 if shape == "disc" else 0.85
+    return SparseAperture(mask.centers, mask.subaperture_diameter * narrower, 1.0, shape)
+
+
+def some_frequencies(mask, grid, count, lowest):
+    """Of at least `lowest` baselines' medians, as rows and columns; a third of them below two holes."""
+    nu_y, nu_x = (nu.expand(grid.shape) for nu in grid.frequencies(torch.float64))
+    length = torch.hypot(nu_y, nu_x) * grid.period
+    short = length > lowest * float(torch.pdist(mask.centers).median())
+    generator = torch.Generator().manual_seed(0)
+    picked = []
+    for reach, number in ((2 * mask.subaperture_diameter, count // 3), (1.0, count - count // 3)):
+        found = (short & (length < reach) & (nu_y >= 0)).nonzero()
+        picked.append(found[torch.randperm(len(found), generator=generator)[:number]])
+    row, column = torch.cat(picked).T
+    return row, column, torch.stack([nu_x[row, column], nu_y[row, column]], -1)
+
+
+@pytest.mark.parametrize(
+    ("n", "ratio", "outer_scale", "tau", "wind", "shape"),
+    [
+        (6, 0.4, math.inf, 0.0, 0.0, "disc"),
+        (6, 1.5, 5.0, 0.0, 0.0, "disc"),
+        (11, 0.8, 20.0, 1.0, (8.0, 6.0), "disc"),
+        (6, 0.8, math.inf, 2.0, 10.0, "disc"),
+        (6, 0.8, math.inf, 0.0, 0.0, "hexagon"),
+    ],
+)
+def test_masks_agree_with_the_general_integral(n, ratio, outer_scale, tau, wind, shape):
+    """The bound of 3 % is the promise; the integral's own samples err by half a per cent."""
+    mask = mask_of(n, shape=shape)
+    r0 = mask.subaperture_diameter / ratio
+    exposure = tau * Seeing(r0, wind=10.0).tau0
+    turbulence = {"r0": r0, "outer_scale": outer_scale, "exposure": exposure, "wind": wind}
+    row, column, nu = some_frequencies(mask, GRID, 24, 0.1)
+    found = criterion_of(**turbulence).expected_power(mask)[row, column]
+    exact = mean_square_otf(mask, GRID, nu, Seeing(**turbulence))
+    counts = exact > 0.02 / n**2  # of what one pair of holes gives at most: below lie the edges of the lenses
+    assert int(counts.sum()) >= 8
+    assert (found / exact - 1)[counts].abs().max() < 0.03
+    assert abs(float((found / exact - 1)[counts].mean())) < 0.01
+    assert (found - exact)[~counts].abs().max() < 0.002 / n**2
+
+
+def test_holes_that_overlap_agree_with_the_general_integral():
+    mask = SparseAperture([[0.3, 0.0], [0.2, 0.05], [-0.3, 0.1]], 0.16, 1.0)
+    row, column, nu = some_frequencies(mask, GRID, 24, 0.1)
+    exact = mean_square_otf(mask, GRID, nu, Seeing(0.2))
+    found = criterion_of(r0=0.2).expected_power(mask)[row, column]
+    assert (found - exact).abs().max() < 0.03 * float(exact.max())
+
+
+def test_masks_agree_with_draws():
+    """Redundant on purpose: three holes in a row, whose lenses share what turbulence leaves."""
+    mask = SparseAperture([[-0.3, 0.0], [0.0, 0.0], [0.3, 0.0], [0.0, 0.35]], 0.24, 1.0)
+    seeing = Seeing(0.3, 10.0)
+    generator = torch.Generator().manual_seed(1)
+    drawn = drawn_mean_square(mask, GRID, seeing, n_draws=600, oversampling=2, generator=generator)
+    still = criterion_of(r0=1e6).expected_power(mask)  # the samples of the draws differ from the discs by this
+    found = criterion_of(r0=0.3, outer_scale=10.0).expected_power(mask) * drawn.perfect / still
+    nu_y, nu_x = GRID.frequencies(torch.float64)
+    counts = (drawn.mean > 3e-3) & (torch.hypot(nu_y, nu_x) * GRID.period > 0.05)
+    assert int(counts.sum()) > 500
+    excess = (found - drawn.mean).abs() - 4 * drawn.error
+    assert (excess < 0.03 * found)[counts].all()
+    assert float((found / drawn.mean)[counts].mean()) == pytest.approx(1, abs=0.02)
+
+
+@pytest.mark.parametrize("shape", ["disc", "hexagon"])
+def test_without_r0_it_is_mse_a(shape):
+    mask = mask_of(7, shape=shape)
+    asymptotic = AsymptoticMSE(GRID, PowerLawPSD(1.5, 1e5), NoisePSD(1e5), 20)
+    ours = criterion_of()
+    assert float(ours(mask)) == pytest.approx(float(asymptotic(mask)), rel=1e-10)
+    assert float(ours.relative(mask)) == pytest.approx(float(asymptotic.relative(mask)), rel=1e-10)
+    with pytest.raises(ValueError, match="TurbulentMSE with the r0"):
+        ours(FullAperture(1.0))
+    for turbulence in ({"exposure": 1e-3, "wind": 10.0}, {"outer_scale": 20.0}):
+        with pytest.raises(ValueError, match="give its r0 in m"):
+            criterion_of(**turbulence)
+    with pytest.raises(ValueError, match="r0 is None"):
+        ours.expected_power(mask)
+
+
+def test_weak_turbulence_within_small_holes_is_mse_a():
+    """Holes of r0 / 8, each pair many r0 apart: what is lost is the piston-removed variance of two holes at most."""
+    centers = [[0.0, 0.45], [0.4, -0.3], [-0.45, -0.25], [0.1, -0.05]]
+    mask = SparseAperture(centers, 0.025, 1.0)
+    grid = Grid.nyquist(1.0, 550e-9, 160)
+    ours = TurbulentMSE(grid, PowerLawPSD(1.5, 1e4), NoisePSD(1e4), 20, r0=0.2)
+    asymptotic = AsymptoticMSE(grid, PowerLawPSD(1.5, 1e4), NoisePSD(1e4), 20)
+    restored = 1 - float(asymptotic.relative(mask))
+    lost = restored - (1 - float(ours.relative(mask)))
+    assert 0 < lost < restored * 2 * 1.0324 * (1 / 8) ** (5 / 3)
+
+
+@pytest.mark.parametrize(("obstruction", "wind"), [(0.0, 0.0), (0.3, 0.0), (0.3, (10.0, 0.0))])
+def test_full_pupils_agree_with_the_general_integral(obstruction, wind):
+    pupil = FullAperture(1.0, obstruction)
+    exposure = 5e-3 if wind else 0.0
+    turbulence = {"r0": 0.2, "exposure": exposure, "wind": wind}
+    row, column, nu = some_frequencies(SparseAperture([[0.5, 0.0], [-0.5, 0.0]], 0.3, 1.0), GRID, 12, 0.05)
+    exact = mean_square_otf(pupil, GRID, nu, Seeing(**turbulence))
+    found = criterion_of(**turbulence).expected_power(pupil)[row, column]
+    assert (found - exact).abs().max() < 0.01 * float(exact.max())
+    counts = exact > 1e-4
+    assert (found / exact - 1)[counts].abs().max() < 0.02
+
+
+@pytest.mark.parametrize("grid", [GRID, Grid.nyquist(1.0, 550e-9, (33, 40))])
+def test_expected_power_is_even_and_one_at_zero(grid):
+    power = criterion_of(grid, r0=0.2).expected_power(mask_of(5))
+    assert power.shape == grid.shape
+    assert float(power[0, 0]) == pytest.approx(1, abs=5e-3)
+    torch.testing.assert_close(power, power.flip(-2, -1).roll((1, 1), (-2, -1)))
+
+
+def test_the_error_is_its_formula():
+    """A pixel multiplies every OTF; a sky adds its electrons, pixel by pixel, to the noise."""
+    mask, pixel = mask_of(5), SquarePixel(0.8)
+    criterion = criterion_of(r0=0.2, pixel=pixel, sky=3.0)
+    nu_y, nu_x = GRID.frequencies(torch.float64)
+    power = criterion_of(r0=0.2).expected_power(mask) * pixel.transfer(nu_y, nu_x) ** 2
+    s_o, s_n = PowerLawPSD(1.5, 1e5)(GRID), 1e5 + 48 * 48 * 3.0
+    expected = float((s_o * s_n / (20 * s_o * power + s_n)).mean())
+    assert float(criterion(mask)) == pytest.approx(expected, rel=1e-12)
+    assert float(criterion.relative(mask)) == pytest.approx(expected / float(s_o.mean()), rel=1e-12)
+    frozen = criterion_of(pixel=pixel, sky=3.0)
+    assert float(frozen(mask)) > float(criterion_of(sky=3.0)(mask)) > float(criterion_of()(mask))
+
+
+def test_a_sky_counts_the_pixels_of_the_detector():
+    noise = NoisePSD(1e5, n_pixels=100)
+    criterion = TurbulentMSE(GRID, PowerLawPSD(1.5, 1e5), noise, 20, sky=3.0)
+    assert float(criterion.noise_psd[0, 0]) == 1e5 + 300
+    assert float(criterion.on_grid(24).noise_psd[0, 0]) == 1e5 + 300
+
+
+def test_populations_and_both_dtypes():
+    criterion = criterion_of(r0=0.2)
+    centers = torch.stack([mask_of(6, seed).centers for seed in range(6)])
+    diameter = mask_of(6).subaperture_diameter
+    together = criterion(SparseAperture(centers.unflatten(0, (2, 3)), diameter, 1.0))
+    assert together.shape == (2, 3)
+    alone = torch.stack([criterion(SparseAperture(one, diameter, 1.0)) for one in centers])
+    torch.testing.assert_close(together.flatten(), alone, rtol=1e-12, atol=0)
+    single = criterion(SparseAperture(centers.float(), diameter, 1.0))
+    assert single.dtype == torch.float32
+    torch.testing.assert_close(single.double(), alone, rtol=1e-4, atol=0)
+
+
+CENTERS = {
+    "random": [[0.31, 0.12], [-0.22, 0.28], [0.05, -0.33]],
+    "coincident": [[0.2, 0.1], [0.2, 0.1], [-0.3, 0.0]],
+    "touching": [[-0.2, 0.0], [0.0, 0.0], [0.2, 0.0]],
+    "one baseline twice": [[-0.3, 0.0], [-0.3, 0.25], [0.3, 0.0], [0.3, 0.25]],
+}
+
+
+@pytest.mark.parametrize("layout", CENTERS)
+def test_gradients(layout):
+    criterion = criterion_of(Grid.nyquist(1.0, 550e-9, 24), r0=0.25)
+    centers = torch.tensor(CENTERS[layout], dtype=torch.float64, requires_grad=True)
+    torch.autograd.gradcheck(lambda x: criterion.relative(SparseAperture(x, 0.2, 1.0)), centers, eps=1e-6, atol=1e-6)
+
+
+def test_turning_everything_changes_little():
+    """Criterion and wind turned by 90 degrees: the same but for rounding. Turned alone, the mask differs."""
+    mask = mask_of(6)
+    turned = SparseAperture(mask.centers @ torch.tensor([[0.0, 1.0], [-1.0, 0.0]]).double(), 0.158113883, 1.0)
+    still = SparseAperture(mask.centers, 0.158113883, 1.0)
+    grid = Grid.nyquist(1.0, 550e-9, 32)
+    along, across = (criterion_of(grid, r0=0.2, exposure=5e-3, wind=wind) for wind in ((20.0, 0.0), (0.0, 20.0)))
+    assert float(along(still)) == pytest.approx(float(across(turned)), rel=1e-6)
+    assert float(along(still)) != pytest.approx(float(along(turned)), rel=1e-4)
+
+
+def test_stronger_turbulence_and_longer_exposures_are_worse():
+    mask = mask_of(6)
+    by_r0 = [float(criterion_of(r0=r0).relative(mask)) for r0 in (0.5, 0.2, 0.1)]
+    by_time = [float(criterion_of(r0=0.2, exposure=t, wind=10.0).relative(mask)) for t in (0, 5e-3, 1e-2)]
+    assert by_r0 == sorted(by_r0)
+    assert by_time == sorted(by_time)
+
+
+def test_search_refinement_and_machining_take_it():
+    criterion = criterion_of(Grid.nyquist(1.0, 550e-9, 32), r0=0.2)
+    found = search_mask(criterion, 4, 1.0, 0.15, seed=0, budget=100)
+    better = refine_mask(criterion, found.aperture, budget=20)
+    assert better.relative_mse <= found.relative_mse * (1 + 1e-9)
+    assert found.relative_mse < float(criterion.relative(mask_of(4)))
+    moved = machining_errors(criterion, found.aperture, 1e-3, n_draws=16, generator=torch.Generator().manual_seed(0))
+    assert 0 < float(moved.growth.abs().max()) < 0.1
+
+
+def test_coarser_grids_and_copies_keep_everything():
+    criterion = criterion_of(r0=0.2, exposure=5e-3, wind=10.0, pixel=SquarePixel(), sky=1.0)
+    mask, coarse = mask_of(5), criterion.on_grid(40)
+    assert float(coarse.relative(mask)) == pytest.approx(float(criterion.relative(mask)), rel=0.1)
+    assert coarse.seeing == criterion.seeing
+    value = float(criterion(mask))
+    for other in (copy.deepcopy(criterion), pickle.loads(pickle.dumps(criterion))):
+        assert float(other(mask)) == value
+    other = criterion_of(n_photons=1e3, r0=0.2, exposure=5e-3, wind=10.0, pixel=SquarePixel())
+    other.load_state_dict(criterion.state_dict())
+    assert float(other(mask)) == value
+
+
+def test_diverged_centres_give_nan_and_no_crash():
+    criterion = criterion_of(r0=0.2)
+    centers = mask_of(4).centers.expand(2, 4, 2).clone()
+    centers[1, 2, 0] = math.nan
+    values = criterion(_with_centers(centers))
+    assert float(values[0]) == pytest.approx(float(criterion(_with_centers(centers[0]))), rel=1e-12)
+    assert bool(values[1].isnan())
+
+
+def _with_centers(centers):
+    mask = SparseAperture(torch.zeros_like(centers), 0.19, 1.0)
+    mask.centers.copy_(centers)
+    return mask
+
+
+@pytest.mark.parametrize("sky", [-1.0, math.nan])
+def test_a_sky_that_is_none_is_refused(sky):
+    with pytest.raises(ValueError, match="electrons per pixel"):
+        criterion_of(sky=sky)

@@ -1,0 +1,172 @@
+"""What turbulence leaves of the overlap of two equal holes, as a few products: one factor for the baseline, one for
+the place in the overlap.
+
+Two holes of a pupil let a baseline b through where b differs from their own by u, less than a hole: their overlap is
+then a lens, whatever the holes' places. Of its |OTF|^2 turbulence and exposure keep the part
+
+    c(b, u) = < exp(-Q(b, s) / 2) >,   Q(b, s) = 2 D(b) + 2 D(s) - D(s + b) - D(s - b),
+
+the mean over pairs of points of the lens, s apart. It is smooth in both, so c(b, u) = sum over r of a_r(b) f_r(u)
+converges fast: the singular value decomposition of a table of c finds the factors.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.ndimage import map_coordinates
+from torch import Tensor
+
+from torchmask.atmosphere.seeing import Seeing
+from torchmask.atmosphere.structure import StructureFunction
+from torchmask.optics.shape_base import Shape
+
+_PER_HOLE, _PER_R0, _PER_SHARED = 20, 6, 10  # samples
+_MOST_LAGS = 12
+_PLACES = (12, 16)  # distances and directions (of half a turn) of places in the overlap
+_BASELINES = (16, 16)  # of baselines
+_SHARED_BASELINES = (9, 12)  # below a hole, of lenses of holes with themselves
+_SEPARATIONS = (28, 12)  # of these holes
+_TOLERANCE = 3e-4  # of c, in the norm of its rows
+
+
+class PolarTable:
+    """A function that is even in the plane, known at distances `longest` (i / (n - 1))^power and evenly spread
+    directions over half a turn: values (..., distances, directions)."""
+
+    def __init__(self, values: Tensor, longest: float, power: float) -> None:
+        # half a turn to either side, so that a cubic spline does not feel the seam
+        self.values, self.longest, self.power = torch.cat([values] * 3, -1).numpy(), longest, power
+        self.n_directions = values.shape[-1]
+
+    @staticmethod
+    def nodes(sizes: tuple[int, int], longest: float, power: float) -> Tensor:
+        """Where the function must be known, (distances, directions, 2)."""
+        radius = longest * torch.linspace(0, 1, sizes[0], dtype=torch.float64) ** power
+        angle = math.pi * torch.arange(sizes[1], dtype=torch.float64) / sizes[1]
+        return radius[:, None, None] * torch.stack([angle.cos(), angle.sin()], -1)
+
+    def __call__(self, points: Tensor) -> Tensor:
+        """At points (P, 2): (..., P), by cubic splines; beyond `longest` as there."""
+        x, y = points.double().cpu().numpy().T
+        opposite = (y < 0) | ((y == 0) & (x < 0))  # of which all is even to the last digit
+        x, y = np.where(opposite, -x, x), np.where(opposite, -y, y)
+        n = self.values.shape[-2] - 1
+        distance = np.minimum(np.hypot(x, y) / self.longest, 1) ** (1 / self.power) * n
+        direction = (np.arctan2(y, x) / math.pi + 1) * self.n_directions
+        leading = self.values.shape[:-2]
+        flat = self.values.reshape(-1, *self.values.shape[-2:])
+        found = [map_coordinates(one, [distance, direction], order=3, mode="mirror") for one in flat]
+        return torch.from_numpy(np.stack(found)).reshape(*leading, len(points))
+
+
+class LensCoherence(NamedTuple):
+    """c(b, u) = sum over r of by_baseline[r] at b times by_place[r] at u [m]."""
+
+    by_baseline: PolarTable
+    by_place: PolarTable
+
+
+def lens_coherence(shape: Shape, diameter: float, seeing: Seeing, longest: float) -> LensCoherence:
+    """The factors of c for holes of one shape and baselines up to `longest` [m]."""
+    reach = shape.outer_diameter(diameter)
+    places = PolarTable.nodes(_PLACES, reach, 1.0)
+    drift, shares = _drift(seeing)
+    fewest = _PER_HOLE if len(drift) == 1 else _PER_HOLE * 3 // 5  # the drift smooths
+    per_hole = max(fewest, math.ceil(_PER_R0 * diameter / seeing.r0))
+    separations, densities = _lens_densities(shape, diameter, places.flatten(0, 1), per_hole)
+
+    def coherence(baselines: Tensor) -> Tensor:
+        total = torch.zeros(len(baselines), len(separations), dtype=torch.float64)
+        for step, share in zip(drift, shares, strict=True):
+            total += share * _kernel(structure, baselines[:, None], separations + step)
+        return total @ densities.T
+
+    structure = seeing.structure(longest + 2 * reach + float(drift.norm(dim=-1).max()))
+    baselines = PolarTable.nodes(_BASELINES, longest, 2.0)
+    rows, columns = _factors(_table(coherence, baselines, _PLACES, shape.is_round and seeing.is_isotropic))
+    by_baseline = PolarTable(rows.unflatten(-1, _BASELINES), longest, 2.0)
+    return LensCoherence(by_baseline, PolarTable(columns.unflatten(-1, _PLACES), reach, 1.0))
+
+
+def shared_coherence(shape: Shape, diameter: float, seeing: Seeing, longest: float) -> LensCoherence:
+    """The factors of what the lenses of two holes with themselves share, by the baseline u, below a hole, and the
+    separation of the holes, up to `longest` [m]: <exp(-Q(u, c + t) / 2)>, t between two points of one lens."""
+    reach = shape.outer_diameter(diameter)
+    between = PolarTable.nodes(_SEPARATIONS, longest, 1.5).flatten(0, 1)[:, None]
+    drift, shares = _drift(seeing)
+    per_hole = _PER_SHARED if len(drift) == 1 else _PER_SHARED * 3 // 5
+    structure = seeing.structure(longest + 4 * reach + float(drift.norm(dim=-1).max()))
+
+    def coherence(baselines: Tensor) -> Tensor:
+        separations, densities = _lens_densities(shape, diameter, baselines, per_hole)
+        total = torch.zeros(len(baselines), len(between), dtype=torch.float64)
+        for step, share in zip(drift, shares, strict=True):
+            for points in (between + step + separations, between + step - separations):
+                own = structure(points)
+                for row, (baseline, density) in enumerate(zip(baselines, densities, strict=True)):
+                    total[row] += share / 2 * (_kernel(structure, baseline, points, own) @ density)
+        return total
+
+    baselines = PolarTable.nodes(_SHARED_BASELINES, reach, 1.5)
+    rows, columns = _factors(_table(coherence, baselines, _SEPARATIONS, shape.is_round and seeing.is_isotropic))
+    by_baseline = PolarTable(rows.unflatten(-1, _SHARED_BASELINES), reach, 1.5)
+    return LensCoherence(by_baseline, PolarTable(columns.unflatten(-1, _SEPARATIONS), longest, 1.5))
+
+
+def _table(function: Callable[[Tensor], Tensor], baselines: Tensor, others: tuple[int, int], isotropic: bool) -> Tensor:
+    """`function` (..., distances times directions of the others) of all polar baselines (n, m, 2): (n m, ...). Where no
+    direction is distinguished, all follow from the first, as only the angle between both counts."""
+    if not isotropic:
+        return function(baselines.flatten(0, 1))
+    first = function(baselines[:, 0]).unflatten(-1, others)
+    turned = [first.roll(turn, -1) for turn in range(baselines.shape[1])]
+    return torch.stack(turned, 1).flatten(2).flatten(0, 1)
+
+
+def _drift(seeing: Seeing) -> tuple[Tensor, list[float]]:
+    """Displacements (L, 2) [m] during the exposure, each with its opposite, and their shares."""
+    if seeing.exposure == 0:
+        return torch.zeros(1, 2, dtype=torch.float64), [1.0]
+    n = 3 + math.ceil(2 * seeing.exposure * seeing.speed / seeing.r0)
+    steps, shares = seeing.drift(min(n, _MOST_LAGS), min(n, _MOST_LAGS))
+    return torch.cat([steps, -steps]), (shares / 2).repeat(2).tolist()
+
+
+def _kernel(structure: StructureFunction, baseline: Tensor, separation: Tensor, own: Tensor | None = None) -> Tensor:
+    """exp(-Q / 2) (...); `own` is the structure function of the separation where it is known."""
+    own = structure(separation) if own is None else own
+    crossed = structure(separation + baseline) + structure(separation - baseline)
+    return torch.exp(crossed / 2 - own - structure(baseline))
+
+
+def _factors(table: Tensor) -> tuple[Tensor, Tensor]:
+    """Rows (R, n) and columns (R, m) whose products sum to the table (n, m)."""
+    left, size, right = torch.linalg.svd(table, full_matrices=False)
+    rank = max(1, int((size > _TOLERANCE * size[0]).sum()))
+    root = size[:rank].sqrt()
+    return (left[:, :rank] * root).T, root[:, None] * right[:rank]
+
+
+def _lens_densities(shape: Shape, diameter: float, places: Tensor, per_hole: int) -> tuple[Tensor, Tensor]:
+    """Separations (S, 2) [m] of half the plane, and how often the points of the lens at `places` (U, 2) are so far
+    apart, (U, S) of unit sum. A lens of no extent keeps everything: separation 0."""
+    step = diameter * shape.fineness / per_hole
+    size = math.ceil(shape.outer_diameter(diameter) / step) + 2
+    axis = (torch.arange(size, dtype=torch.float64) - (size - 1) / 2) * step
+    points = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), -1)
+    cell = torch.tensor([step, step], dtype=torch.float64)
+    half = places[:, None, None] / 2
+    lens = shape.coverage(points + half, cell, diameter) * shape.coverage(points - half, cell, diameter)
+    power = torch.fft.rfft2(lens, s=(2 * size, 2 * size)).abs() ** 2
+    density = torch.fft.irfft2(power, s=(2 * size, 2 * size)).clamp(min=0).flatten(1)
+    lag = torch.fft.fftfreq(2 * size, 1 / (2 * size), dtype=torch.float64) * step
+    separations = torch.stack(torch.meshgrid(lag, lag, indexing="xy"), -1).flatten(0, 1)
+    upper = (separations[:, 1] > 0) | ((separations[:, 1] == 0) & (separations[:, 0] >= 0))
+    density[:, 0] = density[:, 0] / 2 + 1e-12 * float(density.max())  # half of it belongs to the other half plane
+    density = density[:, upper]
+    return separations[upper], density / density.sum(-1, keepdim=True)
