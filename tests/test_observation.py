@@ -59,6 +59,20 @@ def test_everything_survives_the_file(tmp_path, mask):
         assert getattr(back.aperture, name) == getattr(mask, name), name
 
 
+def test_some_frames_come_with_what_belongs_to_them(mask):
+    per_frame = {"psfs": frames_of(4, 1), "phases": phases_of(mask, 4), "errors": frames_of(4, 2)}
+    per_frame |= {"valid": frames_of(4, 3) > 0.5, "transmission": torch.rand(4)}
+    whole = Observation(frames_of(4), mask, GRID, 1.5, object=frames_of(1)[0], header={"OBJECT": "x"}, **per_frame)
+    part = whole.take([3, 1])
+    for name in ("frames", *per_frame):
+        assert torch.equal(getattr(part, name), getattr(whole, name)[[3, 1]]), name
+    assert part.object is whole.object
+    assert part.header == whole.header
+    common = Observation(frames_of(4), mask, GRID, None, valid=frames_of(1)[0] > 0.5)
+    assert torch.equal(common.take([2]).valid, common.valid)
+    assert common.take([2]).errors is None
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_what_is_not_known_is_not_known_afterwards(tmp_path, dtype):
     pupil = FullAperture(1.0, central_obstruction=0.25)

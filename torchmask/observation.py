@@ -6,8 +6,8 @@ import json
 import math
 import re
 import warnings
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -125,6 +125,15 @@ class Observation(Brief):
         """
         matrix = pixel_matrix(self.header) if self.header else None
         return None if matrix is None else torch.from_numpy(matrix)
+
+    def take(self, frames: Sequence[int] | np.ndarray) -> Observation:
+        """The observation of these frames alone, numbered from 0, with what belongs to each of them."""
+        chosen = torch.as_tensor(np.asarray(frames, dtype=np.int64), device=self.frames.device)
+        per_frame = ["frames", "psfs", "phases", "errors", "transmission"]
+        if self.valid is not None and self.valid.ndim == 3:
+            per_frame.append("valid")
+        parts = {name: getattr(self, name) for name in per_frame}
+        return replace(self, **{name: part[chosen] for name, part in parts.items() if part is not None})
 
     def save(self, path: str | Path) -> None:
         """Write everything to a new .npz file (compressed, without pickle; the format of `load`).

@@ -62,6 +62,7 @@ UNITS = {
     "crop": r"\[pixels\]",
     "pixel_fill": "[Pp]art of the area",
     "gain": "[Ee]lectrons per adu",
+    "saturation": "in its unit",
     "readout_noise": "Electrons rms",
     "imaging.readout_noise": "Electrons rms",
     "n_photons": "Electrons per frame",

@@ -3,9 +3,12 @@
 from pathlib import Path
 
 import pytest
+import torch
 
 from torchmask.cli.stacks import StackOptions, group_files, read_stack
 from torchmask.design.manufacture import save_json
+from torchmask.grid import Grid
+from torchmask.observation import Observation
 from torchmask.optics.aperture import SparseAperture
 
 FILES = [Path("a/cube.fits"), Path("b/cube.fits"), Path("b/other.npz"), Path("c/cube.fits")]
@@ -41,3 +44,23 @@ def test_a_cube_without_wavelength_has_that_of_the_mask_file(write_fits, fits_cu
     assert read_stack(bare, StackOptions(mask=tmp_path / "mask.json")).grid.wavelength == 633e-9
     with pytest.raises(ValueError, match=r"bare\.fits has no WAVELEN.*: give --wavelength \[m\]"):
         read_stack(bare, StackOptions(mask=tmp_path / "old.json"))
+
+
+def test_frames_of_a_stack_are_skipped_and_those_without_light_left_out(tmp_path):
+    mask, generator = SparseAperture.from_catalog("golay6", 1.0, 0.15), torch.Generator().manual_seed(0)
+    frames = torch.rand(6, 16, 16, dtype=torch.float64, generator=generator)
+    frames[:, 6:10, 6:10] += 100
+    frames[4] -= 200
+    Observation(frames, mask, Grid.nyquist(1.0, 550e-9, 16), 1.0).save(tmp_path / "a.npz")
+    with pytest.warns(UserWarning, match=r"frames \[4\] hold no light"):
+        seen = read_stack([tmp_path / "a.npz"], StackOptions(skip=(1,)))
+    assert torch.equal(seen.frames, frames[[0, 2, 3, 5]])
+    with pytest.raises(ValueError, match="--skip names frame 6, but the stack has 6"):
+        read_stack([tmp_path / "a.npz"], StackOptions(skip=(6,)))
+
+
+def test_a_cube_in_adu_needs_a_gain(write_fits, fits_cube):
+    raw = [write_fits("raw.fits", fits_cube, BUNIT=None)]
+    with pytest.raises(ValueError, match=r"give --gain \[electrons per adu\]; if pixels are not in adu, give --unit"):
+        read_stack(raw, StackOptions(mask=Path("keck_nirc2_9")))
+    assert len(read_stack(raw, StackOptions(mask=Path("keck_nirc2_9"), gain=2.0)).frames) == 3

@@ -86,3 +86,24 @@ def test_extensions_must_agree(write_fits, fits_cube):
         read_fits(write_fits("a.fits", fits_cube, extensions=[quality], sci=True))
     with pytest.raises(ValueError, match=r"2 SCI extensions"):
         read_fits(write_fits("b.fits", fits_cube, extensions=[("SCI", fits_cube)], sci=True))
+
+
+@pytest.mark.parametrize("name", ["BADPIX", "BPM", "DQ"])
+def test_extensions_of_bad_pixels_mark_them(write_fits, fits_cube, name):
+    bad = np.zeros((16, 20), dtype=np.uint8)
+    bad[2, 3] = 4
+    valid = read_fits(write_fits("a.fits", fits_cube, extensions=[(name, bad)])).valid
+    assert (~valid).nonzero()[1].tolist() == [2, 2, 2]
+    assert (~valid).nonzero()[2].tolist() == [3, 3, 3]
+    with pytest.raises(ValueError, match=rf"{name} of shape \(3, 3\)"):
+        read_fits(write_fits("b.fits", fits_cube, extensions=[(name, np.zeros((3, 3), dtype=np.uint8))]))
+
+
+@pytest.mark.parametrize(("dtype", "top"), [("uint16", 65535), ("int16", 32767), ("uint8", 255), ("int32", None)])
+def test_where_a_converter_stops_a_pixel_is_not_valid(write_fits, dtype, top):
+    counts = np.full((4, 6), 17, dtype=dtype)
+    counts[1, 2] = np.iinfo(dtype).max
+    counts[3, 3] = np.iinfo(dtype).max - 1
+    images = read_fits(write_fits("a.fits", counts))
+    assert images.values[0, 1, 2] == np.iinfo(dtype).max
+    assert np.argwhere(~images.valid).tolist() == ([[0, 1, 2]] if top else [])

@@ -5,11 +5,13 @@ import math
 import pytest
 
 from torchmask.data.keywords import (
+    closed_shutter,
     electrons_per_unit,
     exposure_seconds,
     kept_cards,
     number,
     pixel_scale,
+    saturation,
     shift_cards,
     wavelength,
 )
@@ -96,9 +98,12 @@ def test_what_is_given_wins_over_the_header():
     assert electrons(cards, gain=2.0, exposure_time=3.0) == pytest.approx(6.0)
 
 
-def test_pixels_without_a_unit_are_taken_for_electrons_and_it_is_said():
-    with pytest.warns(UserWarning, match="no BUNIT and no GAIN in the header: pixels are taken for electrons"):
-        assert electrons({}) == 1.0
+def test_pixels_without_a_unit_are_never_taken_for_electrons():
+    for cards in ({}, {"GAIN": 0.0}):
+        with pytest.raises(
+            ValueError, match=r"no BUNIT and no GAIN: give gain \[.*\]; if pixels are not in adu, give unit"
+        ):
+            electrons(cards)
     assert electrons({}, unit="electron") == 1.0
     assert electrons({}, gain=2.5) == 2.5
 
@@ -150,3 +155,38 @@ def test_shifted_cards_leave_the_originals_alone(sky_cards):
     assert moved == {name: value for name, value in cards.items() if not name.startswith("CRPIX")}
     assert cards == sky_cards(0.3, 1e-7)
     assert shift_cards({}, 3, 4) == {}
+
+
+@pytest.mark.parametrize(
+    ("cards", "level"),
+    [
+        ({}, None),
+        ({"SATURATE": 60000.0}, 60000.0),
+        ({"FULLWELL": 80000}, 50000.0),  # electrons, at 1.6 for each adu
+        ({"FULLWELL": 80000, "SATURATE": 40000}, 40000.0),
+        ({"SATURATE": 0}, None),
+    ],
+)
+def test_a_pixel_is_full_at_the_lower_of_converter_and_well(cards, level):
+    assert saturation(cards, "a.fits", 1.6, None) == level
+    assert saturation(cards, "a.fits", 1.6, 1000.0) == 1000.0
+
+
+@pytest.mark.parametrize(
+    ("cards", "closed"),
+    [
+        ({"IMAGETYP": "Dark Frame"}, True),
+        ({"IMAGETYP": "bias"}, True),
+        ({"OBSTYPE": "ZERO"}, True),
+        ({"EXP_TYPE": "NIS_DARK"}, True),
+        ({"ESO DPR TYPE": "DARK"}, True),
+        ({"SHUTTER": "CLOSED"}, True),
+        ({"SHUTTER": "open", "IMAGETYP": "Light Frame"}, False),
+        ({"EXP_TYPE": "NIS_AMI", "OBJECT": "Dark Nebula"}, False),
+        ({}, False),
+    ],
+)
+def test_darks_and_closed_shutters_are_known_by_their_cards(cards, closed):
+    said = closed_shutter(cards)
+    assert (said is not None) == closed
+    assert said is None or any(name in said and value in said for name, value in cards.items())

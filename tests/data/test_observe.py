@@ -94,6 +94,51 @@ def test_errors_are_in_electrons_and_bad_pixels_are_not_valid(write_fits, mask, 
         read_observation(dead, mask)
 
 
+@pytest.mark.parametrize(
+    ("cards", "given"),
+    [
+        ({"SATURATE": 1e5}, {}),
+        ({"FULLWELL": 2e5}, {}),
+        ({}, {"saturation": 1e5}),
+        ({"SATURATE": 1.0}, {"saturation": 1e5}),
+    ],
+)
+def test_saturated_pixels_carry_no_weight_and_are_counted(write_fits, mask, cube, cards, given):
+    """The star's pixel alone is above 1e5 adu, of 2 electrons; the dark that is taken off does not hide it."""
+    path = write_fits("a.fits", cube, BUNIT="adu", GAIN=2.0, **cards)
+    with pytest.warns(UserWarning, match=r"a\.fits: 3 pixels in 3 frames are saturated \(1e\+05 or more\)"):
+        seen = read_observation(path, mask, dark=np.full((16, 20), 90.0), **given)
+    assert (~seen.valid).nonzero().tolist() == [[0, 9, 12], [1, 9, 12], [2, 9, 12]]
+
+
+def test_darks_among_the_files_are_left_out_and_alone_are_refused(write_fits, mask, cube):
+    light, dark = write_fits("light.fits", cube), write_fits("dark.fits", cube[0] / 50, IMAGETYP="DARK")
+    with pytest.warns(
+        UserWarning, match=r"files without light are left out \(.*dark\.fits: IMAGETYP is 'DARK'\); dark"
+    ):
+        assert len(read_observation([dark, light], mask).frames) == 3
+    with pytest.raises(ValueError, match=r"no file holds light \(.*dark\.fits: IMAGETYP is 'DARK'\): give exposures"):
+        read_observation(dark, mask)
+
+
+def test_frames_are_skipped_by_number_and_the_best_are_kept_of_the_others(write_fits, mask, cube):
+    cube[1] *= 3
+    cube[2] *= 2
+    path = write_fits("a.fits", cube)
+    best = read_observation([path], mask, skip=[1], keep=0.5, keep_by="flux").frames
+    assert torch.equal(best, torch.from_numpy(cube[2:]).double())
+    with pytest.raises(ValueError, match="skip names frame 3, but the stack has 3"):
+        read_observation(path, mask, skip=[3])
+
+
+def test_negative_frames_are_left_out_with_a_notice(write_fits, mask, cube):
+    path = write_fits("a.fits", np.concatenate([-cube[:1], cube]), extensions=[("ERR", np.ones((4, 16, 20)))])
+    with pytest.warns(UserWarning, match=r"frames \[0\] hold no light"):
+        seen = read_observation(path, mask)
+    assert torch.equal(seen.frames, torch.from_numpy(cube).double())
+    assert seen.errors.shape == seen.valid.shape == seen.frames.shape
+
+
 def test_calibration_files_and_arrays_are_applied(write_fits, mask, cube):
     """Dark as an array, flat as a file, bad pixels as a tensor; of a cube the median counts."""
     rng = np.random.default_rng(0)

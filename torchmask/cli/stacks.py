@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import torch
+
 from torchmask.cli.options import MaskOptions, load_aperture, told_wavelength
+from torchmask.data.light import usable_frames
 from torchmask.data.observe import read_observation
 from torchmask.grid import ARCSEC, Grid
 from torchmask.observation import Observation, check_frames
@@ -20,11 +24,13 @@ class FITSOptions:
     """What the header of a FITS file may lack, and calibration. What is given wins over the header."""
 
     unit: str | None = None
-    """Such as "adu", "electron / s" or "250 electron"; None: BUNIT, else adu if a gain is known, else electron."""
+    """Such as "adu", "electron / s" or "250 electron"; None: from the header (BUNIT), or else adu."""
     gain: float | None = None
     """Electrons per adu; None: from the header (EGAIN, GAIN)."""
     exposure_time: float | None = None
     """Of one frame [s], for units per second; None: from the header."""
+    saturation: float | None = None
+    """Value in the file from which on a pixel is full, in its unit; None: from the header (SATURATE, FULLWELL)."""
     dark: Path | None = None
     """FITS image that is subtracted, in the units of the files."""
     flat: Path | None = None
@@ -51,6 +57,8 @@ class StackOptions(MaskOptions, FITSOptions):
     """Angle on the sky of one pixel [arcsec]; None: as the file says."""
     readout_noise: float | None = None
     """Electrons rms per pixel and frame; None: as the file says, or else measured on the frames."""
+    skip: tuple[int, ...] = ()
+    """Frames to leave out, counted from 0 through all files of a stack."""
     errors: bool = True
     """Weigh pixels by the standard deviations in the file (FITS extension ERR), where it has them."""
 
@@ -99,7 +107,22 @@ def _read(files: Sequence[Path], options: StackOptions) -> Observation:
         changes["aperture"] = load_aperture(options)
     if options.readout_noise is not None:
         changes["readout_noise"] = options.readout_noise
-    return dataclasses.replace(observation, **changes)
+    return _usable(dataclasses.replace(observation, **changes), files[0], options)
+
+
+def _usable(observation: Observation, path: Path, options: StackOptions) -> Observation:
+    """The frames that are not skipped and hold light."""
+    frames = observation.frames
+    valid = torch.isfinite(frames) if observation.valid is None else observation.valid.expand_as(frames)
+    try:
+        return observation.take(usable_frames(frames.numpy(), valid.numpy(), options.skip))
+    except ValueError as error:
+        raise ValueError(f"{path}: {_as_option(str(error))}") from error
+
+
+def _as_option(message: str) -> str:
+    """A message that begins with the name of `skip`, as the command line calls it."""
+    return re.sub(r"^skip", "--skip", message)
 
 
 def _from_fits(files: Sequence[Path], options: StackOptions) -> Observation:
@@ -108,11 +131,11 @@ def _from_fits(files: Sequence[Path], options: StackOptions) -> Observation:
     scale = options.pixel_scale_arcsec
     given = {item.name: getattr(options, item.name) for item in dataclasses.fields(FITSOptions)}
     given |= {"wavelength": options.wavelength, "readout_noise": options.readout_noise}
-    given |= {"design_wavelength": told_wavelength(options)}
+    given |= {"skip": options.skip, "design_wavelength": told_wavelength(options)}
     try:
         return read_observation(files, aperture, pixel_scale=None if scale is None else scale * ARCSEC, **given)
     except ValueError as error:
-        message = str(error).replace("give pixel_scale [rad]", "give --pixel-scale-arcsec [arcsec]")
+        message = _as_option(str(error)).replace("give pixel_scale [rad]", "give --pixel-scale-arcsec [arcsec]")
         for name in given:
             message = message.replace(f"give {name}", f"give --{name.replace('_', '-')}")
         raise ValueError(message) from error

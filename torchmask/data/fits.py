@@ -18,7 +18,7 @@ class FITSImages:
     path : where they come from
     values : (T, H, W) float64
     errors : (T, H, W) or None, from an ERR extension
-    valid : (T, H, W) bool: finite, and not marked in a DQ extension
+    valid : (T, H, W) bool: finite, not marked as bad in an extension, and below what the file's integers can hold
     header : the cards that hold a value: the image's, and where it has none, those of the primary header
     is_cube : whether the file itself has a time axis
     """
@@ -34,8 +34,9 @@ class FITSImages:
 def read_fits(path: str | Path) -> FITSImages:
     """Read an image (H, W) or a cube (T, H, W): the SCI extension, or else the first image in the file.
 
-    A pixel is not valid where a value or error is not finite, or where DQ is set: for JWST its lowest bit, DO_NOT_USE
-    (the others tell what was done to a pixel that is good), for others any bit.
+    A pixel is not valid where a value or error is not finite, or where an extension BADPIX, BPM or DQ is not 0: of DQ
+    for JWST the lowest bit, DO_NOT_USE (the others tell what was done to a pixel that is good), for others any bit.
+    Nor is it where integers of 8 or 16 bits are at their largest value, at which a converter stops.
 
     Raises
     ------
@@ -87,6 +88,11 @@ def _images(path: Path, hdus: Any) -> FITSImages:
     header = _cards(hdus[0].header) | _cards(images[0].header)
     errors, quality = (_extension(hdus, name, values.shape) for name in ("ERR", "DQ"))
     valid = np.isfinite(values)
+    if values.dtype.kind in "iu" and values.dtype.itemsize <= 2:
+        valid &= values < np.iinfo(values.dtype.newbyteorder("=")).max
+    for marked in (_extension(hdus, name, values.shape) for name in ("BADPIX", "BPM")):
+        if marked is not None:
+            valid &= marked == 0
     if errors is not None:
         valid &= np.isfinite(errors)
     if quality is not None:

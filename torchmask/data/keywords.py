@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import re
-import warnings
 from typing import Any
 
 import numpy as np
@@ -89,26 +88,44 @@ def exposure_seconds(header: Any, path: Any, is_cube: bool, given: float | None)
     return number(header, ("EFFINTTM",) * is_cube + ("XPOSURE", "EXPTIME", "EFFEXPTM"), path)
 
 
+def saturation(header: Any, path: Any, electrons_per_unit: float, given: float | None) -> float | None:
+    """From which value in the file on a pixel is full: SATURATE or FULLWELL [electrons], the lower; None if unknown."""
+    if given is not None:
+        return given
+    level, well = number(header, ("SATURATE",), path), number(header, ("FULLWELL",), path)
+    levels = ([level] if level else []) + ([well / electrons_per_unit] if well else [])
+    return min(levels, default=None)
+
+
+def closed_shutter(header: Any) -> str | None:
+    """What the header says if no light fell on the detector: a dark, a bias, a shutter that is closed; else None."""
+    for name in ("IMAGETYP", "OBSTYPE", "IMAGE_TYPE", "EXP_TYPE", "ESO DPR TYPE"):
+        words = re.split(r"[^a-z]+", str(header.get(name, "")).lower())
+        if {"dark", "bias", "zero"} & set(words):
+            return f"{name} is {header[name]!r}"
+    if str(header.get("SHUTTER", "")).strip().lower() in ("closed", "close", "shut"):
+        return f"SHUTTER is {header['SHUTTER']!r}"
+    return None
+
+
 def electrons_per_unit(
     header: Any, path: Any, is_cube: bool, unit: str | None, gain: float | None, exposure_time: float | None
 ) -> float:
     """Electrons in a frame for one unit of the file.
 
     `unit` or BUNIT: electrons or photons; adu, DN or counts (times GAIN [electrons]); any of them per second (times
-    the exposure time of a frame [s]); MJy/sr (through JWST's PHOTMJSR). Without either: adu if a gain is known, else
-    electrons, with a warning.
+    the exposure time of a frame [s]); MJy/sr (through JWST's PHOTMJSR). Without either: adu if a gain is known.
 
-    Raises ValueError if the unit is not known or what its conversion needs is missing.
+    Raises ValueError if the unit is not known, nothing tells it, or what its conversion needs is missing.
     """
     from astropy import units
 
     text = unit or str(header.get("BUNIT", "")).strip()
-    gain = number(header, ("EGAIN", "GAIN"), path) if gain is None else gain
+    gain = (number(header, ("EGAIN", "GAIN"), path) or None) if gain is None else gain
     if not text:
         if gain is not None:
             return gain
-        warnings.warn("no BUNIT and no GAIN in the header: pixels are taken for electrons; unit tells", stacklevel=2)
-        return 1.0
+        raise missing(path, "BUNIT and no GAIN", "gain [electrons per adu]; if pixels are not in adu, give unit")
 
     def electrons(counted: Any) -> float:
         if counted in (units.electron, units.photon):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ import torch
 from torchmask.data import keywords
 from torchmask.data.calibration import SELECTIONS, best_frames, calibrate, crop_corner, find_target
 from torchmask.data.fits import FITSImages, read_fits
+from torchmask.data.light import usable_frames
 from torchmask.grid import ARCSEC, Grid
 from torchmask.observation import Observation, pixel_matrix
 from torchmask.optics.aperture import Aperture
@@ -31,11 +34,13 @@ def read_observation(
     gain: float | None = None,
     exposure_time: float | None = None,
     readout_noise: float | None = None,
+    saturation: float | None = None,
     dark: Any = None,
     flat: Any = None,
     bad_pixels: Any = None,
     crop: int | None = None,
     target: tuple[int, int] | None = None,
+    skip: Sequence[int] = (),
     keep: float | None = None,
     keep_by: str = "sharpness",
 ) -> Observation:
@@ -47,7 +52,8 @@ def read_observation(
     ----------
     paths : path or sequence of paths
         FITS files of one filter, pixel scale and orientation. The SCI extension is read, or else the first image;
-        ERR becomes `errors`, DQ marks pixels that are not valid.
+        ERR becomes `errors`; DQ, BADPIX or BPM mark pixels that are not valid. Files whose header says dark, bias or
+        closed shutter are left out, with a warning, and so are frames that hold no light.
     aperture : Aperture
         That they were taken through, in metres on the pupil, x and y along the image's columns and rows.
     wavelength : float, optional
@@ -58,13 +64,16 @@ def read_observation(
         [rad]. Header: PIXELSCL [arcsec], or CD, PC or CDELT.
     unit : str, optional
         Unit of the pixels, such as "adu", "electron / s" or "250 electron". Header: BUNIT; without it the pixels
-        are in adu where a gain is known, and in electrons (with a warning) where none is.
+        are in adu, and a gain is needed.
     gain : float, optional
         Electrons per adu (DN, count). Header: EGAIN, GAIN.
     exposure_time : float, optional
         Of one frame [s], for units per second. Header: XPOSURE, EXPTIME; EFFINTTM for cubes of JWST.
     readout_noise : float, optional
         [electrons rms]. Header: RDNOISE, READNOIS. It may remain unknown.
+    saturation : float, optional
+        Value of a pixel in the file, in its unit, from which on the pixel is full and not valid. Header: SATURATE, or
+        FULLWELL [electrons].
     dark, flat, bad_pixels : path or (H, W) array, optional
         In the units of the file; of any scale; not 0 where bad. Of a cube the median is used.
     crop : int, optional
@@ -72,6 +81,8 @@ def read_observation(
         in all frames of a file, found afresh in every file. The sky coordinates move with it.
     target : (row, column), optional
         Pixel of the target in every file, counted from 0. None: where the mean frame is brightest.
+    skip : sequence of int
+        Frames to leave out, counted from 0 through all files.
     keep : float, optional
         Fraction of the frames to keep: those of highest `keep_by`, "sharpness" or "flux".
 
@@ -93,12 +104,14 @@ def read_observation(
     >>> observation.frames.shape, observation.readout_noise
     (torch.Size([5, 32, 32]), 1.5)
     """
-    _check_options(wavelength, design_wavelength, pixel_scale, gain, exposure_time, readout_noise, crop, keep, keep_by)
+    positive = (wavelength, design_wavelength, pixel_scale, gain, exposure_time, saturation)
+    _check_options(positive, readout_noise, crop, keep, keep_by)
     if target is not None and crop is None:
         raise ValueError(f"target is {target}, the middle of the field to cut out: give crop [pixels] too")
     files = [read_fits(path) for path in ([paths] if isinstance(paths, str | Path) else list(paths))]
     if not files:
         raise ValueError("paths is empty: give at least one FITS file")
+    files = _without_darks(files)
     lengths = [keywords.wavelength(file.header, file.path, wavelength, design_wavelength) for file in files]
     scales = [keywords.pixel_scale(file.header, file.path, pixel_scale) for file in files]
     _check_alike(files, lengths, scales)
@@ -111,19 +124,17 @@ def read_observation(
     blur = max(1.0, lengths[0] / aperture.extent / scales[0] / 2)
     stacks, headers = [], []
     for file, factor in zip(files, factors, strict=True):
-        stack, header = _stack(file, factor, images, crop, target, blur)
+        full = keywords.saturation(file.header, file.path, factor, saturation)
+        stack, header = _stack(_below(file, full), factor, images, crop, target, blur)
         stacks.append(stack)
         headers.append(header)
     frames = np.concatenate([stack[0] for stack in stacks])
     valid = np.concatenate([stack[2] for stack in stacks])
     errors = _joined([stack[1] for stack in stacks])
     _check_rotation(files, frames.shape[-1])
-    lit = valid.any((1, 2))
-    if not lit.all():
-        raise ValueError(f"frames {np.flatnonzero(~lit).tolist()} have no valid pixel: leave their files out")
+    kept = usable_frames(frames, valid, skip)
     if keep is not None:
-        kept = best_frames(frames, valid, keep, keep_by)
-        frames, valid, errors = frames[kept], valid[kept], None if errors is None else errors[kept]
+        kept = kept[best_frames(frames[kept], valid[kept], keep, keep_by)]
     known = [noise for noise in noises if noise is not None]
     if readout_noise is None and len(known) == len(files):
         readout_noise = math.sqrt(sum(noise**2 for noise in known) / len(known))
@@ -136,7 +147,32 @@ def read_observation(
         valid=torch.from_numpy(valid),
         errors=None if errors is None else torch.from_numpy(errors),
         header=headers[0] | _mean_exposure(files, times),
+    ).take(kept)
+
+
+def _without_darks(files: Sequence[FITSImages]) -> list[FITSImages]:
+    """The files that were taken with an open shutter. Warns of others; raises ValueError if there are only those."""
+    closed = {file.path: keywords.closed_shutter(file.header) for file in files}
+    told = "; ".join(f"{path}: {why}" for path, why in closed.items() if why)
+    opened = [file for file in files if not closed[file.path]]
+    if not opened:
+        raise ValueError(f"no file holds light ({told}): give exposures of the target")
+    if told:
+        warnings.warn(f"files without light are left out ({told}); dark subtracts one", stacklevel=3)
+    return opened
+
+
+def _below(file: FITSImages, full: float | None) -> FITSImages:
+    """The same with pixels of the value `full` or more, in the unit of the file, marked as not valid."""
+    spoilt = np.zeros_like(file.valid) if full is None else file.valid & (file.values >= full)
+    if not spoilt.any():
+        return file
+    warnings.warn(
+        f"{file.path}: {spoilt.sum()} pixels in {spoilt.any((1, 2)).sum()} frames are saturated ({full:.5g} or more) "
+        "and carry no weight",
+        stacklevel=3,
     )
+    return replace(file, valid=file.valid & ~spoilt)
 
 
 def _mean_exposure(files: Sequence[FITSImages], times: Sequence[float | None]) -> dict[str, float]:
@@ -147,25 +183,20 @@ def _mean_exposure(files: Sequence[FITSImages], times: Sequence[float | None]) -
     return {"XPOSURE": sum(time * count for time, count in known) / sum(count for _, count in known)}
 
 
+_POSITIVE = {
+    "wavelength": "m",
+    "design_wavelength": "m",
+    "pixel_scale": "rad",
+    "gain": "electrons per adu",
+    "exposure_time": "s",
+    "saturation": "the unit of the file",
+}
+
+
 def _check_options(
-    wavelength: float | None,
-    design_wavelength: float | None,
-    pixel_scale: float | None,
-    gain: float | None,
-    exposure_time: float | None,
-    readout_noise: float | None,
-    crop: int | None,
-    keep: float | None,
-    keep_by: str,
+    positive: Sequence[float | None], readout_noise: float | None, crop: int | None, keep: float | None, keep_by: str
 ) -> None:
-    positive = {
-        "wavelength": (wavelength, "m"),
-        "design_wavelength": (design_wavelength, "m"),
-        "pixel_scale": (pixel_scale, "rad"),
-        "gain": (gain, "electrons per adu"),
-        "exposure_time": (exposure_time, "s"),
-    }
-    for name, (value, unit) in positive.items():
+    for (name, unit), value in zip(_POSITIVE.items(), positive, strict=True):
         if value is not None and not (math.isfinite(value) and value > 0):
             raise ValueError(f"{name} is {value}: it must be finite and positive, in {unit}")
     if readout_noise is not None and not (math.isfinite(readout_noise) and readout_noise >= 0):
