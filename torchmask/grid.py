@@ -175,7 +175,8 @@ class Grid:
             # rounded down, so that the printed value is accepted
             needed = self.wavelength / (2 * diameter) * (1 - 5e-5)
             raise ValueError(
-                f"pixel_scale {self.pixel_scale:.4g} rad undersamples an aperture of {diameter:.4g} m at "
+                f"pixel_scale {self.pixel_scale:.4g} rad ({self.pixel_scale / ARCSEC:.4g} arcsec) undersamples an "
+                f"aperture of {diameter:.4g} m at "
                 f"{self.wavelength:.4g} m (cut-off {self.cutoff(diameter):.3f} cycles/pixel, above 1/2): "
-                f"pixel_scale must be at most {needed:.5g} rad"
+                f"pixel_scale must be at most {needed:.5g} rad ({needed / ARCSEC:.5g} arcsec)"
             )

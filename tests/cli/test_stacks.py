@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -64,3 +65,37 @@ def test_a_cube_in_adu_needs_a_gain(write_fits, fits_cube):
     with pytest.raises(ValueError, match=r"give --gain \[electrons per adu\]; if pixels are not in adu, give --unit"):
         read_stack(raw, StackOptions(mask=Path("keck_nirc2_9")))
     assert len(read_stack(raw, StackOptions(mask=Path("keck_nirc2_9"), gain=2.0)).frames) == 3
+
+
+FULL = {"mask": Path("full"), "mask_diameter": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"exposure_time": -1.0}, "exposure_time is -1.0: it must be finite and positive, in s"),
+        ({"gain": 0.0}, "gain is 0.0: it must be finite and positive, in electrons per adu"),
+        ({"saturation": -1.0}, "saturation is -1.0: it must be finite and positive"),
+        ({"readout_noise": -1.0}, "readout_noise is -1.0: it must be finite and at least 0"),
+        ({"pixel_scale_arcsec": 0.0}, "--pixel-scale-arcsec is 0: it must be finite and positive, in arcsec"),
+        ({"wavelength": 2.2}, r"--wavelength is 2\.2: .* 2\.2 micrometres are 2\.2e-6"),
+    ],
+)
+def test_numbers_that_cannot_be_are_refused_in_the_unit_of_their_option(write_fits, fits_cube, given, message):
+    with pytest.raises(ValueError, match=message):
+        read_stack([write_fits("a.fits", fits_cube)], StackOptions(**FULL | given))
+
+
+def test_an_unknown_filter_lists_the_known_ones(write_fits, fits_cube):
+    path = write_fits("a.fits", fits_cube, WAVELEN=None, INSTRUME="NIRISS", FILTER="F999Z")
+    with pytest.raises(ValueError, match=r"'F999Z' of INSTRUME 'NIRISS'; known: .*NIRISS F480M"):
+        read_stack([path], StackOptions(**FULL))
+
+
+@pytest.mark.parametrize(
+    ("errors", "message"),
+    [(np.ones((2, 16, 20)), r"ERR of shape \(2, 16, 20\)"), (-np.ones((3, 16, 20)), r"errors is not positive at 960")],
+)
+def test_errors_that_cannot_be_are_refused(write_fits, fits_cube, errors, message):
+    with pytest.raises(ValueError, match=message):
+        read_stack([write_fits("a.fits", fits_cube, extensions=[("ERR", errors)])], StackOptions(**FULL))

@@ -118,6 +118,8 @@ def outside(options: Options) -> tuple[TurbulencePhase, Detector]:
     imaging = options.imaging
     if not imaging.d_over_r0 > 0:
         raise ValueError(f"imaging.d_over_r0 is {imaging.d_over_r0}: it must be positive")
+    if not imaging.outer_scale > 0:
+        raise ValueError(f"imaging.outer_scale is {imaging.outer_scale}: it must be positive, in units of the diameter")
     turbulence = TurbulencePhase(imaging.diameter / imaging.d_over_r0, imaging.outer_scale * imaging.diameter)
     return turbulence, Detector(imaging.readout_noise)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -9,6 +10,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from torchmask.design.manufacture import load_mask, mask_wavelength
+from torchmask.grid import ARCSEC
 from torchmask.optics.aperture import Aperture, FullAperture, SparseAperture
 from torchmask.optics.overlaps import check_overlaps
 from torchmask.record import Callback
@@ -82,6 +84,15 @@ def require_wavelength(metres: float, option: str = "--wavelength") -> None:
     raise ValueError(f"{option} is {metres:g}: it must be a wavelength of light in m, such as 550e-9{meant}")
 
 
+def pixel_angle(arcsec: float | None) -> float | None:
+    """The angle of --pixel-scale-arcsec [rad]. Raises ValueError, in arcsec, unless it is finite and positive."""
+    if arcsec is None:
+        return None
+    if not (math.isfinite(arcsec) and arcsec > 0):
+        raise ValueError(f"--pixel-scale-arcsec is {arcsec:g}: it must be finite and positive, in arcsec")
+    return arcsec * ARCSEC
+
+
 @dataclass(frozen=True)
 class SearchOptions:
     """The search for the mask, and the criterion it minimises."""
@@ -143,6 +154,11 @@ def load_aperture(options: MaskOptions) -> Aperture:
         if options.mask_diameter is None:
             raise ValueError("a full pupil needs --mask-diameter [m]")
         FullAperture(options.mask_diameter)  # raises for a diameter that nothing can be divided by
+        if not 0 <= options.central_obstruction < options.mask_diameter:
+            raise ValueError(
+                f"--central-obstruction is {options.central_obstruction:g} m: it must be at least 0 and less than "
+                f"--mask-diameter, {options.mask_diameter:g} m"
+            )
         return FullAperture(options.mask_diameter, options.central_obstruction / options.mask_diameter)
     if options.central_obstruction:
         raise ValueError("--central-obstruction is for a full pupil (--mask full); a mask has the holes that it has")

@@ -10,7 +10,14 @@ import torch
 from torchmask.atmosphere.layers import Layers
 from torchmask.atmosphere.phase import LayeredPhase, TurbulencePhase
 from torchmask.atmosphere.profiles import named_layers
-from torchmask.cli.options import MaskOptions, RunOptions, load_aperture, require_wavelength, told_wavelength
+from torchmask.cli.options import (
+    MaskOptions,
+    RunOptions,
+    load_aperture,
+    pixel_angle,
+    require_wavelength,
+    told_wavelength,
+)
 from torchmask.cli.report import log_observation
 from torchmask.cli.run import new_run
 from torchmask.grid import ARCSEC, Grid
@@ -168,14 +175,15 @@ def run(options: Options) -> None:
     wavelength = observing_wavelength(options)
     conditions = options.conditions.make(options.turbulence.exposure_time, wavelength)
     turbulence = options.turbulence.make(options.r0, wavelength, options.outer_scale)
-    if options.pixel_scale_arcsec is None:
+    pixel_scale = pixel_angle(options.pixel_scale_arcsec)
+    if pixel_scale is None:
         # Real masks may reach beyond their nominal pupil.
         diameter = max(told.mask_diameter, told.extent, aperture.extent)
         shortest = wavelength if conditions.band is None else conditions.band.shortest
         finest = Grid.nyquist(diameter, shortest, options.n_pixels)
         grid = Grid(options.n_pixels, finest.pixel_scale, wavelength)
     else:
-        grid = Grid(options.n_pixels, options.pixel_scale_arcsec * ARCSEC, wavelength)
+        grid = Grid(options.n_pixels, pixel_scale, wavelength)
     detector = Detector(options.readout_noise)
     scene = make_scene(grid.shape, options.n_photons, options.scene)
     with new_run("simulate", options, options.seed) as output:

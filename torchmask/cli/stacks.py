@@ -11,10 +11,10 @@ from typing import Any, Literal
 
 import torch
 
-from torchmask.cli.options import MaskOptions, load_aperture, told_wavelength
+from torchmask.cli.options import MaskOptions, load_aperture, pixel_angle, require_wavelength, told_wavelength
 from torchmask.data.light import usable_frames
 from torchmask.data.observe import read_observation
-from torchmask.grid import ARCSEC, Grid
+from torchmask.grid import Grid
 from torchmask.observation import Observation, check_frames
 from torchmask.restoration.noise import check_errors
 
@@ -78,6 +78,8 @@ def group_files(files: Sequence[Path], join: bool) -> dict[str, list[Path]]:
 
 def read_stack(files: Sequence[Path], options: StackOptions) -> Observation:
     """One stack: an .npz file, or FITS files that belong together. Raises ValueError for what is missing or wrong."""
+    if options.wavelength is not None:
+        require_wavelength(options.wavelength)
     observation = _read(files, options)
     if not options.errors or observation.errors is None:
         return dataclasses.replace(observation, errors=None)
@@ -97,11 +99,9 @@ def _read(files: Sequence[Path], options: StackOptions) -> Observation:
         if getattr(options, item.name) != item.default:
             raise ValueError(f"--{item.name.replace('_', '-')} is for FITS files; {files[0]} is none")
     observation = Observation.load(files[0])
-    grid, scale = observation.grid, options.pixel_scale_arcsec
+    grid, scale = observation.grid, pixel_angle(options.pixel_scale_arcsec)
     changes: dict[str, Any] = {
-        "grid": Grid(
-            grid.n_pixels, scale * ARCSEC if scale else grid.pixel_scale, options.wavelength or grid.wavelength
-        )
+        "grid": Grid(grid.n_pixels, scale or grid.pixel_scale, options.wavelength or grid.wavelength)
     }
     if options.mask is not None:
         changes["aperture"] = load_aperture(options)
@@ -128,12 +128,12 @@ def _as_option(message: str) -> str:
 def _from_fits(files: Sequence[Path], options: StackOptions) -> Observation:
     """Read FITS files; what their header lacks is named as the option of the command line that supplies it."""
     aperture = load_aperture(options)
-    scale = options.pixel_scale_arcsec
+    scale = pixel_angle(options.pixel_scale_arcsec)
     given = {item.name: getattr(options, item.name) for item in dataclasses.fields(FITSOptions)}
     given |= {"wavelength": options.wavelength, "readout_noise": options.readout_noise}
     given |= {"skip": options.skip, "design_wavelength": told_wavelength(options)}
     try:
-        return read_observation(files, aperture, pixel_scale=None if scale is None else scale * ARCSEC, **given)
+        return read_observation(files, aperture, pixel_scale=scale, **given)
     except ValueError as error:
         message = _as_option(str(error)).replace("give pixel_scale [rad]", "give --pixel-scale-arcsec [arcsec]")
         for name in given:
