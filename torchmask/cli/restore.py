@@ -218,7 +218,11 @@ def log(
     scale = observation.grid.pixel_scale
     logger.figure(
         f"{prefix}restored",
-        restored_figure(result.object, observation.frames, result.residuals, scale, deviation=result.object_std),
+        restored_figure(
+            *(result.object, observation.frames, result.residuals, scale),
+            deviation=result.object_std,
+            sky=observation.sky_matrix,
+        ),
     )
     logger.figure(f"{prefix}cost", viz.history_figure({"restoration": result.cost.tolist()}, "cost"))
     if observation.object is not None:
