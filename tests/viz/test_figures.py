@@ -245,7 +245,7 @@ def test_comparison_shows_what_is_scored():
     assert bar.get_ylim() == (0, pytest.approx(peak))
     assert axes[0].texts[0].get_text() == "200 mas"  # a third of 32 pixels of 20.6 mas is 220
     assert len(viz.comparison_figure(truth, {"mask": (frame, restored)}, 0.3).axes) == 5  # with the bar
-    assert len(viz.comparison_figure(truth, dict.fromkeys("abc", (frame, restored)), 0.3).axes) == 8
+    assert len(viz.comparison_figure(truth, dict.fromkeys("abc", (frame, restored)), 0.3).axes) == 9
 
 
 @pytest.mark.parametrize(
