@@ -12,11 +12,13 @@ import tyro
 
 from torchmask import __version__
 from torchmask.cli.config import stored
+from torchmask.cli.oifits import OIFITSOptions, measure_frames, write_frames
 from torchmask.cli.options import RunOptions, WorkerOptions
 from torchmask.cli.report import restored_figure
 from torchmask.cli.run import CHECKPOINT, new_run
 from torchmask.cli.stacks import StackOptions, group_files, read_stack
 from torchmask.data.restored import save_restored
+from torchmask.interferometry.observables import Observables
 from torchmask.io import new_folder, write_json
 from torchmask.metrics import relative_error, ssim
 from torchmask.observation import Observation
@@ -32,7 +34,7 @@ SKIES = {"if-seen": Background.IF_SEEN, "per-frame": Background.PER_FRAME, "none
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(StackOptions, WorkerOptions, RunOptions):
+class Options(StackOptions, OIFITSOptions, WorkerOptions, RunOptions):
     """Restore the image behind a stack of short exposures with unknown aberrations (myopic deconvolution).
 
     A stack is an .npz file (`torchmask simulate` writes such) or a FITS cube; several are restored side by side, each
@@ -103,7 +105,9 @@ def restore_one(files: Sequence[Path], options: Options) -> None:
     if checkpoint is not None and not checkpoint.is_file():
         raise ValueError(f"there is no {checkpoint} to go on from: it is written at the 100th iteration")
     method = deconvolution(observation, options)
+    observables = measure_frames(observation, options, known_sky(options))
     with new_run("restore", options) as output:
+        output.summary.extend(write_frames(output.directory, observables, observation, options))
         state = output.directory / CHECKPOINT
         if checkpoint is not None:
             shutil.copyfile(checkpoint, state)
@@ -124,11 +128,14 @@ def restore_several(stacks: Mapping[str, Sequence[Path]], options: Options) -> N
     """Each stack on a core, and what was found in a folder of its name; failures are told when all have ended."""
     observations: dict[str, Observation] = {}
     methods: list[MyopicDeconvolution] = []
+    observables: dict[str, Observables | None] = {}
     failures: dict[str, Exception] = {}
     for name, files in stacks.items():
         try:
             observations[name] = read_stack(files, options)
-            methods.append(deconvolution(observations[name], options))
+            method = deconvolution(observations[name], options)
+            observables[name] = measure_frames(observations[name], options, known_sky(options))
+            methods.append(method)
         except (ValueError, OSError) as error:
             observations.pop(name, None)
             failures[name] = error
@@ -143,7 +150,9 @@ def restore_several(stacks: Mapping[str, Sequence[Path]], options: Options) -> N
             if isinstance(result, Exception):
                 failures[name] = result
                 continue
-            tables[name] = write(new_folder(output.directory / name), stacks[name], seen[number], result, options)
+            folder = new_folder(output.directory / name)
+            tables[name] = write(folder, stacks[name], seen[number], result, options)
+            output.summary.extend(write_frames(folder, observables[name], seen[number], options))
             log(seen[number], result, tables[name], output.logger, f"{name}/")
             output.summary.append(f"{name}: {result.summary()}")
         tables |= {name: {"error": str(error)} for name, error in failures.items()}
@@ -175,6 +184,11 @@ def deconvolution(observation: Observation, options: Options) -> MyopicDeconvolu
         max_iterations=options.max_iterations,
         tolerance=options.tolerance,
     )
+
+
+def known_sky(options: Options) -> float:
+    """What --sky says of its light [electrons per pixel]; 0 where it is to be found."""
+    return 0.0 if isinstance(options.sky, str) else options.sky
 
 
 def write(
