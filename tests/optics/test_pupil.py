@@ -101,7 +101,7 @@ def test_rows_are_y_and_columns_are_x():
 def test_weights_are_fractions_and_move_by_whole_samples(x, y, shape, angle):
     aperture = SparseAperture([[x, y]], 0.25, 1.0, shape, angle)
     samples = aperture.samples(GRID)
-    # Three squares of up to (a + b)^2 over 2 a b, where a side b counts as 1e-4 a at least: each rounds by 2^-53 of 5e3.
+    # Three squares of up to (a + b)^2 over 2 a b, b counting as 1e-4 a at least: each rounds by 2^-53 of 5e3.
     rounding = 3 * 5e3 * 2**-53
     assert float(samples.weights.min()) >= -rounding
     assert float(samples.weights.max()) <= 1 + rounding
