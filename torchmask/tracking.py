@@ -6,7 +6,7 @@ A run folder holds
     metrics.jsonl            one JSON object per line: stage, step, n_steps, seconds, scalars
     config.json              what was asked for
     environment.json         command, seed, versions
-    status.json              running, finished, interrupted or failed
+    status.json              running, finished, interrupted or failed, and what it came to
     checkpoints/STAGE.npz    the last state of each stage
     NAME.png                 figures
 """
@@ -92,6 +92,7 @@ class RunLogger:
         self._image_steps: dict[str, int] = {}
         self._session_end: Any = None
         self._closed = False
+        self._conclusion: dict[str, Any] = {}
         self.writer: Any = SummaryWriter(str(self.directory), flush_secs=_FLUSH_INTERVAL)
         self._metrics = open(self.directory / "metrics.jsonl", "x", encoding="utf-8", buffering=1)  # noqa: SIM115
         self._write_status("running")
@@ -162,6 +163,10 @@ class RunLogger:
             raise ValueError(f"table {tag} needs rows that all have the same columns; the first has {columns}")
         lines = [columns, ["---"] * len(columns), *([_cell(value) for value in row.values()] for row in rows)]
         self.text(tag, "\n".join(f"| {' | '.join(line)} |" for line in lines), step)
+
+    def conclude(self, **values: Any) -> None:
+        """Say in status.json what the run came to, such as a verdict. Raises TypeError for what JSON cannot hold."""
+        self._conclusion |= to_json(values)
 
     def close(self, status: str = "finished", error: str | None = None) -> None:
         """Write the last states and images, and how the run ended. A second call does nothing."""
@@ -237,7 +242,7 @@ class RunLogger:
 
     def _write_status(self, status: str, error: str | None = None) -> None:
         seconds = round(time.monotonic() - self._start, 3)
-        state = {"status": status, "seconds": seconds, "error": error}
+        state = {"status": status, "seconds": seconds, "error": error, **self._conclusion}
         write_json(self.directory / "status.json", state, replace=True)
 
 

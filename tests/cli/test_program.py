@@ -12,7 +12,7 @@ from typing import Literal
 
 import pytest
 
-from torchmask.cli.program import parse, run_script
+from torchmask.cli.program import NOT_EXPLAINED, parse, run_script
 
 
 @dataclass(frozen=True)
@@ -132,6 +132,11 @@ def test_an_interruption_is_130(capsys):
     assert capsys.readouterr().err == "program: interrupted\n"
     with pytest.raises(KeyboardInterrupt):
         status(fails(KeyboardInterrupt()), "--debug")
+
+
+def test_a_program_may_have_a_status_to_tell():
+    assert status(lambda _: None) == 0
+    assert status(lambda _: NOT_EXPLAINED) == 3
 
 
 def test_termination_interrupts_as_well(capsys):

@@ -41,7 +41,7 @@ def test_the_folder_tells_how_to_do_it_again_and_what_came_out(tmp_path, capsys)
         output.report("result", {"rows": [1, 2]}, "# Result\n", Figure())
         output.summary.append("all of it is done")
     folder = tmp_path / "runs" / "first"
-    assert capsys.readouterr().out == f"all of it is done\nwritten to {folder}\n"
+    assert capsys.readouterr().out == f"written to {folder}\nall of it is done\n"
     assert load_config(folder / "config.yaml", SweepOptions, "program") == SweepOptions(smoke=True)
     assert json.loads((folder / "environment.json").read_text())["seed"] == 7
     assert json.loads((folder / "result.json").read_text()) == {"rows": [1, 2]}

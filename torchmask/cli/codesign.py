@@ -32,6 +32,7 @@ from torchmask.restoration.background import Background
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.result import RestorationResult
 from torchmask.restoration.schedule import Schedule
+from torchmask.restoration.verdict import Verdict
 from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
 from torchmask.spectra import NoisePSD
@@ -203,8 +204,10 @@ def metrics(observation: Observation, result: RestorationResult, cutoff: float) 
     }
 
 
-def codesign(options: Options, scene: torch.Tensor, output: Run) -> dict[str, dict[str, float]]:
-    """Design, observe, restore and compare; returns the metrics of each instrument."""
+def codesign(
+    options: Options, scene: torch.Tensor, output: Run
+) -> tuple[dict[str, dict[str, float]], dict[str, Verdict | None]]:
+    """Design, observe, restore and compare; returns the metrics of each instrument, and the verdicts."""
     logger, callback = output.logger, output.callback
     design = design_mask(options, callback)
     log_design(design, image_grid(options), logger)
@@ -217,12 +220,13 @@ def codesign(options: Options, scene: torch.Tensor, output: Run) -> dict[str, di
         "subaperture_diameter": mask.subaperture_diameter,
         "relative_mse": design.relative_mse,
     }
-    pictures = {}
+    pictures, verdicts = {}, dict[str, Verdict | None]()
     for name, aperture in (("mask", mask), ("full", full)):
         light = scene * (aperture.area / mask.area)
         observation = observe(options, light, aperture, label_stage(callback, name))
         log_observation(f"observation/{name}", observation, logger)
         result = restore(options, observation, label_stage(callback, name))
+        verdicts[name] = result.verdict
         logger.figure(f"restoration/{name}_cost", viz.history_figure({name: result.cost.tolist()}, "cost"))
         table[name] = metrics(observation, result, cutoff)
         for key, value in table[name].items():
@@ -233,7 +237,8 @@ def codesign(options: Options, scene: torch.Tensor, output: Run) -> dict[str, di
     logger.figure("comparison", viz.comparison_figure(scene, pictures, cutoff, image_grid(options).pixel_scale))
     logger.table("comparison/table", [{"instrument": name, **row} for name, row in table.items()])
     save_npz(logger.directory / "result.npz", {**arrays, "scene": scene})
-    return table
+    logger.conclude(verdicts={name: verdict and verdict.to_json() for name, verdict in verdicts.items()})
+    return table, verdicts
 
 
 def print_table(table: dict[str, dict[str, float]]) -> None:
@@ -254,5 +259,6 @@ def run(options: Options) -> None:
     scene = make_scene(image_grid(options).shape, options.imaging.n_photons, options.scene)
     with new_run("codesign", options, options.seed) as output:
         output.summary.append(f"look at it with: tensorboard --logdir {output.directory.parent}")
-        table = codesign(options, scene, output)
+        table, verdicts = codesign(options, scene, output)
     print_table(table)
+    print(*(f"{name}: {verdict}" for name, verdict in verdicts.items()), sep="\n")

@@ -31,9 +31,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     command = parser.parse_args(arguments[:1]).command
     program = f"torchmask {command}"
 
-    def work() -> None:
+    def work() -> int | None:
         module = importlib.import_module(f"torchmask.cli.{command}")
-        module.run(parse(module.Options, command, arguments[1:], prog=program))
+        return module.run(parse(module.Options, command, arguments[1:], prog=program))
 
     return exit_status(program, work, debug="--debug" in arguments)
 

@@ -1,8 +1,9 @@
 """A program of the command line: options in, exit status out. Each `torchmask COMMAND` is one, and each script that
 shares its ways.
 
-Exit status: 0 done; 1 something the user can mend, said in one line; 2 wrong usage; 130 interrupted, by Ctrl-C or by
-SIGTERM, which batch systems send.
+Exit status: 0 done; 1 something the user can mend, said in one line; 2 wrong usage; 3 done, and all of it written, but
+frames are not explained by what was restored from them; 130 interrupted, by Ctrl-C or by SIGTERM, which batch systems
+send.
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ from torchmask.cli.config import CONFIG, load_config
 
 T = TypeVar("T")
 
+NOT_EXPLAINED = 3  # exit status
+
 # What programs need beyond a plain install, by the name of the module.
 _EXTRAS = (
     *("tyro", "rich", "yaml", "tensorboard", "matplotlib"),
@@ -33,7 +36,11 @@ _EXTRAS = (
 
 
 def run_script(
-    name: str, run: Callable[[T], None], options: type[T], description: str | None, argv: Sequence[str] | None = None
+    name: str,
+    run: Callable[[T], int | None],
+    options: type[T],
+    description: str | None,
+    argv: Sequence[str] | None = None,
 ) -> int:
     """Parse the options of a script and run it; returns the exit status.
 
@@ -42,7 +49,8 @@ def run_script(
     name : str
         Of the script: it begins every message, and stands in its config files.
     run : callable
-        Does the work. What it raises as ValueError or OSError is a mistake of the user's, and becomes one line.
+        Does the work, and may return an exit status. What it raises as ValueError or OSError is a mistake of the
+        user's, and becomes one line.
     options : type
         Dataclass whose fields are the options; those of `torchmask.cli.options` bring --config, --debug and --out.
     description : str, optional
@@ -60,13 +68,13 @@ def run_script(
     )
 
 
-def exit_status(program: str, work: Callable[[], None], debug: bool) -> int:
+def exit_status(program: str, work: Callable[[], int | None], debug: bool) -> int:
     """Do the work; mistakes and warnings become one line each, unless `debug` asks for the traceback."""
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_, **__: _say(program, f"warning: {message}")
         try:
             with _interrupted_by_termination():
-                work()
+                return work() or 0
         except KeyboardInterrupt:
             if debug:
                 raise
@@ -86,7 +94,6 @@ def exit_status(program: str, work: Callable[[], None], debug: bool) -> int:
                 raise
             _say(program, f"error: {error}")
             return 1
-    return 0
 
 
 @contextmanager

@@ -12,13 +12,12 @@ import tyro
 
 from torchmask import __version__
 from torchmask.cli.config import stored
-from torchmask.cli.oifits import OIFITSOptions, measure_frames, write_frames
 from torchmask.cli.options import RunOptions, WorkerOptions
+from torchmask.cli.program import NOT_EXPLAINED
 from torchmask.cli.report import restored_figure
 from torchmask.cli.run import CHECKPOINT, new_run
 from torchmask.cli.stacks import StackOptions, group_files, read_stack
 from torchmask.data.restored import save_restored
-from torchmask.interferometry.observables import Observables
 from torchmask.io import new_folder, write_json
 from torchmask.metrics import relative_error, ssim
 from torchmask.observation import Observation
@@ -34,13 +33,14 @@ SKIES = {"if-seen": Background.IF_SEEN, "per-frame": Background.PER_FRAME, "none
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(StackOptions, OIFITSOptions, WorkerOptions, RunOptions):
+class Options(StackOptions, WorkerOptions, RunOptions):
     """Restore the image behind a stack of short exposures with unknown aberrations (myopic deconvolution).
 
     A stack is an .npz file (`torchmask simulate` writes such) or a FITS cube; several are restored side by side, each
     by itself. With --join the FITS files, cubes or images of one filter and orientation, are one stack. FITS files need
     --mask. Writes restored.fits (with the sky coordinates of the input, and in HISTORY what was done), restored.npz,
-    figures, metrics.json, config.yaml and the log to a new folder, of several stacks to a folder in it for each.
+    figures, metrics.json, config.yaml and the log to a new folder, of several stacks to a folder in it for each. The
+    last line says whether the frames are explained; the exit status is 3 if not.
     """
 
     stacks: tyro.conf.Positional[tuple[Path, ...]] = ()
@@ -84,30 +84,27 @@ class Options(StackOptions, OIFITSOptions, WorkerOptions, RunOptions):
         return values
 
 
-def run(options: Options) -> None:
-    """Restore, and write the images."""
+def run(options: Options) -> int:
+    """Restore, and write the images; returns the exit status, which says whether the frames are explained."""
     stacks = group_files(options.stacks, options.join)
     if not stacks:
         raise ValueError("there is no stack to restore: give .npz or FITS files")
     if len(stacks) == 1:
         (files,) = stacks.values()
-        restore_one(files, options)
-    elif options.resume is not None:
+        return restore_one(files, options)
+    if options.resume is not None:
         raise ValueError(f"--resume goes on with one stack, and {len(stacks)} are given")
-    else:
-        restore_several(stacks, options)
+    return restore_several(stacks, options)
 
 
-def restore_one(files: Sequence[Path], options: Options) -> None:
-    """One stack, on all cores, with a checkpoint to go on from."""
+def restore_one(files: Sequence[Path], options: Options) -> int:
+    """One stack, on all cores, with a checkpoint to go on from; returns the exit status."""
     observation = read_stack(files, options)
     checkpoint = None if options.resume is None else options.resume / CHECKPOINT
     if checkpoint is not None and not checkpoint.is_file():
         raise ValueError(f"there is no {checkpoint} to go on from: it is written at the 100th iteration")
     method = deconvolution(observation, options)
-    observables = measure_frames(observation, options, known_sky(options))
     with new_run("restore", options) as output:
-        output.summary.extend(write_frames(output.directory, observables, observation, options))
         state = output.directory / CHECKPOINT
         if checkpoint is not None:
             shutil.copyfile(checkpoint, state)
@@ -121,21 +118,23 @@ def restore_one(files: Sequence[Path], options: Options) -> None:
         )
         table = write(output.directory, files, observation, result, options)
         log(observation, result, table, output.logger)
+        output.logger.conclude(verdict=table["verdict"])
         output.summary.append(result.summary())
+    return 0 if table["verdict"]["explained"] else NOT_EXPLAINED
 
 
-def restore_several(stacks: Mapping[str, Sequence[Path]], options: Options) -> None:
-    """Each stack on a core, and what was found in a folder of its name; failures are told when all have ended."""
+def restore_several(stacks: Mapping[str, Sequence[Path]], options: Options) -> int:
+    """Each stack on a core, and what was found in a folder of its name; failures are told when all have ended.
+
+    Returns the exit status, which is that of the worst verdict.
+    """
     observations: dict[str, Observation] = {}
     methods: list[MyopicDeconvolution] = []
-    observables: dict[str, Observables | None] = {}
     failures: dict[str, Exception] = {}
     for name, files in stacks.items():
         try:
             observations[name] = read_stack(files, options)
-            method = deconvolution(observations[name], options)
-            observables[name] = measure_frames(observations[name], options, known_sky(options))
-            methods.append(method)
+            methods.append(deconvolution(observations[name], options))
         except (ValueError, OSError) as error:
             observations.pop(name, None)
             failures[name] = error
@@ -150,15 +149,19 @@ def restore_several(stacks: Mapping[str, Sequence[Path]], options: Options) -> N
             if isinstance(result, Exception):
                 failures[name] = result
                 continue
-            folder = new_folder(output.directory / name)
-            tables[name] = write(folder, stacks[name], seen[number], result, options)
-            output.summary.extend(write_frames(folder, observables[name], seen[number], options))
+            tables[name] = write(new_folder(output.directory / name), stacks[name], seen[number], result, options)
             log(seen[number], result, tables[name], output.logger, f"{name}/")
             output.summary.append(f"{name}: {result.summary()}")
+        verdicts = {name: table["verdict"] for name, table in tables.items()}
+        output.logger.conclude(verdicts=verdicts)
+        lacking = [name for name, verdict in verdicts.items() if not verdict["explained"]]
+        told = f"{len(verdicts) - len(lacking)} of {len(stacks)} stacks are explained"
+        output.summary.append(told + (f"; not explained: {', '.join(lacking)}" if lacking else ""))
         tables |= {name: {"error": str(error)} for name, error in failures.items()}
         write_json(output.directory / "metrics.json", tables)
         if failures:
             raise _failed(failures, len(stacks))
+    return NOT_EXPLAINED if lacking else 0
 
 
 def _failed(failures: Mapping[str, Exception], n_stacks: int) -> ValueError:
@@ -186,11 +189,6 @@ def deconvolution(observation: Observation, options: Options) -> MyopicDeconvolu
     )
 
 
-def known_sky(options: Options) -> float:
-    """What --sky says of its light [electrons per pixel]; 0 where it is to be found."""
-    return 0.0 if isinstance(options.sky, str) else options.sky
-
-
 def write(
     folder: Path, files: Sequence[Path], observation: Observation, result: RestorationResult, options: Options
 ) -> dict[str, Any]:
@@ -215,6 +213,7 @@ def metrics(observation: Observation, result: RestorationResult) -> dict[str, An
         "iterations": len(result.cost),
         "evaluations": result.n_evaluations,
         "converged": result.converged,
+        "verdict": None if result.verdict is None else result.verdict.to_json(),
         "seconds": result.seconds,
     }
     if observation.object is not None:
@@ -232,11 +231,7 @@ def log(
     scale = observation.grid.pixel_scale
     logger.figure(
         f"{prefix}restored",
-        restored_figure(
-            *(result.object, observation.frames, result.residuals, scale),
-            deviation=result.object_std,
-            sky=observation.sky_matrix,
-        ),
+        restored_figure(result.object, observation.frames, result.residuals, scale, deviation=result.object_std),
     )
     logger.figure(f"{prefix}cost", viz.history_figure({"restoration": result.cost.tolist()}, "cost"))
     if observation.object is not None:
@@ -244,7 +239,8 @@ def log(
         pictures = {"stack": (observation.frames[0], result.object)}
         logger.figure(f"{prefix}comparison", viz.comparison_figure(observation.object, pictures, cutoff, scale))
     for name, value in table.items():
-        logger.scalar(f"comparison/{prefix}restored/{name}", float(value))
+        if name != "verdict":
+            logger.scalar(f"comparison/{prefix}restored/{name}", float(value))
 
 
 def history(files: Sequence[Path], result: RestorationResult, options: Options) -> list[str]:

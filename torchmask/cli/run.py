@@ -93,7 +93,7 @@ def new_run(command: str, options: RunOptions, seed: int | None = None) -> Itera
         elif run is not None:
             print(*run.summary, f"what was reached is in {directory}", sep="\n", file=sys.stderr)
         raise
-    print(*run.summary, f"written to {directory}", sep="\n")
+    print(f"written to {directory}", *run.summary, sep="\n")
 
 
 def _ways_on(command: str, directory: Path, options: RunOptions) -> list[str]:

@@ -38,7 +38,8 @@ def save_restored(
     Notes
     -----
     The image is in electrons per pixel and frame (BUNIT). CHISQ is the mean over the frames of the mean square residual
-    in units of the noise, CHISQMAX that of the worst frame; CONVERGD says whether the restoration came to rest.
+    in units of the noise, CHISQMAX that of the worst frame; CONVERGD says whether the restoration came to rest,
+    EXPLAIND whether object and aberrations explain the frames: CHISQRED is at most CHISQLIM then.
     Standard deviations, if the restoration was asked for them, are an extension ERR.
 
     Examples
@@ -83,6 +84,16 @@ def save_restored(
         "R0": (result.r0, "[m] Fried parameter of the prior"),
         "CONVERGD": (result.converged, "whether the restoration came to rest"),
     }
+    if (verdict := result.verdict) is not None:
+        cards |= {
+            "VERDICT": (verdict.finding.value, "whether the frames are explained"),
+            "EXPLAIND": (verdict.explained, "the same"),
+            "CHISQDOF": (verdict.degrees_of_freedom, "degrees of freedom"),
+            "CHISQRED": (verdict.chi_square, "chi-square over degrees of freedom"),
+            "CHISQMOD": (verdict.model_error, "that modes left out are expected to add"),
+            "CHISQLIM": (verdict.limit, "up to which the frames are explained"),
+            "NLOST": (len(verdict.frames), "frames that are not explained"),
+        }
     for name, (value, comment) in cards.items():
         if not isinstance(value, float) or math.isfinite(value):  # FITS knows no NaN in a card
             hdu.header[name] = (value, comment)

@@ -12,11 +12,16 @@ from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.posterior import standard_deviations
 from torchmask.restoration.result import RestorationResult
+from torchmask.restoration.verdict import Verdict
 
 
 @torch.no_grad()
 def assemble_result(
-    objective: MyopicObjective, stack: FrameStack, progress: Progress, r0: float | None
+    objective: MyopicObjective,
+    stack: FrameStack,
+    progress: Progress,
+    r0: float | None,
+    verdict: Verdict | None = None,
 ) -> RestorationResult:
     """The result of a restoration that has ended; `r0` [m] is that of the aberration basis, None if they are known."""
     model, state = objective.model, progress.state
@@ -43,6 +48,7 @@ def assemble_result(
         message=_message(progress),
         n_evaluations=progress.n_evaluations,
         seconds=0.0,
+        verdict=verdict,
     )
 
 

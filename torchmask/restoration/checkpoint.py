@@ -75,6 +75,11 @@ class Progress:
         self.candidates = Candidates(state, self.candidates.n_each)
 
     @property
+    def ending(self) -> Ending:
+        """Where the present start has come to."""
+        return Ending(self.state, self.status, self.decrease)
+
+    @property
     def iterations(self) -> int:
         """Of the present start."""
         return len(self.costs) - self.began
@@ -96,10 +101,9 @@ class Checkpoint:
 
     def save(self, progress: Progress) -> None:
         """Write or replace the file."""
-        now = Ending(progress.state, progress.status, progress.decrease)
         arrays: dict[str, Any] = {name: getattr(progress, name) for name in ("costs", *_NUMBERS)}
         arrays |= {"n_candidates": progress.candidates.n_each, "fingerprint": self.fingerprint}
-        arrays |= _ending_arrays("", now)
+        arrays |= _ending_arrays("", progress.ending)
         if progress.rival is not None:
             arrays |= _ending_arrays("rival_", progress.rival)
         save_npz(self.path, arrays, replace=True)

@@ -106,6 +106,15 @@ class FrameStack:
         return float((moved**2 * self.precision).mean())
 
     @property
+    def contrast(self) -> float:
+        """Chi-square per pixel of the mean frame against an even one: 1 where frames show nothing but noise."""
+        weight = self.precision.expand_as(self.frames)
+        total = weight.sum(0)
+        mean = (weight * self.frames).sum(0) / total.clamp(min=torch.finfo(total.dtype).tiny)
+        level = (total * mean).sum() / total.sum()
+        return float((total * (mean - level) ** 2).sum() / (total > 0).sum())
+
+    @property
     def photon_share(self) -> float:
         """The part of the noise variance that is photon noise, at most 1; 0 where `precision` holds it already."""
         if self.errors is not None:

@@ -23,15 +23,16 @@ from torchmask.restoration.checkpoint import Checkpoint, fingerprint_of
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.frames import Array, FrameStack
 from torchmask.restoration.memory import keep_freed_memory
-from torchmask.restoration.objective import Free, MyopicObjective
+from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.parallel import each_on_a_core
 from torchmask.restoration.priors import ObjectPrior, TotalVariation, as_prior, check_prior
 from torchmask.restoration.projected_lbfgs import Minimizer, ProjectedLBFGS
 from torchmask.restoration.recipe import ModelRecipe
 from torchmask.restoration.result import RestorationResult
 from torchmask.restoration.schedule import Schedule
-from torchmask.restoration.solver import Solver, Traits
+from torchmask.restoration.solver import Solver
 from torchmask.restoration.starts import Known
+from torchmask.restoration.traits import Traits
 
 
 class MyopicDeconvolution:
@@ -81,9 +82,9 @@ class MyopicDeconvolution:
     aberration_prior : bool
         False leaves out 1/2 ||z||^2; z are the Zernike coefficients then.
     max_iterations : int
-        Of all starts together; one takes 1000 at most. A start that leaves more of the frames unexplained than noise
-        can, and 0.13 % of their change from frame to frame, may have missed the object: up to three more begin at
-        random aberrations, until one misses nothing or two end alike, and the best is kept.
+        Of all starts together; one takes 1000 at most. A start whose verdict is that it does not explain the frames may
+        have missed the object: up to three more begin at random aberrations, until one explains them or two end alike,
+        and the best is kept.
     tolerance : float
         Converged when 100 iterations lower the cost by less than this fraction.
     minimizer : Minimizer
@@ -267,33 +268,32 @@ class MyopicDeconvolution:
                 model, stack.frames, stack.precision, self.prior, free=known.free, parallel=parallel
             )
             traits = self._traits(known, seed)
-            has_r0 = self.recipe.whitened and not traits.estimated and Free.ABERRATIONS in known.free
             solver = Solver(objective, stack, traits, self.schedule, self.minimizer, callback)
             check_prior(self.prior, model.window.embed(stack.frames.mean(0).clamp(min=0)).double())
-            file = self._checkpoint(checkpoint, solver, known)
-            progress = solver.solve(known, start, file)
-            result = assemble_result(solver.objective, stack, progress, r0=self.recipe.r0 if has_r0 else None)
+            progress = solver.solve(known, start, self._checkpoint(checkpoint, solver, known))
+            verdict = solver.verdict(progress.ending)
+            result = assemble_result(solver.objective, stack, progress, solver.prior_r0, verdict)
             if n_samples:
-                cutoff = min(0.5, self.recipe.grid.cutoff(self.recipe.aperture.extent))
-                result = add_deviations(result, solver.objective, stack, progress, cutoff, n_samples)
+                result = add_deviations(result, solver.objective, stack, progress, self.recipe.cutoff, n_samples)
         return replace(result, seconds=time.perf_counter() - started)
 
     def _stack(self, frames: Array, valid: Array | None, errors: Array | None) -> FrameStack:
-        bluest = replace(self.recipe.grid, wavelength=self.recipe.band.shortest)
-        return FrameStack.of(frames, valid, bluest, self.recipe.aperture, self.readout_noise, self.background, errors)
+        grid, aperture = self.recipe.bluest_grid, self.recipe.aperture
+        return FrameStack.of(frames, valid, grid, aperture, self.readout_noise, self.background, errors)
 
     def _checkpoint(self, path: str | Path | None, solver: Solver, known: Known) -> Checkpoint | None:
         settings = (self.recipe.whitened, self.known_r0, self.minimizer, self.schedule, solver.traits.seed)
-        given = (known.coefficients, known.covariance, known.object)
-        return Checkpoint(Path(path), fingerprint_of(solver.objective, settings, given)) if path is not None else None
+        fingerprint = fingerprint_of(solver.objective, settings, known.tensors)
+        return None if path is None else Checkpoint(Path(path), fingerprint)
 
     def _traits(self, known: Known, seed: int) -> Traits:
-        estimated = known.covariance is not None
         return Traits(
             many_minima=self.many_minima,
-            estimated=estimated,
+            estimated=known.estimated,
             prior_on_aberrations=self.recipe.whitened,
-            r0_is_open=self.recipe.whitened and not self.known_r0 and not estimated,
+            r0_is_open=self.recipe.whitened and not self.known_r0 and not known.estimated,
+            r0=self.recipe.r0,
+            outer_scale=self.recipe.outer_scale,
             max_iterations=self.max_iterations,
             tolerance=self.tolerance,
             seed=seed,

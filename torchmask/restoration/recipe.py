@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -58,6 +58,16 @@ class ModelRecipe:
     def n_modes(self) -> int:
         """J, Zernike modes per sub-aperture of the coefficients."""
         return max(self.frame_modes, self.static_modes)
+
+    @property
+    def cutoff(self) -> float:
+        """Highest frequency that the frames can tell of an object [cycles/pixel]."""
+        return min(0.5, self.grid.cutoff(self.aperture.extent))
+
+    @property
+    def bluest_grid(self) -> Grid:
+        """That of the shortest wavelength, whose cut-off is the highest."""
+        return replace(self.grid, wavelength=self.band.shortest)
 
     def turbulent_model(self, *, follows_aperture: bool = False) -> ExposureModel:
         """The model with aberrations of turbulence, for the aperture where it lies now, or wherever it goes."""

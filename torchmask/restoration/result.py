@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from torchmask.io import load_npz, save_npz
 from torchmask.record import Brief
+from torchmask.restoration.verdict import Verdict
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -37,6 +39,7 @@ class RestorationResult(Brief):
         brightness, which frames cannot tell, taken as found; None unless samples were asked for
     coefficients_std : (N, J) that of the coefficients of a frame [rad rms], or None
     background : (T,) mean light of a pixel of each frame that is not the object's [electrons]; None in files of 0.1
+    verdict : whether all this explains the frames; None in files of 0.1
 
     Examples
     --------
@@ -71,6 +74,7 @@ class RestorationResult(Brief):
     object_std: Tensor | None = None
     coefficients_std: Tensor | None = None
     background: Tensor | None = None
+    verdict: Verdict | None = None
 
     @property
     def sky(self) -> float:
@@ -80,6 +84,8 @@ class RestorationResult(Brief):
     def save(self, path: str | Path) -> None:
         """Write everything to a new .npz file, without pickle. Errors as in `torchmask.io.save_npz`."""
         values = {item.name: getattr(self, item.name) for item in fields(self)}
+        if self.verdict is not None:
+            values["verdict"] = json.dumps(self.verdict.to_json())
         save_npz(path, {name: value for name, value in values.items() if value is not None})
 
     @classmethod
@@ -96,10 +102,12 @@ class RestorationResult(Brief):
         names = [item.name for item in fields(cls) if item.name in stored]
         values: dict[str, Any] = {name: torch.from_numpy(stored[name]) for name in names if stored[name].ndim}
         values.update({name: stored[name].item() for name in names if not stored[name].ndim})
+        if "verdict" in values:
+            values["verdict"] = Verdict.from_json(values["verdict"])
         return cls(**values)
 
     def summary(self) -> str:
-        """A few lines for people."""
+        """A few lines for people, the last one the verdict."""
         n_frames, n_sub, n_modes = self.coefficients.shape
         chi = self.chi_square
         lines = [
@@ -111,7 +119,7 @@ class RestorationResult(Brief):
             + ("" if math.isnan(self.r0) else f", r0 {self.r0:.3g} m")
             + (f", sky {self.sky:.3g} electrons" if self.sky > 0 else ""),
         ]
-        return "\n".join(lines)
+        return "\n".join([*lines, *([] if self.verdict is None else [str(self.verdict)])])
 
 
 def _as_of_now(stored: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

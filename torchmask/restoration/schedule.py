@@ -23,9 +23,10 @@ class Schedule:
     start_rms_unwhitened : the same in rad, where the aberrations have no prior
     candidates : stages of a full pupil's tournament, as (candidates for each frame, iterations); each stage keeps
         half of them, the last one the best
-    missed : share of the change from frame to frame that a fit may leave unexplained: with more, the object is
-        another one
-    chance : standard deviations of the stack's chi-square that are left to noise
+    model_errors : a fit may leave so many times what modes beyond the aberration basis are expected to leave: with
+        more, the object is another one
+    chance : standard deviations of the stack's chi-square that it may leave besides
+    missed : share of the change from frame to frame that may be left through a full pupil, if that is more
     starts : how many there are, at most, for objects that were missed
     alike : relative difference of what two starts leave unexplained, below which they have found the same
     outlying : a frame is lost if its residual variance is so many times that of the frames that fit well
@@ -51,8 +52,9 @@ class Schedule:
     start_rms: float = 0.7
     start_rms_unwhitened: float = 0.1
     candidates: tuple[tuple[int, int], ...] = ((16, 30), (8, 70), (4, 100), (2, 100))
-    missed: float = 0.0013
+    model_errors: float = 2.0
     chance: float = 2.0
+    missed: float = 0.0013
     starts: int = 4
     alike: float = 0.03
     outlying: float = 1.25

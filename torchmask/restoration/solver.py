@@ -5,14 +5,14 @@ descent follow each other. Between two, what the frames tell of themselves is br
 the strength of the turbulence, and the noise, which falls from what the mean frame leaves unexplained to what it is, or
 to what the model cannot explain, if that is more. Once the object is sharp, frames and object escape from local minima;
 when nothing moves any more, each frame counts as it fits. A start ends when a segment brings nothing more or its
-iterations are spent; if it has missed the object, which the stack's chi-square tells, another one begins from random
-aberrations, and the best is kept. Of faint frames, the aberrations are integrated out of what has been found.
+iterations are spent; if it has missed the object, which its verdict tells, another one begins from random aberrations,
+and the best is kept. Of faint frames, the aberrations are integrated out of what has been found.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import cached_property
 
 from torch import Tensor
 
@@ -24,6 +24,7 @@ from torchmask.restoration.checkpoint import Checkpoint, Ending, Progress, Statu
 from torchmask.restoration.descent import Variables, descend
 from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.marginal import integrate_aberrations
+from torchmask.restoration.model_error import LeftOut, expected_error
 from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.result import RestorationResult
@@ -37,28 +38,8 @@ from torchmask.restoration.starts import (
     start_from_result,
 )
 from torchmask.restoration.state import State
-
-
-@dataclass(frozen=True)
-class Traits:
-    """What a solver must know of the problem beside its objective.
-
-    many_minima : of a full pupil, which needs a tournament of candidates
-    estimated : the aberrations are known with errors, whose prior takes the place of turbulence
-    prior_on_aberrations : whether they have one at all
-    r0_is_open : the strength of the turbulence follows the aberrations
-    max_iterations : of all starts together
-    tolerance : a segment that lowers the cost by a smaller fraction is the last one
-    seed : of random starts
-    """
-
-    many_minima: bool
-    estimated: bool
-    prior_on_aberrations: bool
-    r0_is_open: bool
-    max_iterations: int
-    tolerance: float
-    seed: int
+from torchmask.restoration.traits import Traits
+from torchmask.restoration.verdict import Finding, Tolerance, Verdict, judge
 
 
 class Solver:
@@ -95,8 +76,9 @@ class Solver:
         self.first_inflation: float = max(1.0, change / schedule.first_inflation)
         held = traits.prior_on_aberrations and not traits.many_minima  # through a full pupil it was not tried
         self.is_faint: bool = held and Free.OBJECT | Free.ABERRATIONS in objective.free and change < schedule.faint
-        noise = (2 / objective.frames.numel()) ** 0.5  # of the chi-square per pixel
-        self.tolerable: float = max(schedule.missed * change, schedule.chance * noise)
+        self.contrast: float = stack.contrast
+        least = schedule.missed * change if traits.many_minima else 0.0  # its poor minima are no worse than that
+        self.tolerance: Tolerance = Tolerance(schedule.model_errors, schedule.chance, least)
 
     def solve(self, known: Known, start: RestorationResult | None = None, file: Checkpoint | None = None) -> Progress:
         """The restoration from its beginning, an earlier result or a checkpoint to its end."""
@@ -256,16 +238,16 @@ class Solver:
 
         Two that end alike have found what there is to be found.
         """
-        now = Ending(progress.state, progress.status, progress.decrease)
-        left = self.unexplained(now.state)
-        best, least, progress.alike = now, left, False
-        if progress.rival is not None:
-            before = self.unexplained(progress.rival.state)
-            least = min(before, left)
-            progress.alike = abs(before - left) < self.schedule.alike * max(least, self.tolerable)
-            best = progress.rival if before < left else now
+        now = progress.ending
+        best, verdict, progress.alike = now, self.verdict(now), False
+        if (rival := progress.rival) is not None:
+            before, after = self.verdict(rival), verdict
+            best, verdict = (rival, before) if before.excess < after.excess else (now, after)
+            scale = max(verdict.excess, verdict.limit - 1)
+            progress.alike = abs(before.excess - after.excess) < self.schedule.alike * scale
+        missed = verdict.finding is Finding.NOT_EXPLAINED
         spent = len(progress.costs) >= self.traits.max_iterations
-        if least > self.tolerable and not progress.alike and progress.starts < self.schedule.starts and not spent:
+        if missed and not progress.alike and progress.starts < self.schedule.starts and not spent:
             seed = self.traits.seed + progress.starts
             progress.rival, progress.began, progress.starts = best, len(progress.costs), progress.starts + 1
             progress.escapes, progress.status, progress.decrease = 0, Status.RUNNING, None
@@ -273,9 +255,25 @@ class Solver:
         else:
             progress.state, progress.status, progress.decrease = best.state, best.status, best.decrease
 
-    def unexplained(self, state: State) -> float:
-        """Variance of the residuals above that of the noise, over the latter."""
-        return float(fit_of_frames(self.objective, state)[1].mean()) - 1
+    @property
+    def prior_r0(self) -> float | None:
+        """r0 of the prior on the aberrations at first [m]; None if that is not of turbulence, or they are known."""
+        known = self.traits.estimated or Free.ABERRATIONS not in self.objective.free
+        return self.traits.r0 if self.traits.prior_on_aberrations and not known else None
+
+    def verdict(self, ending: Ending) -> Verdict:
+        """Whether the frames are explained by what a start, or all of them, ended at."""
+        objective, state = self.objective, ending.state
+        pixels = (objective.precision.expand_as(objective.frames) > 0).sum((1, 2))
+        error = expected_error(objective, state, self._left_out)
+        chi_square = fit_of_frames(objective, state)[1]
+        at_rest = ending.status is not Status.ITERATION_LIMIT
+        return judge(chi_square, pixels, self.contrast, error, self.tolerance, at_rest=at_rest)
+
+    @cached_property
+    def _left_out(self) -> LeftOut:
+        model, traits = self.objective.model, self.traits
+        return LeftOut.of(model.pupil.aperture, model.aberrations.n_modes, traits.r0, traits.outer_scale)
 
     def _report(self, progress: Progress, variables: Variables) -> None:
         if self.callback is None:

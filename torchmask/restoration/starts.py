@@ -39,6 +39,16 @@ class Known:
             raise ValueError("coefficients and known_object are both given: nothing is left to restore")
 
     @property
+    def tensors(self) -> tuple[Tensor | None, ...]:
+        """All that is known."""
+        return self.coefficients, self.covariance, self.object
+
+    @property
+    def estimated(self) -> bool:
+        """Whether the aberrations are known with errors."""
+        return self.covariance is not None
+
+    @property
     def nothing(self) -> bool:
         """Whether all of it is open."""
         return self.coefficients is None and self.object is None

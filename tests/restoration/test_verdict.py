@@ -1,0 +1,83 @@
+"""What counts as explained, and how a verdict reads and is kept."""
+
+import json
+import math
+
+import pytest
+import torch
+
+from torchmask.restoration.model_error import ModelError
+from torchmask.restoration.verdict import Finding, Tolerance, Verdict, judge
+
+PIXELS = 1000
+ERROR = ModelError(excess=0.3, fitted=40.0, phase=0.2)
+
+
+TOLERANCE = Tolerance(2.0, 2.0)
+
+
+def verdict_on(*chi_square, contrast=50.0, tolerance=TOLERANCE, at_rest=True):
+    frames = torch.tensor(chi_square, dtype=torch.float64)
+    return judge(frames, torch.full((len(frames),), PIXELS), contrast, ERROR, tolerance, at_rest=at_rest)
+
+
+def test_chi_square_is_over_its_degrees_of_freedom():
+    verdict = verdict_on(1.0, 1.2)
+    assert verdict.degrees_of_freedom == 2 * 960
+    assert verdict.chi_square == pytest.approx(2.2 * 1000 / 1920)
+    assert verdict.excess == pytest.approx(verdict.chi_square - 1)
+
+
+def test_what_may_be_left_is_the_model_error_and_chance():
+    limit = 1 + 2 * 0.3 + 2 * math.sqrt(2 / 1920)
+    assert verdict_on(1.0, 1.0).limit == pytest.approx(limit)
+    just = limit * 0.96  # per pixel
+    assert verdict_on(just - 1e-6, just - 1e-6).finding is Finding.EXPLAINED
+    assert verdict_on(just + 1e-6, just + 1e-6).finding is Finding.NOT_EXPLAINED
+    assert verdict_on(3.0, 3.0, tolerance=Tolerance(2.0, 2.0, least=5.0)).explained
+
+
+def test_pixels_that_are_not_valid_do_not_count():
+    each = torch.tensor([1.0, 9.0], dtype=torch.float64)
+    verdict = judge(each, torch.tensor([1000, 40]), 50.0, ERROR, TOLERANCE, at_rest=True)
+    assert verdict.degrees_of_freedom == 961  # a frame that tells nothing has one left
+    assert verdict.chi_square == pytest.approx((1000 + 360) / 961)
+
+
+def test_single_frames_may_be_lost():
+    verdict = verdict_on(*[1.0] * 19, 8.0)
+    assert verdict.explained
+    assert verdict.frames == (19,)
+    assert "frame 19 is not explained; check those frames for clouds" in str(verdict)
+    verdict = verdict_on(1.0, 8.0, 8.0, 1.0)
+    assert not verdict.explained
+    assert verdict.frames == (1, 2)
+    assert "frames 1, 2 are not explained; check those frames" in str(verdict)
+
+
+def test_of_many_frames_it_is_the_instrument_that_is_to_be_checked():
+    text = str(verdict_on(900.0, 800.0, 850.0))
+    assert text.startswith("not explained: chi-square 885.4 of 2880 degrees of freedom")
+    assert "0.2 rad rms" in text
+    assert "all frames are not explained; check the mask" in text
+    assert "go on" in str(verdict_on(900.0, 800.0, at_rest=False))
+    assert str(verdict_on(1.0, 1.0)).startswith("explained: ")
+    assert "check" not in str(verdict_on(1.0, 1.0))
+
+
+def test_frames_of_noise_alone_are_not_explained():
+    noise = 1 + 4.9 * math.sqrt(2 / PIXELS)
+    assert verdict_on(1.0, 1.0, contrast=noise).finding is Finding.ONLY_NOISE
+    assert not verdict_on(1.0, 1.0, contrast=noise).explained
+    assert "nothing but noise" in str(verdict_on(1.0, 1.0, contrast=noise))
+    assert verdict_on(1.0, 1.0, contrast=noise + 0.01).explained
+
+
+def test_it_is_kept_as_json():
+    verdict = verdict_on(1.0, 8.0, 8.0, 1.0)
+    values = verdict.to_json()
+    assert (values["explained"], values["text"]) == (False, str(verdict))
+    assert Verdict.from_json(json.dumps(values, allow_nan=False)) == verdict
+    for wrong in ("", "3", "{}", json.dumps(values | {"finding": "OTHER"}), json.dumps(values | {"more": 1})):
+        with pytest.raises(ValueError, match="there is no verdict in"):
+            Verdict.from_json(wrong)

@@ -1,0 +1,152 @@
+"""The verdict on a restoration: whether object and aberrations explain the frames, which they do not, what to check."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass
+from enum import Enum
+from typing import Any
+
+from torch import Tensor
+
+from torchmask.restoration.model_error import ModelError
+
+_SURE = 5.0  # standard deviations of noise, above which a mean frame shows something
+_LOST = 2.0  # a single frame may leave so many times more than the stack
+
+
+class Finding(Enum):
+    """What a verdict comes to."""
+
+    EXPLAINED = "explained"
+    NOT_EXPLAINED = "not explained"
+    ONLY_NOISE = "not explained, the frames show nothing but noise"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether what was restored explains the frames.
+
+    finding : what it comes to
+    chi_square : of the residuals, over its degrees of freedom
+    degrees_of_freedom : valid pixels, less what was fitted to each frame as far as its prior left it free. The object
+        is not counted: its prior holds it, and all frames share it
+    model_error : what modes that the model leaves out are expected to add to the chi-square
+    limit : chi-square up to which the frames count as explained
+    phase_error : rms of the modes left out, over a sub-aperture [rad]
+    frames : those that are not explained by themselves, counted from 0
+    n_frames : of the stack
+    check : what may be wrong; empty if all is explained
+
+    Examples
+    --------
+    >>> verdict = Verdict(Finding.EXPLAINED, 1.39, 300000, 0.4, 1.8, 0.2, (), 20, "")
+    >>> verdict.explained, str(verdict).partition(":")[0]
+    (True, 'explained')
+    """
+
+    finding: Finding
+    chi_square: float
+    degrees_of_freedom: int
+    model_error: float
+    limit: float
+    phase_error: float
+    frames: tuple[int, ...]
+    n_frames: int
+    check: str
+
+    @property
+    def explained(self) -> bool:
+        """Whether the stack as a whole is explained."""
+        return self.finding is Finding.EXPLAINED
+
+    @property
+    def excess(self) -> float:
+        """Chi-square beyond that of noise."""
+        return self.chi_square - 1
+
+    def __str__(self) -> str:
+        parts = [
+            f"{self.finding.value}: chi-square {self.chi_square:.4g} of {self.degrees_of_freedom} degrees of freedom",
+            f"modes left out ({self.phase_error:.2g} rad rms) are expected to add {self.model_error:.2g} to 1, and "
+            f"{self.limit:.4g} passes",
+        ]
+        if self.frames:
+            parts.append(f"{_listed(self.frames, self.n_frames)} not explained")
+        return "; ".join([*parts, *([f"check {self.check}"] if self.check else [])])
+
+    def to_json(self) -> dict[str, Any]:
+        """The same as plain values, with what `str` says as "text"."""
+        return asdict(self) | {"finding": self.finding.name, "explained": self.explained, "text": str(self)}
+
+    @classmethod
+    def from_json(cls, text: str) -> Verdict:
+        """Read what `json.dumps` made of `to_json`. Raises ValueError for anything else."""
+        try:
+            values = {name: value for name, value in json.loads(text).items() if name not in ("explained", "text")}
+            values |= {"finding": Finding[values["finding"]], "frames": tuple(values["frames"])}
+            return cls(**values)
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"there is no verdict in {text!r}") from error
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """What counts as explained.
+
+    model_errors : so many times the expected model error may be left
+    chance : and so many standard deviations of the chi-square
+    least : or this much, if that is more
+    """
+
+    model_errors: float
+    chance: float
+    least: float = -math.inf
+
+
+def judge(
+    chi_square: Tensor, pixels: Tensor, contrast: float, error: ModelError, tolerance: Tolerance, *, at_rest: bool
+) -> Verdict:
+    """The verdict on frames with a mean square residual `chi_square` (T,), over so many valid `pixels` (T,).
+
+    `contrast` is the chi-square per pixel of the mean frame against an even one, `at_rest` says whether the search was
+    left to its end.
+    """
+    chi_square, pixels = chi_square.double().cpu(), pixels.double().cpu()
+    free = (pixels - error.fitted).clamp(min=1)
+    total = float(free.sum())
+    found = float((chi_square * pixels).sum()) / total
+    expected = max(tolerance.model_errors * error.excess, tolerance.least)
+    limit = 1 + expected + tolerance.chance * math.sqrt(2 / total)
+    each = 1 + _LOST * (expected + tolerance.chance * (2 / free).sqrt())
+    lost = tuple((chi_square * pixels / free > each).nonzero().flatten().tolist())
+    if contrast - 1 < _SURE * math.sqrt(2 / float(pixels.max())):
+        finding = Finding.ONLY_NOISE
+    else:
+        finding = Finding.EXPLAINED if found <= limit else Finding.NOT_EXPLAINED
+    check = _what_to_check(finding, len(lost), len(pixels), at_rest)
+    return Verdict(finding, found, round(total), error.excess, limit, error.phase, lost, len(pixels), check)
+
+
+def _what_to_check(finding: Finding, n_lost: int, n_frames: int, at_rest: bool) -> str:
+    if finding is Finding.ONLY_NOISE:
+        return "the pointing, the crop and the exposure time"
+    few = 0 < n_lost <= n_frames / 2
+    if finding is Finding.EXPLAINED:
+        return "those frames for clouds and tracking errors" if n_lost else ""
+    if not at_rest:
+        return "that it may go on: it was stopped before it came to rest"
+    if few:
+        return "those frames for clouds and tracking errors, or leave them out"
+    return (
+        "the mask (which one, how it lies), wavelength and pixel scale, gain and read-out noise, and that all frames "
+        "show one object"
+    )
+
+
+def _listed(frames: tuple[int, ...], n_frames: int) -> str:
+    if len(frames) == n_frames:
+        return "all frames are" if n_frames > 1 else "the frame is"
+    names = ", ".join(map(str, frames))
+    return f"frames {names} are" if len(frames) > 1 else f"frame {names} is"
