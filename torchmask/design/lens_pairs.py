@@ -20,7 +20,7 @@ from torch import Tensor
 from torchmask.atmosphere.seeing import Seeing
 from torchmask.design.overlap import Geometry, PatchPlan
 
-_SMALLEST = 1e-3  # products T T' exp(-Q / 2) below, as estimated from above, are left out
+_SMALLEST = 3e-3  # products T T' exp(-Q / 2) below, as estimated from above, are left out
 _NODE = 0.7  # of the hole's reach: where the parabolas are fixed
 
 

@@ -19,7 +19,7 @@ from torchmask.design.lens_pairs import Lenses, LensPairs
 from torchmask.design.overlap import Geometry, PatchPlan, cached_plan
 from torchmask.design.spline_patches import SplinePatches
 
-_CHUNK = 2**18  # pixels of patches in work at a time: what a cache holds
+_CHUNK = 2**22  # numbers of patches in work at a time: few enough for memory, enough to amortise launches
 
 
 class MaskTransfer:

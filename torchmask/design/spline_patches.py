@@ -12,7 +12,7 @@ import torch
 from scipy.ndimage import spline_filter
 from torch import Tensor
 
-_FINENESS = 40  # lattice steps across the radius of support
+_FINENESS = 48  # lattice steps across the radius of support
 _MARGIN = 20  # more steps on every side: what the spline does at the lattice's end is not felt
 
 
