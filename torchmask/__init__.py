@@ -18,8 +18,9 @@ from torchmask.design.turbulent import TurbulentMSE
 from torchmask.grid import Grid
 from torchmask.interferometry.calibration import MaskCalibration, calibrate_mask
 from torchmask.interferometry.fringes import frame_observables
+from torchmask.interferometry.observables import Observables
 from torchmask.interferometry.oifits import save_oifits
-from torchmask.interferometry.visibilities import Observables, restored_observables
+from torchmask.interferometry.visibilities import restored_observables
 from torchmask.observation import Observation
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.detector import Detector

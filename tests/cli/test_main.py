@@ -47,6 +47,7 @@ def test_help_shows_every_option(command, capsys):
 UNITS = {
     "wavelength": r"\[m\]",
     "wavelengths": r"\[m\]",
+    "bandwidth": r"\[m\]",
     "mask_diameter": r"\[m\]",
     "imaging.diameter": r"\[m\]",
     "central_obstruction": r"\[m\]",

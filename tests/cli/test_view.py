@@ -179,3 +179,14 @@ def test_mistakes_about_files(tmp_path, capsys):
     refused(capsys, "no run folder", "view", tmp_path / "empty")
     save_npz(tmp_path / "half.npz", {"frames": np.zeros((2, 8, 8))})
     refused(capsys, "has no centers", "view", tmp_path / "half.npz")
+
+
+def test_a_cube_in_adu_is_shown_in_adu_with_its_sky(write_fits, fits_cube, sky_cards):
+    path = write_fits("raw.fits", fits_cube, BUNIT="adu", PIXELSCL=None, **sky_cards(0.3, 1e-7))
+    figure = view_path(path).figures[""]
+    assert figure.axes[-1].get_ylabel() == "adu, square-root stretch"
+    assert figure.axes[0].get_xlabel() in ("x [arcsec]", "x [mas]")
+    image = write_fits("image.fits", fits_cube[0], BUNIT="adu", **sky_cards(0.3, 1e-7))
+    shown = view_path(image).figures[""].axes
+    assert [text.get_text() for text in shown[0].texts if text.get_text()] == ["E", "N"]
+    assert shown[-1].get_ylabel() == "adu, square-root stretch"

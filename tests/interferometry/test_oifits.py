@@ -10,8 +10,9 @@ import torch
 
 from torchmask.grid import Grid
 from torchmask.interferometry.fringes import frame_observables
+from torchmask.interferometry.observables import Observables
 from torchmask.interferometry.oifits import save_oifits
-from torchmask.interferometry.visibilities import Observables, restored_observables
+from torchmask.interferometry.visibilities import restored_observables
 from torchmask.observation import Observation
 from torchmask.optics.aperture import SparseAperture
 

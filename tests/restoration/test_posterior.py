@@ -1,6 +1,7 @@
 """Standard deviations against closed forms, and against the errors of whole restorations."""
 
 import math
+import statistics
 
 import pytest
 import torch
@@ -166,25 +167,28 @@ def test_about_two_thirds_of_bright_pixels_lie_within_one_sigma(photons):
     assert 0.5 < inside(seen, result) < 0.85
 
 
+@pytest.mark.slow
 def test_coefficients_scatter_as_said(five_holes):
     """Errors of the coefficients over their standard deviations, from frames that the model itself has made."""
     columns = whitening(five_holes, 3, 1.5, 20.0)
-    generator = torch.Generator().manual_seed(5)
-    z = torch.randn(6, columns.shape[1], dtype=torch.float64, generator=generator)
-    true = (z @ columns.T).unflatten(1, (5, 3))
     model = ExposureModel(five_holes, GRID, 3)
     image = torch.zeros(model.window.field.shape, dtype=torch.float64)
     image[18:30, 16:34], image[20:24, 20:42] = 3000.0, 5000.0
-    frames = torch.poisson(model(image, true.flatten(1)).clamp(min=0), generator=generator)
     method = MyopicDeconvolution(five_holes, GRID, 3, r0=1.5, outer_scale=20.0)
-    result = method.restore(frames, known_object=image[:48, :48], n_samples=30)
-    error = result.coefficients - true
-    error[..., 0] -= error[..., 0].mean(1, keepdim=True)
-    pull = float((error / result.coefficients_std).square().mean().sqrt())
-    # 90 errors, of which 84 are independent: rms 1 within 4 sigma, and 1 % of bias
-    assert pull == pytest.approx(1, abs=4 / math.sqrt(2 * 84) + 0.01)
-    assert result.object_std is not None
-    assert not bool(result.object_std.any())  # it is known
+    pulls = []
+    for seed in range(6):
+        generator = torch.Generator().manual_seed(seed)
+        z = torch.randn(6, columns.shape[1], dtype=torch.float64, generator=generator)
+        true = (z @ columns.T).unflatten(1, (5, 3))
+        frames = torch.poisson(model(image, true.flatten(1)).clamp(min=0), generator=generator)
+        result = method.restore(frames, known_object=image[:48, :48], n_samples=30)
+        error = result.coefficients - true
+        error[..., 0] -= error[..., 0].mean(1, keepdim=True)
+        pulls.append(float((error / result.coefficients_std).square().mean().sqrt()))
+        assert result.object_std is not None
+        assert not bool(result.object_std.any())  # it is known
+    # The deviations are those of all frames together, while each frame has its own: one stack alone scatters by 0.15.
+    assert statistics.mean(pulls) == pytest.approx(1, abs=4 * statistics.stdev(pulls) / math.sqrt(len(pulls)))
 
 
 def test_deviations_are_kept_and_asked_for(tmp_path, five_holes):

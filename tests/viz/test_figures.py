@@ -217,7 +217,8 @@ def test_comparison_shows_what_is_scored():
     peak = np.percentile(lowpass(truth, 0.3), 99.5)
 
     figure = viz.comparison_figure(truth, {"mask": (frame, restored), "full": (frame, truth)}, 0.3, pixel_scale=1e-7)
-    panels = {ax.get_title(loc="left"): np.asarray(ax.images[0].get_array()) for ax in figure.axes}
+    *axes, bar = figure.axes
+    panels = {ax.get_title(loc="left"): ax.images[0].norm(np.asarray(ax.images[0].get_array())) for ax in axes}
     assert list(panels) == [
         "truth",
         f"mask\none exposure, score {relative_error(frame, truth, 0.3):.3f}",
@@ -240,10 +241,11 @@ def test_comparison_shows_what_is_scored():
     ]
     for panel, image in zip(panels.values(), expected, strict=True):
         np.testing.assert_allclose(panel, shown(image), atol=1e-6)
-    assert {ax.images[0].get_clim() for ax in figure.axes} == {(0, 1)}
-    assert figure.axes[0].texts[0].get_text() == "200 mas"  # a third of 32 pixels of 20.6 mas is 220
-    assert len(viz.comparison_figure(truth, {"mask": (frame, restored)}, 0.3).axes) == 4
-    assert len(viz.comparison_figure(truth, dict.fromkeys("abc", (frame, restored)), 0.3).axes) == 8
+    assert [ax.images[0].get_clim() for ax in axes] == [(0, pytest.approx(peak))] * 6
+    assert bar.get_ylim() == (0, pytest.approx(peak))
+    assert axes[0].texts[0].get_text() == "200 mas"  # a third of 32 pixels of 20.6 mas is 220
+    assert len(viz.comparison_figure(truth, {"mask": (frame, restored)}, 0.3).axes) == 5  # with the bar
+    assert len(viz.comparison_figure(truth, dict.fromkeys("abc", (frame, restored)), 0.3).axes) == 9
 
 
 @pytest.mark.parametrize(
@@ -315,3 +317,36 @@ def test_the_callers_style_and_pyplot_are_left_alone(tmp_path):
     process = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "MPLBACKEND": "TkAgg"})
     assert process.returncode == 0, process.stderr  # no display is asked for
     assert (tmp_path / "a.png").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.5, 2.0])
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_arrows_point_north_and_east_as_the_sky_says(sky_matrix, angle, mirrored):
+    """Along each arrow the sky's coordinates change in its own direction alone, whatever the turn and the parity."""
+    matrix = sky_matrix(angle, 1e-7, mirrored)
+    ax = viz.frames_figure(np.ones((2, 24, 32)), pixel_scale=1e-7, sky=matrix).axes[2]
+    tips = [text for text in ax.texts if not text.get_text()]
+    assert [text.get_text() for text in ax.texts if text.get_text()] == ["E", "N"]
+    for arrow, expected in zip(tips, np.eye(2), strict=True):
+        step = np.subtract(arrow.xy, arrow.xyann)  # data coordinates: y grows with the row
+        along = matrix @ step
+        np.testing.assert_allclose(along / np.linalg.norm(along), expected, atol=1e-12)
+    left, right, bottom, top = ax.images[0].get_extent()
+    places = np.array([text.get_position() for text in ax.texts])
+    assert ((places > [left, top]) & (places < [right, bottom])).all()
+
+
+def test_images_have_a_bar_that_names_unit_and_stretch():
+    frames = np.random.default_rng(0).random((3, 16, 16))
+    labels = {
+        "frames": viz.frames_figure(frames, unit="adu").axes[-1].get_ylabel(),
+        "unknown": viz.frames_figure(frames, unit="").axes[-1].get_ylabel(),
+        "comparison": viz.comparison_figure(frames[0], {"mask": (frames[1], frames[2])}, 0.5).axes[-1].get_ylabel(),
+        "psf": viz.psf_figure({"a": frames[0]}, Grid(16, 1e-7, 1e-6)).axes[-1].get_ylabel(),
+    }
+    assert labels == {
+        "frames": "adu, square-root stretch",
+        "unknown": "square-root stretch",
+        "comparison": "electrons, square-root stretch",
+        "psf": "fraction of the peak, logarithmic",
+    }

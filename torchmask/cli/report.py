@@ -76,13 +76,16 @@ def restored_figure(
     pixel_scale: float | None = None,
     title: str = "restored",
     deviation: Any | None = None,
+    unit: str = "electrons",
+    sky: Any | None = None,
 ) -> Figure:
     """A restored image (H, W), beside it the first and the mean of `frames` (T, H, W), and the rms of `residuals`.
 
     The standard deviation of the image stands between, if there is one.
 
-    Light is shown with a square root, each image up to its own 99.5th percentile; residuals (T, H, W) are in units of
-    the noise, so that 1 is what noise alone leaves. `pixel_scale` [rad] labels the axes with angles.
+    Light is shown with a square root, each image up to its own 99.5th percentile [`unit` per pixel]; residuals
+    (T, H, W) are in units of the noise, so that 1 is what noise alone leaves. `pixel_scale` [rad] labels the axes with
+    angles, `sky` (2, 2), as `Observation.sky_matrix`, adds north and east.
     """
     restored = as_array(image)
     lights = {title: restored}
@@ -90,19 +93,22 @@ def restored_figure(
         stack = as_array(frames)
         lights = {"first frame": stack[0], f"mean of {len(stack)} frames": stack.mean(0), **lights}
     panels = len(lights) + (residuals is not None) + (deviation is not None)
-    figure, axes = drawing.row_of_axes([1.0] * panels, height=3.2)
-    unit, extent = drawing.sky_extent((restored.shape[0], restored.shape[1]), pixel_scale)
+    figure, axes = drawing.row_of_axes([1.3] * panels, height=3.2)
+    angle, extent = drawing.sky_extent((restored.shape[0], restored.shape[1]), pixel_scale)
     for ax, (name, values) in zip(axes, lights.items(), strict=False):
-        ax.imshow(viz.stretch(values), cmap="gray", vmin=0, vmax=1, extent=extent)
-        drawing.image_axes(ax, name, f"x [{unit}]", f"y [{unit}]" if ax is axes[0] else "")
+        ax.imshow(values, cmap="gray", norm=drawing.light_norm(viz.peak(values)), extent=extent)
+        drawing.image_axes(ax, name, f"x [{angle}]", f"y [{angle}]" if ax is axes[0] else "")
+        drawing.light_bar(figure, [ax], unit)
+        if sky is not None and name == title:
+            drawing.compass(ax, sky)
     if deviation is not None:
         ax = axes[len(lights)]
         ax.imshow(as_array(deviation), cmap="magma", vmin=0, extent=extent)
-        drawing.image_axes(ax, "standard deviation", f"x [{unit}]", "")
-        drawing.colorbar(figure, [ax], "electrons")
+        drawing.image_axes(ax, "standard deviation", f"x [{angle}]", "")
+        drawing.colorbar(figure, [ax], f"{unit}, linear")
     if residuals is not None:
         rms = np.sqrt((as_array(residuals) ** 2).mean(0))
         axes[-1].imshow(rms, cmap="magma", vmin=0, vmax=max(2.0, float(np.percentile(rms, 99.5))), extent=extent)
-        drawing.image_axes(axes[-1], "rms residual", f"x [{unit}]", "")
-        drawing.colorbar(figure, axes[-1:], "noise")
+        drawing.image_axes(axes[-1], "rms residual", f"x [{angle}]", "")
+        drawing.colorbar(figure, axes[-1:], "noise, linear")
     return figure

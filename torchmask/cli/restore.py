@@ -12,12 +12,14 @@ import tyro
 
 from torchmask import __version__
 from torchmask.cli.config import stored
+from torchmask.cli.oifits import OIFITSOptions, measure_frames, write_frames
 from torchmask.cli.options import RunOptions, WorkerOptions
 from torchmask.cli.program import NOT_EXPLAINED
 from torchmask.cli.report import restored_figure
 from torchmask.cli.run import CHECKPOINT, new_run
 from torchmask.cli.stacks import StackOptions, group_files, read_stack
 from torchmask.data.restored import save_restored
+from torchmask.interferometry.observables import Observables
 from torchmask.io import new_folder, write_json
 from torchmask.metrics import relative_error, ssim
 from torchmask.observation import Observation
@@ -33,7 +35,7 @@ SKIES = {"if-seen": Background.IF_SEEN, "per-frame": Background.PER_FRAME, "none
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(StackOptions, WorkerOptions, RunOptions):
+class Options(StackOptions, OIFITSOptions, WorkerOptions, RunOptions):
     """Restore the image behind a stack of short exposures with unknown aberrations (myopic deconvolution).
 
     A stack is an .npz file (`torchmask simulate` writes such) or a FITS cube; several are restored side by side, each
@@ -104,7 +106,9 @@ def restore_one(files: Sequence[Path], options: Options) -> int:
     if checkpoint is not None and not checkpoint.is_file():
         raise ValueError(f"there is no {checkpoint} to go on from: it is written at the 100th iteration")
     method = deconvolution(observation, options)
+    observables = measure_frames(observation, options, known_sky(options))
     with new_run("restore", options) as output:
+        output.summary.extend(write_frames(output.directory, observables, observation, options))
         state = output.directory / CHECKPOINT
         if checkpoint is not None:
             shutil.copyfile(checkpoint, state)
@@ -130,11 +134,14 @@ def restore_several(stacks: Mapping[str, Sequence[Path]], options: Options) -> i
     """
     observations: dict[str, Observation] = {}
     methods: list[MyopicDeconvolution] = []
+    observables: dict[str, Observables | None] = {}
     failures: dict[str, Exception] = {}
     for name, files in stacks.items():
         try:
             observations[name] = read_stack(files, options)
-            methods.append(deconvolution(observations[name], options))
+            method = deconvolution(observations[name], options)
+            observables[name] = measure_frames(observations[name], options, known_sky(options))
+            methods.append(method)
         except (ValueError, OSError) as error:
             observations.pop(name, None)
             failures[name] = error
@@ -149,7 +156,9 @@ def restore_several(stacks: Mapping[str, Sequence[Path]], options: Options) -> i
             if isinstance(result, Exception):
                 failures[name] = result
                 continue
-            tables[name] = write(new_folder(output.directory / name), stacks[name], seen[number], result, options)
+            folder = new_folder(output.directory / name)
+            tables[name] = write(folder, stacks[name], seen[number], result, options)
+            output.summary.extend(write_frames(folder, observables[name], seen[number], options))
             log(seen[number], result, tables[name], output.logger, f"{name}/")
             output.summary.append(f"{name}: {result.summary()}")
         verdicts = {name: table["verdict"] for name, table in tables.items()}
@@ -187,6 +196,11 @@ def deconvolution(observation: Observation, options: Options) -> MyopicDeconvolu
         max_iterations=options.max_iterations,
         tolerance=options.tolerance,
     )
+
+
+def known_sky(options: Options) -> float:
+    """What --sky says of its light [electrons per pixel]; 0 where it is to be found."""
+    return 0.0 if isinstance(options.sky, str) else options.sky
 
 
 def write(
@@ -231,7 +245,11 @@ def log(
     scale = observation.grid.pixel_scale
     logger.figure(
         f"{prefix}restored",
-        restored_figure(result.object, observation.frames, result.residuals, scale, deviation=result.object_std),
+        restored_figure(
+            *(result.object, observation.frames, result.residuals, scale),
+            deviation=result.object_std,
+            sky=observation.sky_matrix,
+        ),
     )
     logger.figure(f"{prefix}cost", viz.history_figure({"restoration": result.cost.tolist()}, "cost"))
     if observation.object is not None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
 import tyro
 
 from torchmask.cli.masks import describe
@@ -17,7 +19,7 @@ from torchmask.data.fits import read_fits
 from torchmask.design.manufacture import load_mask
 from torchmask.grid import ARCSEC
 from torchmask.io import atomic_write, load_npz, read_json
-from torchmask.observation import Observation
+from torchmask.observation import Observation, pixel_matrix
 from torchmask.optics.aperture import SparseAperture
 from torchmask.restoration.result import RestorationResult
 from torchmask.tracking import read_metrics
@@ -106,9 +108,13 @@ def _view_fits(path: Path) -> View:
     lines += [f"{key} = {images.header[key]}" for key in keys if key in images.header]
     scale = images.header.get("PIXELSCL")
     angle = scale * ARCSEC if isinstance(scale, float) else None
+    sky = pixel_matrix(images.header)
+    if angle is None and sky is not None:
+        angle = math.sqrt(abs(np.linalg.det(sky)))
+    shown: dict[str, Any] = {"pixel_scale": angle, "unit": str(images.header.get("BUNIT", "")), "sky": sky}
     if count == 1:
-        return View("\n".join(lines), {"": restored_figure(images.values[0], title="image", pixel_scale=angle)})
-    return View("\n".join(lines), {"": viz.frames_figure(images.values, pixel_scale=angle)})
+        return View("\n".join(lines), {"": restored_figure(images.values[0], title="image", **shown)})
+    return View("\n".join(lines), {"": viz.frames_figure(images.values, **shown)})
 
 
 def _view_npz(path: Path) -> View:
@@ -145,7 +151,10 @@ def _stack_view(observation: Observation) -> View:
         lines.append(f"simulated, r0 {observation.r0:.4g} m, {observation.n_photons or 0:.4g} photons per frame")
     return View(
         "\n".join(lines),
-        {"": viz.frames_figure(frames, pixel_scale=grid.pixel_scale), "-mask": viz.mask_figure(aperture)},
+        {
+            "": viz.frames_figure(frames, pixel_scale=grid.pixel_scale, sky=observation.sky_matrix),
+            "-mask": viz.mask_figure(aperture),
+        },
     )
 
 

@@ -12,7 +12,8 @@ from torchmask.interferometry.fringe_fit import (
     complex_covariances,
     fit_fringes,
 )
-from torchmask.interferometry.visibilities import Observables, sky_stations, triangle_sides
+from torchmask.interferometry.observables import Observables
+from torchmask.interferometry.visibilities import sky_stations, triangle_sides
 from torchmask.observation import Observation, check_frames
 from torchmask.optics.noise import noise_variance
 from torchmask.optics.pixel import PixelResponse

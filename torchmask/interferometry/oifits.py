@@ -16,7 +16,7 @@ import numpy as np
 from torch import Tensor
 
 from torchmask.grid import ARCSEC
-from torchmask.interferometry.visibilities import Observables
+from torchmask.interferometry.observables import Observables
 from torchmask.io import as_array, atomic_write
 from torchmask.observation import Observation
 from torchmask.optics.band import filter_of_header

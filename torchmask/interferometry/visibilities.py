@@ -1,90 +1,22 @@
-"""What an interferometer measures, for every baseline and triangle of a mask; here, of a restored object.
-
-Signs, as in OIFITS (Pauls et al. 2005, PASP 117, 1255; Duvert et al. 2017, A&A 597, A8): the visibility of a brightness
-I(E, N), east and north in radians, on the baseline (u, v) metres is
-
-    V = integral I exp(-2 pi i (u E + v N) / wavelength) / integral I,
-
-(u, v) of the pair (i, j) is centre j minus centre i, turned from the axes of the image to those of the sky, and the
-closure phase of the triangle (i, j, k) is arg(V_ij V_jk V_ki).
-"""
+"""Visibilities and closure phases of a restored object, and the geometry of baselines and triangles."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from torchmask.grid import Grid
+from torchmask.interferometry.observables import Observables
 from torchmask.observation import Observation
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.otf import OTF
 from torchmask.optics.zernike import ZernikePhase
-from torchmask.record import Brief
 
 _SAMPLES_PER_HOLE = 8
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Observables(Brief):
-    """Visibilities of B = N (N - 1) / 2 baselines and closure phases of C = N (N - 1) (N - 2) / 6 triangles.
-
-    pairs : (B, 2) holes i < j of each baseline
-    triangles : (C, 3) holes i < j < k
-    stations : (N, 2) centres of the holes, (u, v) towards east and north [m]
-    visibilities : (B,) complex; from frames, pistons and all
-    visibility_errors : (B,) rms of the amplitude, and of the phase times the amplitude
-    vis2, vis2_covariance : (B,) and (B, B), |V|^2
-    closure_phases, closure_covariance : (C,) rad and (C, C); triangles share baselines, so it has no inverse from four
-        holes on unless each triangle has noise of its own
-    triple_amplitudes, triple_covariance : (C,) and (C, C), |V_ij V_jk V_ki|
-
-    Examples
-    --------
-    >>> stations = torch.tensor([[0.0, 0.4], [-0.35, -0.2]], dtype=torch.float64)
-    >>> one, none = torch.ones(1, dtype=torch.float64), torch.zeros(0, dtype=torch.float64)
-    >>> point = Observables(
-    ...     torch.tensor([[0, 1]]), torch.zeros(0, 3, dtype=torch.int64), stations, one + 0j, 0.01 * one,
-    ...     one, 0.0004 * one[:, None], none, none[:, None], none, none[:, None])
-    >>> float(point.vis2[0]), float(point.vis2_errors[0])
-    (1.0, 0.02)
-    """
-
-    pairs: Tensor
-    triangles: Tensor
-    stations: Tensor
-    visibilities: Tensor
-    visibility_errors: Tensor
-    vis2: Tensor
-    vis2_covariance: Tensor
-    closure_phases: Tensor
-    closure_covariance: Tensor
-    triple_amplitudes: Tensor
-    triple_covariance: Tensor
-
-    @property
-    def vis2_errors(self) -> Tensor:
-        """(B,) rms of |V|^2."""
-        return self.vis2_covariance.diagonal().sqrt()
-
-    @property
-    def closure_errors(self) -> Tensor:
-        """(C,) rms of the closure phases [rad]."""
-        return self.closure_covariance.diagonal().sqrt()
-
-    @property
-    def triple_errors(self) -> Tensor:
-        """(C,) rms of the amplitudes of triple products."""
-        return self.triple_covariance.diagonal().sqrt()
-
-    @property
-    def baselines(self) -> Tensor:
-        """(B, 2) (u, v) of each pair [m]."""
-        return self.stations[self.pairs[:, 1]] - self.stations[self.pairs[:, 0]]
 
 
 class Restored(Protocol):

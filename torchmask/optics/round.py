@@ -61,8 +61,9 @@ class Disc(Shape):
         return (cls(), 2 * outline[0].radius) if len(outline) == 1 and isinstance(outline[0], Circle) else None
 
     def coverage(self, offsets: Tensor, cell: Tensor, diameter: float) -> Tensor:
-        # A sample on the centre has no direction: any will do, and this one keeps the gradient finite.
-        central = (offsets == 0).all(-1, keepdim=True)
+        # A sample on the centre has no direction: any will do, and this one keeps the gradient finite. So has one so
+        # near that the square of its distance is lost in underflow.
+        central = (offsets.abs() < math.sqrt(torch.finfo(offsets.dtype).tiny)).all(-1, keepdim=True)
         direction = torch.where(central, offsets.new_tensor([1.0, 0.0]), offsets)
         length = torch.linalg.vector_norm(direction, dim=-1, keepdim=True)
         r = torch.where(central, 0, length)[..., 0]

@@ -34,17 +34,17 @@ def stretch(image: Any, percentile: float = 99.5, gamma: float = 0.5) -> np.ndar
     """
     values = as_array(image).astype(float)
     values = np.where(values > 0, values, 0.0)
-    peak = _peak(values, percentile)
-    return (np.minimum(values, peak) / peak) ** gamma if peak > 0 else np.where(values > 0, 1.0, 0.0)
+    white = peak(values, percentile)
+    return (np.minimum(values, white) / white) ** gamma if white > 0 else np.where(values > 0, 1.0, 0.0)
 
 
-def _peak(values: np.ndarray, percentile: float = 99.5) -> float:
+def peak(values: np.ndarray, percentile: float = 99.5) -> float:
     """The value shown as white: `percentile`, or the largest where fewer pixels than that shine."""
     finite = values[np.isfinite(values)]
     if not finite.size:
         return 0.0
-    peak = float(np.percentile(finite, percentile))
-    return peak if peak > 0 else float(finite.max())
+    white = float(np.percentile(finite, percentile))
+    return white if white > 0 else float(finite.max())
 
 
 def _on_grid(name: str, values: Any, grid: Grid) -> np.ndarray:
@@ -172,32 +172,33 @@ def psf_figure(psfs: Mapping[str, Any], grid: Grid) -> Figure:
         psf = np.fft.fftshift(_on_grid(name, values, grid).mean(0))
         ax.imshow(np.maximum(psf / psf.max(), 1e-4), cmap="magma", norm=LogNorm(1e-4, 1), extent=extent)
         drawing.image_axes(ax, name, f"x [{unit}]", f"y [{unit}]" if ax is axes[0] else "")
-    drawing.colorbar(figure, axes, "fraction of the peak")
+    drawing.colorbar(figure, axes, "fraction of the peak, logarithmic")
     return figure
 
 
 @drawing.styled
-def frames_figure(frames: Any, count: int = 4, pixel_scale: float | None = None) -> Figure:
-    """The first `count` of a stack (T, H, W) of exposures and the mean of all, on one scale [electrons per pixel].
+def frames_figure(
+    frames: Any, count: int = 4, pixel_scale: float | None = None, unit: str = "electrons", sky: Any | None = None
+) -> Figure:
+    """The first `count` of a stack (T, H, W) of exposures and the mean of all, on one scale [`unit` per pixel].
 
-    `pixel_scale` [rad] labels the axes with angles instead of pixels. Raises ValueError for another shape.
+    `pixel_scale` [rad] labels the axes with angles instead of pixels, `sky` (2, 2), as `Observation.sky_matrix`, adds
+    north and east. Raises ValueError for another shape.
     """
-    from matplotlib.colors import PowerNorm
-
     stack = as_array(frames).astype(float)
     if stack.ndim != 3 or 0 in stack.shape:
         raise ValueError(f"frames have shape {stack.shape}: a stack (frames, rows, columns) is needed")
     images = {f"frame {k + 1}": frame for k, frame in enumerate(stack[:count])}
     images[f"mean of {len(stack)}"] = stack.mean(0)
     figure, axes = drawing.row_of_axes([1.0] * len(images), height=2.5)
-    unit, extent = drawing.sky_extent(stack.shape[1:], pixel_scale)
-    peak = _peak(stack[:count], 99.9) or 1.0
-    norm = PowerNorm(0.5, 0, peak, clip=True)
+    angle, extent = drawing.sky_extent(stack.shape[1:], pixel_scale)
+    norm = drawing.light_norm(peak(stack[:count], 99.9))
     for ax, (name, values) in zip(axes, images.items(), strict=True):
         ax.imshow(values, cmap="gray", norm=norm, extent=extent)
-        drawing.image_axes(ax, name, f"x [{unit}]", f"y [{unit}]" if ax is axes[0] else "")
-    even = (0, 0.05, 0.2, 0.5, 1)  # nearly so, under the square root
-    drawing.colorbar(figure, axes, "electrons", ticks=[drawing.round_below(peak) * part for part in even], format="%g")
+        drawing.image_axes(ax, name, f"x [{angle}]", f"y [{angle}]" if ax is axes[0] else "")
+    if sky is not None:
+        drawing.compass(axes[-1], sky)
+    drawing.light_bar(figure, axes, unit)
     return figure
 
 
@@ -266,13 +267,15 @@ def comparison_figure(
         first = ["truth", "limit"] + ["."] * (n - 2)
         layout = [[first[k], f"frame {k}", f"restored {k}"] for k in range(n)]
     figure = drawing.new_figure(2.6 * len(layout[0]), 3.1 * len(layout))
-    peak = _peak(images["limit"][1])
-    for key, ax in figure.subplot_mosaic(layout).items():
+    norm = drawing.light_norm(peak(images["limit"][1]))
+    axes = figure.subplot_mosaic(layout)
+    for key, ax in axes.items():
         title, image = images[key]
-        ax.imshow(np.clip(image / peak, 0, 1) ** 0.5, cmap="gray", vmin=0, vmax=1)
+        ax.imshow(image, cmap="gray", norm=norm)
         ax.set(title=title, xticks=[], yticks=[])
         if key == "truth" and pixel_scale is not None:
             drawing.scale_bar(ax, image.shape[1], pixel_scale)
+    drawing.light_bar(figure, list(axes.values()))
     return figure
 
 

@@ -16,6 +16,7 @@ from torchmask.optics.shape_base import Circle, Contour
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.colors import PowerNorm
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
@@ -169,6 +170,38 @@ def colorbar(figure: Figure, axes: list[Axes], label: str = "", **options: Any) 
     """A slim bar to the right of `axes` for the colours of their images, which share one scale."""
     bar = figure.colorbar(axes[0].images[0], ax=axes, shrink=0.9, pad=0.015, aspect=28, label=label, **options)
     bar.outline.set_visible(False)  # type: ignore[operator]
+
+
+def light_norm(peak: float) -> PowerNorm:
+    """From 0 to `peak` under a square root, which lifts the faint parts."""
+    from matplotlib.colors import PowerNorm
+
+    return PowerNorm(0.5, 0, peak or 1.0, clip=True)
+
+
+def light_bar(figure: Figure, axes: list[Axes], unit: str = "electrons") -> None:
+    """A bar for images that `light_norm` maps; it names the unit and the stretch."""
+    peak = axes[0].images[0].get_clim()[1]
+    even = (0, 0.05, 0.2, 0.5, 1)  # nearly so, under the square root
+    label = f"{unit}, square-root stretch" if unit else "square-root stretch"
+    colorbar(figure, axes, label, ticks=[round_below(peak) * part for part in even], format="%g")
+
+
+def compass(ax: Axes, matrix: Any) -> None:
+    """Arrows to north and east in the lower right corner of an image that was shown with `sky_extent`.
+
+    `matrix` (2, 2) leads from pixels (x, y) to (east, north), as `Observation.sky_matrix`.
+    """
+    left, right, bottom, top = ax.images[0].get_extent()
+    side = min(abs(right - left), abs(bottom - top))
+    towards = np.linalg.inv(np.asarray(matrix, dtype=float)).T  # rows: a step to east, to north, in pixels
+    middle = np.array([right - 0.2 * side, bottom - 0.2 * side])
+    for name, step in zip(("E", "N"), towards / np.linalg.norm(towards, axis=1, keepdims=True), strict=True):
+        (x, y), (tip_x, tip_y) = middle, middle + 0.11 * side * step
+        arrow = {"arrowstyle": "->", "color": "white", "shrinkA": 0, "shrinkB": 0}
+        ax.annotate("", (float(tip_x), float(tip_y)), (float(x), float(y)), arrowprops=arrow)
+        x, y = middle + 0.15 * side * step
+        ax.text(float(x), float(y), name, color="white", fontsize=8.5, ha="center", va="center")
 
 
 def scale_bar(ax: Axes, columns: int, pixel_scale: float) -> None:

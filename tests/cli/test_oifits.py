@@ -1,0 +1,71 @@
+"""`torchmask restore --oifits`: what is in the file, and what is refused before any work."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from torchmask.cli.main import main
+from torchmask.cli.oifits import OIFITSOptions, measure_frames
+from torchmask.grid import Grid
+from torchmask.interferometry.fringes import frame_observables
+from torchmask.observation import Observation
+from torchmask.optics.aperture import SparseAperture
+
+fits = pytest.importorskip("astropy.io.fits")
+
+MASK = SparseAperture([[0.0, 0.42], [0.38, -0.2], [-0.4, -0.15], [0.1, -0.05]], 0.1, 1.0)
+GRID = Grid.nyquist(MASK.extent, 550e-9, 32, 1.1)
+
+
+@pytest.fixture
+def seen(expose_points):
+    frames = torch.poisson(expose_points(MASK, GRID, electrons=1e5, n_frames=3), torch.Generator().manual_seed(0))
+    return Observation(frames, MASK, GRID, 1.0)
+
+
+def restore(*arguments):
+    return main(["restore", *map(str, arguments), "--max-iterations", "2", "--n-modes", "3"])
+
+
+@pytest.mark.parametrize("n_stacks", [1, 2])
+def test_the_file_holds_the_observables_of_the_frames(n_stacks, seen, tmp_path, capsys):
+    stacks = [tmp_path / f"stack{number}.npz" for number in range(n_stacks)]
+    for path in stacks:
+        seen.save(path)
+    given = ("--oifits", "--bandwidth", "1e-8", "--workers", "1", "--out", tmp_path / "run")
+    assert restore(*stacks, *given) == 0
+    files = sorted((tmp_path / "run").rglob("*.oifits"))
+    assert len(files) == n_stacks
+    expected = frame_observables(seen)
+    for file in files:
+        assert str(file) in capsys.readouterr().out.replace("\n", "") or n_stacks > 1
+        with fits.open(file) as hdus:
+            np.testing.assert_allclose(hdus["OI_VIS2"].data["VIS2DATA"].ravel(), expected.vis2, rtol=1e-12)
+            phases = np.radians(hdus["OI_T3"].data["T3PHI"].ravel())
+            np.testing.assert_allclose(phases, expected.closure_phases, atol=1e-12)
+            assert float(hdus["OI_WAVELENGTH"].data["EFF_BAND"][0]) == pytest.approx(1e-8)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--oifits"], "give --bandwidth [m]"),
+        (["--oifits", "--bandwidth", "-1"], "--bandwidth is -1: it must be finite"),
+    ],
+)
+def test_an_unknown_band_is_refused_before_any_work(options, message, seen, tmp_path, capsys):
+    seen.save(tmp_path / "stack.npz")
+    assert restore(tmp_path / "stack.npz", *options, "--out", tmp_path / "run") == 1
+    assert message in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_sky_that_is_known_is_taken_off_with_its_noise_counted(seen):
+    bright = dataclasses.replace(seen, frames=seen.frames + 50)
+    found = measure_frames(bright, OIFITSOptions(oifits=True, bandwidth=1e-8), sky=50.0)
+    expected = frame_observables(dataclasses.replace(seen, readout_noise=51**0.5))
+    torch.testing.assert_close(found.vis2, expected.vis2)
+    torch.testing.assert_close(found.vis2_covariance, expected.vis2_covariance)
+    assert measure_frames(bright, OIFITSOptions()) is None

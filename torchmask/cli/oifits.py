@@ -1,0 +1,57 @@
+"""`--oifits`: visibilities and closure phases of the frames that a command restores, as a file beside the image."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from torchmask.interferometry.fringes import frame_observables
+from torchmask.interferometry.observables import Observables
+from torchmask.interferometry.oifits import save_oifits
+from torchmask.observation import Observation
+from torchmask.optics.band import filter_of_header
+
+FILE = "frames.oifits"
+
+
+@dataclass(frozen=True, kw_only=True)
+class OIFITSOptions:
+    """What the frames' visibilities depend on."""
+
+    oifits: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Write the squared visibilities and closure phases of the frames, not calibrated by a star, to frames.oifits."""
+    bandwidth: float | None = None
+    """Width of the band for the OIFITS file [m]; None: that of the FILTER in the header."""
+
+
+def measure_frames(observation: Observation, options: OIFITSOptions, sky: float = 0.0) -> Observables | None:
+    """The frames' observables, without a sky [electrons per pixel] that is known; None if --oifits was not given.
+
+    Raises ValueError if the band's width is not known or cannot be, or the mask's fringes cannot be told apart.
+    """
+    if not options.oifits:
+        return None
+    width = options.bandwidth
+    if width is None and filter_of_header(observation.header) is None:
+        raise ValueError("--oifits needs the width of the band, and no FILTER tells it: give --bandwidth [m]")
+    if width is not None and not (math.isfinite(width) and width > 0):
+        raise ValueError(f"--bandwidth is {width:g}: it must be finite and positive, in m")
+    readout = observation.readout_noise
+    if readout is not None:
+        readout = math.hypot(readout, math.sqrt(sky))  # a sky that is taken off leaves its noise
+    return frame_observables(dataclasses.replace(observation, frames=observation.frames - sky, readout_noise=readout))
+
+
+def write_frames(
+    folder: Path, observables: Observables | None, observation: Observation, options: OIFITSOptions
+) -> list[str]:
+    """Write the file if there is something to write; the line that a summary says of it."""
+    if observables is None:
+        return []
+    save_oifits(folder / FILE, observables, observation, options.bandwidth)
+    n, triangles = len(observables.pairs), len(observables.triangles)
+    return [f"|V|^2 of {n} baselines and closure phases of {triangles} triangles: {folder / FILE}"]

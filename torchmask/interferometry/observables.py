@@ -1,0 +1,147 @@
+"""What an interferometer measures, for every baseline and triangle of a mask.
+
+Signs, as in OIFITS (Pauls et al. 2005, PASP 117, 1255; Duvert et al. 2017, A&A 597, A8): the visibility of a brightness
+I(E, N), east and north in radians, on the baseline (u, v) metres is
+
+    V = integral I exp(-2 pi i (u E + v N) / wavelength) / integral I,
+
+(u, v) of the pair (i, j) is centre j minus centre i, turned from the axes of the image to those of the sky, and the
+closure phase of the triangle (i, j, k) is arg(V_ij V_jk V_ki).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchmask.record import Brief
+
+_SAME_LENGTH = 1e-3  # of baselines of one mask, which lies otherwise on the sky from one star to the next
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Observables(Brief):
+    """Visibilities of B = N (N - 1) / 2 baselines and closure phases of C = N (N - 1) (N - 2) / 6 triangles.
+
+    pairs : (B, 2) holes i < j of each baseline
+    triangles : (C, 3) holes i < j < k
+    stations : (N, 2) centres of the holes, (u, v) towards east and north [m]
+    visibilities : (B,) complex; from frames, pistons and all
+    visibility_errors : (B,) rms of the amplitude, and of the phase times the amplitude
+    vis2, vis2_covariance : (B,) and (B, B), |V|^2
+    closure_phases, closure_covariance : (C,) rad and (C, C); triangles share baselines, so it has no inverse from four
+        holes on unless each triangle has noise of its own
+    triple_amplitudes, triple_covariance : (C,) and (C, C), |V_ij V_jk V_ki|
+
+    Examples
+    --------
+    >>> stations = torch.tensor([[0.0, 0.4], [-0.35, -0.2]], dtype=torch.float64)
+    >>> one, none = torch.ones(1, dtype=torch.float64), torch.zeros(0, dtype=torch.float64)
+    >>> point = Observables(
+    ...     torch.tensor([[0, 1]]), torch.zeros(0, 3, dtype=torch.int64), stations, one + 0j, 0.01 * one,
+    ...     one, 0.0004 * one[:, None], none, none[:, None], none, none[:, None])
+    >>> float(point.vis2[0]), float(point.vis2_errors[0])
+    (1.0, 0.02)
+    """
+
+    pairs: Tensor
+    triangles: Tensor
+    stations: Tensor
+    visibilities: Tensor
+    visibility_errors: Tensor
+    vis2: Tensor
+    vis2_covariance: Tensor
+    closure_phases: Tensor
+    closure_covariance: Tensor
+    triple_amplitudes: Tensor
+    triple_covariance: Tensor
+
+    @property
+    def vis2_errors(self) -> Tensor:
+        """(B,) rms of |V|^2."""
+        return self.vis2_covariance.diagonal().sqrt()
+
+    @property
+    def closure_errors(self) -> Tensor:
+        """(C,) rms of the closure phases [rad]."""
+        return self.closure_covariance.diagonal().sqrt()
+
+    @property
+    def triple_errors(self) -> Tensor:
+        """(C,) rms of the amplitudes of triple products."""
+        return self.triple_covariance.diagonal().sqrt()
+
+    @property
+    def baselines(self) -> Tensor:
+        """(B, 2) (u, v) of each pair [m]."""
+        return self.stations[self.pairs[:, 1]] - self.stations[self.pairs[:, 0]]
+
+    def calibrate(self, star: Observables) -> Observables:
+        """These, divided by those of a star that is a point: what lowers the contrast of both alike drops out.
+
+        |V|^2 and triple amplitudes are divided by the star's, closure phases are subtracted, complex visibilities are
+        divided, which is of use only where pistons stay as they are. Errors and covariances of both add up, to first
+        order. Directions on the sky stay those of the object.
+
+        Parameters
+        ----------
+        star : Observables
+            Of an unresolved star through the same mask and band, by the same function.
+
+        Raises
+        ------
+        ValueError
+            If the star was seen through another mask, or shows no fringes on some baseline.
+
+        Examples
+        --------
+        >>> stations = torch.tensor([[0.0, 0.4], [-0.35, -0.2]], dtype=torch.float64)
+        >>> one, none = torch.ones(1, dtype=torch.float64), torch.zeros(0, dtype=torch.float64)
+        >>> def seen(vis2):
+        ...     return Observables(
+        ...         torch.tensor([[0, 1]]), torch.zeros(0, 3, dtype=torch.int64), stations, (vis2 * one).sqrt() + 0j,
+        ...         0.01 * one, vis2 * one, 1e-4 * one[:, None], none, none[:, None], none, none[:, None])
+        >>> binary = seen(0.4).calibrate(seen(0.8))
+        >>> round(float(binary.vis2[0]), 6), round(float(binary.vis2_errors[0]), 6)  # (0.01 / 0.8) (1 + 0.5^2)^(1/2)
+        (0.5, 0.013975)
+        """
+        self._require_same_mask(star)
+        dark = (star.vis2 <= 0).nonzero().flatten().tolist()
+        if dark:
+            names = ", ".join("-".join(map(str, self.pairs[index].tolist())) for index in dark)
+            raise ValueError(f"the star shows no fringes of holes {names}: use a brighter star, or more frames of it")
+        vis2, vis2_covariance = _divide(self.vis2, self.vis2_covariance, star.vis2, star.vis2_covariance)
+        triple, triple_covariance = _divide(
+            self.triple_amplitudes, self.triple_covariance, star.triple_amplitudes, star.triple_covariance
+        )
+        phases = self.closure_phases - star.closure_phases
+        size = star.visibilities.abs()
+        values = self.visibilities / star.visibilities
+        return replace(
+            self,
+            visibilities=values,
+            visibility_errors=torch.hypot(self.visibility_errors, values.abs() * star.visibility_errors) / size,
+            vis2=vis2,
+            vis2_covariance=vis2_covariance,
+            closure_phases=torch.atan2(phases.sin(), phases.cos()),
+            closure_covariance=self.closure_covariance + star.closure_covariance,
+            triple_amplitudes=triple,
+            triple_covariance=triple_covariance,
+        )
+
+    def _require_same_mask(self, star: Observables) -> None:
+        lengths = [torch.linalg.vector_norm(each.baselines, dim=1) for each in (self, star)]
+        same = torch.equal(self.pairs, star.pairs) and torch.equal(self.triangles, star.triangles)
+        if not (same and torch.allclose(*lengths, rtol=_SAME_LENGTH, atol=0)):
+            raise ValueError(
+                f"the star was seen through another mask: its {len(star.stations)} holes and the "
+                f"{len(self.stations)} of the object must be the same, in the same order"
+            )
+
+
+def _divide(values: Tensor, covariance: Tensor, by: Tensor, by_covariance: Tensor) -> tuple[Tensor, Tensor]:
+    """values / by (M,) and its covariance (M, M), to first order."""
+    ratio, outer = values / by, by[:, None] * by
+    return ratio, (covariance + ratio[:, None] * ratio * by_covariance) / outer
