@@ -17,6 +17,7 @@ import torchmask
 from torchmask.atmosphere.phase import LayeredPhase, TurbulencePhase
 from torchmask.atmosphere.profiles import named_layers
 from torchmask.design.criterion import AsymptoticMSE
+from torchmask.design.turbulent import TurbulentMSE
 from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture, FullAperture, SparseAperture
 from torchmask.optics.band import Band
@@ -47,6 +48,14 @@ def moved(shape="disc"):
 
 def criterion(n_photons=1e7):
     return AsymptoticMSE(GRID, PowerLawPSD(1.5, n_photons), NoisePSD(n_photons), n_frames=20)
+
+
+def turbulent_criterion(n_photons=1e7):
+    return TurbulentMSE(GRID, PowerLawPSD(1.5, n_photons), NoisePSD(n_photons), n_frames=20, r0=0.2)
+
+
+def scored(module: AsymptoticMSE, dtype: torch.dtype) -> Tensor:
+    return module(mask().to(dtype))
 
 
 def seeded():
@@ -118,7 +127,8 @@ MODULES: dict[str, Entry] = {
     "turbulence in layers": Entry(lambda: LayeredPhase(named_layers("hv57", 2), 550e-9, 20.0), turbulent),
     "PSF": Entry(lambda: PSF(mask(), GRID), blurred, lambda: PSF(moved(), GRID)),
     "OTF": Entry(lambda: OTF(mask(), GRID), blurred, lambda: OTF(moved(), GRID)),
-    "criterion": Entry(criterion, lambda module, dtype: module(mask().to(dtype)), lambda: criterion(1e6)),
+    "criterion": Entry(criterion, scored, lambda: criterion(1e6)),
+    "criterion under turbulence": Entry(turbulent_criterion, scored, lambda: turbulent_criterion(1e6)),
     "detector": Entry(
         lambda: Detector(1.5),
         lambda module, dtype: module(1e3 * random(8, 8, dtype=dtype), seeded()),
@@ -205,10 +215,10 @@ def test_the_dtype_follows_the_inputs(entry, dtype):
 @each_module
 def test_the_device_follows_the_inputs(entry):
     """Every array made inside is made where the inputs are: on another default device nothing goes there."""
-    module = entry.make()
+    module, untouched = entry.make(), entry.make()  # which has made nothing at a first call yet
     expected = entry.call(module, torch.float64)
     with torch.device("meta"):
-        result = entry.call(module, torch.float64)
+        result = entry.call(untouched, torch.float64)
     assert torch.equal(result, expected)
 
 
@@ -247,11 +257,13 @@ def value_and_gradient(function, aperture, phase):
 
 @pytest.mark.filterwarnings("ignore")  # the compiler warns of its own doings
 @pytest.mark.parametrize("backend", ["aot_eager", pytest.param("inductor", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("name", ["PSF", "criterion"])
+@pytest.mark.parametrize(
+    "name", ["PSF", "criterion", pytest.param("criterion under turbulence", marks=pytest.mark.slow)]
+)
 def test_compiled_modules_do_what_eager_ones_do(name, backend):
     """Also after an optimiser has moved the holes: nothing of the first call is frozen into the graph."""
     aperture = SparseAperture(nn.Parameter(CENTERS.clone()), 0.2, 1.0)
-    module = PSF(aperture, GRID) if name == "PSF" else criterion()
+    module = PSF(aperture, GRID) if name == "PSF" else MODULES[name].make()
     phase = random(2, *aperture.samples(GRID).weights.shape, dtype=torch.float64) if name == "PSF" else None
     torch.compiler.reset()
     compiled = torch.compile(module, backend=backend)

@@ -52,7 +52,7 @@ def some_frequencies(mask, grid, count, lowest):
     [
         (6, 0.4, math.inf, 0.0, 0.0, "disc"),
         (6, 1.5, 5.0, 0.0, 0.0, "disc"),
-        (11, 0.8, 20.0, 1.0, (8.0, 6.0), "disc"),
+        pytest.param(11, 0.8, 20.0, 1.0, (8.0, 6.0), "disc", marks=pytest.mark.slow),
         (6, 0.8, math.inf, 2.0, 10.0, "disc"),
         (6, 0.8, math.inf, 0.0, 0.0, "hexagon"),
     ],
@@ -125,7 +125,9 @@ def test_weak_turbulence_within_small_holes_is_mse_a():
     assert 0 < lost < restored * 2 * 1.0324 * (1 / 8) ** (5 / 3)
 
 
-@pytest.mark.parametrize(("obstruction", "wind"), [(0.0, 0.0), (0.3, 0.0), (0.3, (10.0, 0.0))])
+@pytest.mark.parametrize(
+    ("obstruction", "wind"), [(0.0, 0.0), (0.3, 0.0), pytest.param(0.3, (10.0, 0.0), marks=pytest.mark.slow)]
+)
 def test_full_pupils_agree_with_the_general_integral(obstruction, wind):
     pupil = FullAperture(1.0, obstruction)
     exposure = 5e-3 if wind else 0.0
@@ -195,6 +197,7 @@ def test_gradients(layout):
     torch.autograd.gradcheck(lambda x: criterion.relative(SparseAperture(x, 0.2, 1.0)), centers, eps=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_turning_everything_changes_little():
     """Criterion and wind turned by 90 degrees: the same but for rounding. Turned alone, the mask differs."""
     mask = mask_of(6)
@@ -209,15 +212,15 @@ def test_turning_everything_changes_little():
 def test_stronger_turbulence_and_longer_exposures_are_worse():
     mask = mask_of(6)
     by_r0 = [float(criterion_of(r0=r0).relative(mask)) for r0 in (0.5, 0.2, 0.1)]
-    by_time = [float(criterion_of(r0=0.2, exposure=t, wind=10.0).relative(mask)) for t in (0, 5e-3, 1e-2)]
+    exposed = float(criterion_of(r0=0.2, exposure=5e-3, wind=10.0).relative(mask))
     assert by_r0 == sorted(by_r0)
-    assert by_time == sorted(by_time)
+    assert by_r0[1] < exposed < 1
 
 
 def test_search_refinement_and_machining_take_it():
-    criterion = criterion_of(Grid.nyquist(1.0, 550e-9, 32), r0=0.2)
-    found = search_mask(criterion, 4, 1.0, 0.15, seed=0, budget=100)
-    better = refine_mask(criterion, found.aperture, budget=20)
+    criterion = criterion_of(Grid.nyquist(1.0, 550e-9, 24), r0=0.2)
+    found = search_mask(criterion, 4, 1.0, 0.15, seed=0, budget=50)
+    better = refine_mask(criterion, found.aperture, budget=10)
     assert better.relative_mse <= found.relative_mse * (1 + 1e-9)
     assert found.relative_mse < float(criterion.relative(mask_of(4)))
     moved = machining_errors(criterion, found.aperture, 1e-3, n_draws=16, generator=torch.Generator().manual_seed(0))
@@ -225,14 +228,17 @@ def test_search_refinement_and_machining_take_it():
 
 
 def test_coarser_grids_and_copies_keep_everything():
-    criterion = criterion_of(r0=0.2, exposure=5e-3, wind=10.0, pixel=SquarePixel(), sky=1.0)
+    exposed = criterion_of(r0=0.2, exposure=5e-3, wind=10.0)
+    assert exposed.on_grid(40).seeing == exposed.seeing
+    turbulence = {"r0": 0.2, "outer_scale": 5.0, "pixel": SquarePixel()}
+    criterion = criterion_of(**turbulence, sky=1.0)
     mask, coarse = mask_of(5), criterion.on_grid(40)
     assert float(coarse.relative(mask)) == pytest.approx(float(criterion.relative(mask)), rel=0.1)
     assert coarse.seeing == criterion.seeing
     value = float(criterion(mask))
     for other in (copy.deepcopy(criterion), pickle.loads(pickle.dumps(criterion))):
         assert float(other(mask)) == value
-    other = criterion_of(n_photons=1e3, r0=0.2, exposure=5e-3, wind=10.0, pixel=SquarePixel())
+    other = criterion_of(n_photons=1e3, **turbulence)
     other.load_state_dict(criterion.state_dict())
     assert float(other(mask)) == value
 
@@ -256,3 +262,10 @@ def _with_centers(centers):
 def test_a_sky_that_is_none_is_refused(sky):
     with pytest.raises(ValueError, match="electrons per pixel"):
         criterion_of(sky=sky)
+
+
+@pytest.mark.parametrize("wind", [10.0, (3.0, 4.0), [0.0, -2.0]])
+def test_a_wind_without_an_exposure_is_refused(wind):
+    for turbulence in ({}, {"r0": 0.2}):
+        with pytest.raises(ValueError, match="exposure is 0"):
+            criterion_of(wind=wind, **turbulence)

@@ -54,7 +54,8 @@ class TurbulentMSE(AsymptoticMSE):
     Raises
     ------
     ValueError, TypeError
-        As `AsymptoticMSE` and `Seeing`; for an exposure or wind without r0, and a sky that is negative.
+        As `AsymptoticMSE` and `Seeing`; for an exposure or outer scale without r0, a wind without an exposure, and a
+        sky that is negative.
 
     Notes
     -----
@@ -96,6 +97,10 @@ class TurbulentMSE(AsymptoticMSE):
             raise ValueError(
                 f"r0 is None, for independent pistons, but outer_scale is {outer_scale} and exposure {exposure}: they "
                 "need turbulence, so give its r0 in m"
+            )
+        if exposure == 0 and (any(wind) if isinstance(wind, tuple | list) else wind != 0):
+            raise ValueError(
+                f"wind is {wind} but exposure is 0: an instant feels no wind, so give the exposure in s, or no wind"
             )
         self.seeing: Seeing | None = None if r0 is None else Seeing(r0, outer_scale, exposure, wind)
         self.pixel: PixelResponse | None = pixel
@@ -155,7 +160,8 @@ class TurbulentMSE(AsymptoticMSE):
         if key not in self._tables:
             if len(self._tables) >= _KEPT:
                 self._tables.pop(next(iter(self._tables)))
-            self._tables[key] = make(aperture)
+            with torch.device("cpu"):  # of whatever default device: tables are made in numpy and scipy
+                self._tables[key] = make(aperture)
         return self._tables[key]
 
     def _mask_transfer(self, aperture: Aperture) -> MaskTransfer:
