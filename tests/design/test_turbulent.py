@@ -140,6 +140,16 @@ def test_full_pupils_agree_with_the_general_integral(obstruction, wind):
     assert (found / exact - 1)[counts].abs().max() < 0.02
 
 
+@pytest.mark.parametrize(("ratio", "times"), [(7, 1.61), (10, 1.53), (20, 1.39)])
+def test_full_pupils_at_half_their_diameter_are_above_korff_limit(ratio, times):
+    """The limit 0.435 (r0/D)^2 T of large D/r0, and how far above it a pupil is: by an independent integral, to 2 %."""
+    power = criterion_of(r0=1 / ratio).expected_power(FullAperture(1.0))
+    transfer = 2 / math.pi * (math.acos(0.5) - 0.5 * math.sqrt(0.75))
+    along, across = float(power[0, 12]), float(power[12, 0])  # of 48 pixels, of which 24 reach the cut-off
+    assert along / (0.435 / ratio**2 * transfer) == pytest.approx(times, rel=0.02)
+    assert across == pytest.approx(along, rel=1e-6)
+
+
 @pytest.mark.parametrize("grid", [GRID, Grid.nyquist(1.0, 550e-9, (33, 40))])
 def test_expected_power_is_even_and_one_at_zero(grid):
     power = criterion_of(grid, r0=0.2).expected_power(mask_of(5))
