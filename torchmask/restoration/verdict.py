@@ -136,7 +136,7 @@ def _what_to_check(finding: Finding, n_lost: int, n_frames: int, at_rest: bool) 
     if finding is Finding.EXPLAINED:
         return "those frames for clouds and tracking errors" if n_lost else ""
     if not at_rest:
-        return "that it may go on: it was stopped before it came to rest"
+        return "again after more iterations: this search was stopped before it came to rest"
     if few:
         return "those frames for clouds and tracking errors, or leave them out"
     return (
