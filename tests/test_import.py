@@ -3,7 +3,11 @@
 import subprocess
 import sys
 
+import pytest
+import torch
+
 import torchmask
+from torchmask.design.drawing import save_dxf
 
 HEAVY = (
     "kornia",
@@ -46,3 +50,19 @@ print(0 < float(criterion.relative(mask)) < 1)
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == "True"
+
+
+@pytest.mark.parametrize(
+    ("missing", "name", "call"),
+    [
+        ("trimesh", "data", lambda: torchmask.make_scene((32, 32), 1e4)),
+        ("skimage", "data", lambda: torchmask.shift_and_add(torch.rand(2, 8, 8))),
+        ("astropy", "data", lambda: torchmask.read_observation("cube.fits", torchmask.FullAperture(1.0))),
+        ("ezdxf", "design", lambda: save_dxf("mask.dxf", torchmask.SparseAperture([[0.0, 0.0]], 0.1, 1.0))),
+    ],
+)
+def test_what_is_missing_is_named_with_its_extra(missing, name, call, monkeypatch):
+    for loaded in [missing, *(module for module in sys.modules if module.startswith(f"{missing}."))]:
+        monkeypatch.setitem(sys.modules, loaded, None)  # as if not installed
+    with pytest.raises(ModuleNotFoundError, match=rf"{missing}.* is not installed: pip install 'torchmask\[{name}\]'"):
+        call()

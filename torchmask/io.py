@@ -1,4 +1,7 @@
-"""Files that are whole or absent: written under a temporary name, then renamed; read without unpickling."""
+"""Files that are whole or absent, written under a temporary name and renamed, read without unpickling; and extras.
+
+Extras are what a plain install leaves out: whoever lacks one is told how to get it.
+"""
 
 from __future__ import annotations
 
@@ -181,3 +184,27 @@ def read_json(path: str | Path) -> Any:
         return json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(f"{path} is no valid JSON: {error}") from error
+
+
+@contextmanager
+def extra(name: str) -> Iterator[None]:
+    """Around imports of what the extra of this name brings.
+
+    Raises
+    ------
+    ModuleNotFoundError
+        If one is not installed: names it, and the extra.
+
+    Examples
+    --------
+    >>> with extra("data"):
+    ...     import nothing_of_this_name
+    Traceback (most recent call last):
+    ModuleNotFoundError: nothing_of_this_name is not installed: pip install 'torchmask[data]'
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            f"{error.name} is not installed: pip install 'torchmask[{name}]'", name=error.name
+        ) from error

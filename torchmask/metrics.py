@@ -15,6 +15,8 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
+from torchmask.io import extra
+
 _ROUNDING = 1e-9  # relative slack, so that frequencies exactly on the rim stay in
 _PEAK_PERCENTILE = 99.5  # glints above it would set the range of the structural similarity
 
@@ -136,7 +138,8 @@ def ssim(estimate: Any, truth: Any, cutoff: float) -> float:
     Both are clipped to [0, the 99.5th percentile of the low-passed truth], which is also the data range, so that a
     few glints do not set the scale. Arguments and errors as in `align`; images of at least 7 x 7 pixels.
     """
-    from skimage.metrics import structural_similarity
+    with extra("data"):
+        from skimage.metrics import structural_similarity
 
     aligned = align(estimate, truth, cutoff).numpy()
     reference = lowpass(_checked(estimate, truth)[1], cutoff).numpy()

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from torchmask.grid import Grid
-from torchmask.io import load_npz, save_npz
+from torchmask.io import extra, load_npz, save_npz
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.bad_pixels import fill_bad_pixels
 from torchmask.optics.records import aperture_record, read_aperture
@@ -238,8 +238,9 @@ def pixel_matrix(header: Any) -> np.ndarray | None:
 
     Axes of the sky that stand the other way round, as DEC before RA, are put in order.
     """
-    from astropy.io.fits import Header
-    from astropy.wcs import WCS
+    with extra("data"):
+        from astropy.io.fits import Header
+        from astropy.wcs import WCS
 
     if not any(name in header for name in ("CD1_1", "CD1_2", "CDELT1")):
         return None

@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import torchmask
-from torchmask.io import as_array, atomic_write, new_folder, save_npz, to_json, write_json
+from torchmask.io import as_array, atomic_write, extra, new_folder, save_npz, to_json, write_json
 from torchmask.record import Record
 from torchmask.viz.figures import stretch
 
@@ -142,7 +142,8 @@ class RunLogger:
 
     def figure(self, name: str, figure: Figure, step: int = 0) -> None:
         """Log a figure, and write it to NAME.png in the run folder; a later one of that name replaces it."""
-        import matplotlib.image
+        with extra("experiments"):
+            import matplotlib.image
 
         picture = io.BytesIO()
         figure.savefig(picture, format="png", dpi=160)

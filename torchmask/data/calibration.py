@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from torchmask.io import extra
 from torchmask.optics.bad_pixels import fill_bad_pixels
 
 SELECTIONS = ("sharpness", "flux")
@@ -125,7 +126,8 @@ def frame_drift(frames: np.ndarray, valid: np.ndarray | None = None, upsampling:
     -----
     The correlation is periodic: what enters and leaves the field biases it, so the target should lie within.
     """
-    from skimage.registration import phase_cross_correlation
+    with extra("data"):
+        from skimage.registration import phase_cross_correlation
 
     frames = np.asarray(frames, dtype=float)
     filled = frames if valid is None else _filled(frames, valid)

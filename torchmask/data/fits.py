@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from torchmask.io import extra
+
 
 @dataclass(frozen=True, eq=False)
 class FITSImages:
@@ -44,9 +46,10 @@ def read_fits(path: str | Path) -> FITSImages:
         If the file is missing, is no FITS, is truncated or fails its checksum, holds no image of 2 or 3 axes or
         several that could be meant, or its extensions disagree in shape.
     """
-    from astropy.io import fits
-    from astropy.io.fits.verify import VerifyError, VerifyWarning
-    from astropy.utils.exceptions import AstropyUserWarning
+    with extra("data"):
+        from astropy.io import fits
+        from astropy.io.fits.verify import VerifyError, VerifyWarning
+        from astropy.utils.exceptions import AstropyUserWarning
 
     path = Path(path)
     if not path.is_file():
@@ -111,7 +114,8 @@ def _images(path: Path, hdus: Any) -> FITSImages:
 
 def _cards(header: Any) -> dict[str, bool | int | float | str]:
     """The cards with a value; those that cannot be read are passed over, they may not be needed."""
-    from astropy.io.fits.verify import VerifyError
+    with extra("data"):
+        from astropy.io.fits.verify import VerifyError
 
     cards = {}
     for card in header.cards:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from torchmask.grid import ARCSEC
+from torchmask.io import extra
 from torchmask.observation import celestial_cards, pixel_matrix
 from torchmask.optics.band import FILTERS, filter_of_header
 
@@ -118,7 +119,8 @@ def electrons_per_unit(
 
     Raises ValueError if the unit is not known, nothing tells it, or what its conversion needs is missing.
     """
-    from astropy import units
+    with extra("data"):
+        from astropy import units
 
     text = unit or str(header.get("BUNIT", "")).strip()
     gain = (number(header, ("EGAIN", "GAIN"), path) or None) if gain is None else gain
@@ -156,7 +158,8 @@ def electrons_per_unit(
 
 
 def _parse_unit(text: str, path: Any) -> Any:
-    from astropy import units
+    with extra("data"):
+        from astropy import units
 
     plain = re.sub(r"(electron|count|photon|adu)s\b", r"\1", text.lower())
     plain = re.sub(r"\be-(?=\W|$)", "electron", plain)

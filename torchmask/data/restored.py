@@ -8,7 +8,7 @@ from io import BytesIO
 from pathlib import Path
 
 from torchmask.grid import ARCSEC
-from torchmask.io import as_array, atomic_write
+from torchmask.io import as_array, atomic_write, extra
 from torchmask.observation import Observation
 from torchmask.restoration.result import RestorationResult
 
@@ -55,7 +55,8 @@ def save_restored(
     >>> result = MyopicDeconvolution(mask, observation.grid, n_modes=3, max_iterations=3).restore(frames)
     >>> save_restored(tempfile.mkdtemp() + "/restored.fits", result, observation, history="an example")
     """
-    from astropy.io import fits
+    with extra("data"):
+        from astropy.io import fits
 
     if Path(path).suffix != ".fits":
         raise ValueError(f"{path} does not end in .fits")

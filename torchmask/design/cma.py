@@ -9,6 +9,7 @@ from torch import Tensor
 from torchmask.design.merit import Criterion, Holes, Merit
 from torchmask.design.refine import PENALTY, Monitor
 from torchmask.design.starts import random_mask
+from torchmask.io import extra
 
 POPULATION = 32
 
@@ -22,7 +23,8 @@ def evolve(
     begins anew from another one when it has come to rest and there is budget left. N. Hansen, The CMA evolution
     strategy: a tutorial, arXiv:1604.00772; package `cma`.
     """
-    import cma
+    with extra("design"):
+        import cma
 
     merit = Merit(criterion, holes, PENALTY)
     population = min(POPULATION, budget)

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchmask.io import atomic_write
+from torchmask.io import atomic_write, extra
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.shape_base import Array, Circle, Contour, Corners, Shape
 from torchmask.optics.shapes import outlined_shape
@@ -43,8 +43,9 @@ def save_dxf(path: str | Path, aperture: SparseAperture, scale: float = LIFE_SIZ
         If `path` exists, its folder does not, the aperture is a population of masks, or `scale` is not finite and
         positive.
     """
-    import ezdxf
-    import ezdxf.units
+    with extra("design"):
+        import ezdxf
+        import ezdxf.units
 
     centers = require_one_mask(aperture).double() * require_scale(scale)
     drawing = ezdxf.new("R2010", units=ezdxf.units.MM)  # pyright: ignore[reportPrivateImportUsage]
@@ -105,7 +106,8 @@ def load_dxf(path: Path) -> SparseAperture:
     ValueError
         If the file is damaged, or shows no mask that this library knows.
     """
-    import ezdxf
+    with extra("design"):
+        import ezdxf
 
     try:
         drawing = ezdxf.readfile(path)  # pyright: ignore[reportPrivateImportUsage]

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchmask.design.drawing import load_dxf, require_one_mask
 from torchmask.grid import Grid
-from torchmask.io import atomic_write
+from torchmask.io import atomic_write, extra
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.records import aperture_record, read_mask
 
@@ -65,7 +65,8 @@ def save_fits(path: str | Path, aperture: SparseAperture, n_pixels: int = 512) -
     ValueError
         As `save_json`, and if a hole is narrower than two pixels.
     """
-    from astropy.io import fits
+    with extra("data"):
+        from astropy.io import fits
 
     centers = require_one_mask(aperture)
     amplitude, step = amplitude_map(aperture, n_pixels)
@@ -197,8 +198,9 @@ def _json_record(path: Path) -> dict[str, Any]:
 
 
 def _read_fits(path: Path) -> SparseAperture:
-    from astropy.io import fits
-    from astropy.utils.exceptions import AstropyWarning
+    with extra("data"):
+        from astropy.io import fits
+        from astropy.utils.exceptions import AstropyWarning
 
     with warnings.catch_warnings():
         warnings.simplefilter("error", AstropyWarning)  # such as that of a truncated file

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchmask.grid import ARCSEC
 from torchmask.interferometry.observables import Observables
-from torchmask.io import as_array, atomic_write
+from torchmask.io import as_array, atomic_write, extra
 from torchmask.observation import Observation
 from torchmask.optics.band import filter_of_header
 
@@ -65,7 +65,8 @@ def save_oifits(
     >>> path = tempfile.mkdtemp() + "/seen.oifits"
     >>> save_oifits(path, frame_observables(observation), observation, bandwidth=30e-9)
     """
-    from astropy.io import fits
+    with extra("oifits"):
+        from astropy.io import fits
 
     path = Path(path)
     if path.suffix not in (".fits", ".oifits"):
@@ -155,7 +156,8 @@ def _spectrum(values: Any) -> np.ndarray:
 
 def _table(name: str, cards: Mapping[str, Any], columns: Mapping[str, tuple[str, str | None, Any]]) -> Any:
     """A binary table from {column: (format, unit, values)}, of the second revision."""
-    from astropy.io import fits
+    with extra("oifits"):
+        from astropy.io import fits
 
     arrays = {column: (code, unit, as_array(values)) for column, (code, unit, values) in columns.items()}
     table = fits.BinTableHDU.from_columns(
@@ -174,7 +176,8 @@ def _table(name: str, cards: Mapping[str, Any], columns: Mapping[str, tuple[str,
 
 
 def _primary(header: Mapping[str, Any], date: str) -> Any:
-    from astropy.io import fits
+    with extra("oifits"):
+        from astropy.io import fits
 
     hdu = fits.PrimaryHDU()
     cards = {
@@ -249,7 +252,8 @@ def _text(header: Mapping[str, Any], name: str) -> str:
 
 def _date(header: Mapping[str, Any]) -> tuple[str, float]:
     """Date and time (ISO) and MJD of the observation: MJD-AVG, MJD-OBS or DATE-OBS; MJD 0 where nothing is known."""
-    from astropy.time import Time
+    with extra("oifits"):
+        from astropy.time import Time
 
     time: Any = None
     for name in ("MJD-AVG", "MJD-OBS"):

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.grid import Grid
+from torchmask.io import extra
 from torchmask.metrics import shift
 from torchmask.observation import check_frames
 from torchmask.optics.aperture import Aperture
@@ -51,7 +52,8 @@ def shift_and_add(frames: Tensor) -> Tensor:
     >>> richardson_lucy((image / image.max()).numpy(), psf.numpy(), num_iter=10).shape
     (32, 32)
     """
-    from skimage.registration import phase_cross_correlation
+    with extra("data"):
+        from skimage.registration import phase_cross_correlation
 
     shape = (int(frames.shape[-2]), int(frames.shape[-1])) if frames.ndim >= 2 else (0, 0)
     stack = check_frames(frames, None, Grid(shape, 1.0, 1.0))[0].cpu()

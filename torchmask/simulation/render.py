@@ -15,6 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchmask.io import extra
+
 Array = NDArray[np.float64]
 
 _SAMPLES = 1024  # samples of a rendering on a side, at least, before they are averaged into pixels
@@ -49,7 +51,8 @@ def load_mesh(path: str | Path) -> Mesh:
     ValueError
         If the file is missing, cannot be read, or holds no triangle or a corner that is not finite.
     """
-    import trimesh
+    with extra("data"):
+        import trimesh
 
     path = Path(path)
     if not path.is_file():

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from torchmask.io import extra
 from torchmask.simulation.render import Array, Mesh
 
 
@@ -146,26 +147,30 @@ def _tiles(
 
 def _revolve(profile: Array, sections: int) -> Array:
     """Triangles (F, 3, 3) of the profile (radius, height) turned about z."""
-    import trimesh
+    with extra("data"):
+        import trimesh
 
     return np.asarray(trimesh.creation.revolve(profile, sections=sections).triangles, dtype=float)
 
 
 def _rod(start: Array, end: Array, radius: float, material: _Material) -> _Part:
-    import trimesh
+    with extra("data"):
+        import trimesh
 
     return np.asarray(trimesh.creation.cylinder(radius, sections=8, segment=(start, end)).triangles, float), material
 
 
 def _box(centre: Any, extents: tuple[float, float, float], material: _Material) -> _Part:
-    import trimesh
+    with extra("data"):
+        import trimesh
 
     return np.asarray(trimesh.creation.box(extents).triangles, dtype=float) + np.asarray(centre), material
 
 
 def _rotation(degrees: tuple[float, float, float], origin: tuple[float, float, float]) -> Array:
     """Homogeneous transform: turned about the axes x, y, z in that order, then moved to `origin`."""
-    import trimesh
+    with extra("data"):
+        import trimesh
 
     transform = trimesh.transformations.euler_matrix(*np.radians(degrees))
     transform[:3, 3] = origin

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchmask.io import load_npz
+from torchmask.io import extra, load_npz
 from torchmask.simulation.render import load_mesh, render_mesh
 from torchmask.simulation.satellite import satellite_mesh
 
@@ -134,7 +134,8 @@ def _read_npz(path: Path) -> np.ndarray:
 
 
 def _read_png(path: Path) -> np.ndarray:
-    import imageio.v3 as imageio  # comes with scikit-image
+    with extra("data"):
+        import imageio.v3 as imageio  # comes with scikit-image
 
     try:
         image = np.asarray(imageio.imread(path.read_bytes(), plugin="pillow", extension=".png"), dtype=np.float64)
@@ -146,7 +147,8 @@ def _read_png(path: Path) -> np.ndarray:
 
 
 def _read_fits(path: Path) -> np.ndarray:
-    from astropy.io import fits
+    with extra("data"):
+        from astropy.io import fits
 
     try:
         with path.open("rb") as file, fits.open(file, memmap=False) as units:
@@ -163,7 +165,8 @@ def _read_fits(path: Path) -> np.ndarray:
 
 def _pose(image: Tensor, shape: tuple[int, int], options: SceneOptions) -> Tensor:
     """Turn an image, crop it to what shines, resample it to the wanted fraction of the field, centre it on black."""
-    from kornia.geometry.transform import resize, rotate
+    with extra("data"):
+        from kornia.geometry.transform import resize, rotate
 
     about_x, about_y, angle = options.attitude or (0.0, 0.0, 0.0)
     if about_x or about_y or options.sun:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 import numpy as np
 
 from torchmask.grid import ARCSEC, MAS, Grid
+from torchmask.io import extra
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.shape_base import Circle, Contour
 
@@ -54,7 +55,8 @@ def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
 
     @functools.wraps(draw)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> Figure:
-        import matplotlib
+        with extra("experiments"):
+            import matplotlib
 
         with matplotlib.rc_context(_STYLE):
             return draw(*args, **kwargs)
@@ -64,7 +66,8 @@ def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
 
 def new_figure(width: float, height: float) -> Figure:
     """An empty figure of `width` x `height` inches, known to no pyplot."""
-    from matplotlib.figure import Figure
+    with extra("experiments"):
+        from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")
 
@@ -139,7 +142,8 @@ def hole(aperture: Aperture, center: np.ndarray, scale: float, **style: Any) -> 
 
 def edge(contour: Contour, center: np.ndarray, **style: Any) -> Patch:
     """What one edge of a hole holds, around `center` (x, y) in the unit of the contour."""
-    from matplotlib import patches
+    with extra("experiments"):
+        from matplotlib import patches
 
     if isinstance(contour, Circle):
         return patches.Circle((float(center[0]), float(center[1])), contour.radius, **style)
@@ -174,7 +178,8 @@ def colorbar(figure: Figure, axes: list[Axes], label: str = "", **options: Any) 
 
 def light_norm(peak: float) -> PowerNorm:
     """From 0 to `peak` under a square root, which lifts the faint parts."""
-    from matplotlib.colors import PowerNorm
+    with extra("experiments"):
+        from matplotlib.colors import PowerNorm
 
     return PowerNorm(0.5, 0, peak or 1.0, clip=True)
 
