@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
@@ -42,6 +43,9 @@ class ModelError(NamedTuple):
     excess: float
     fitted: float
     phase: float
+
+
+NO_MODEL_ERROR = ModelError(0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -86,7 +90,7 @@ def expected_error(objective: MyopicObjective, state: State, left_out: LeftOut) 
     strength = left_out.strength(objective, state)
     field, kind = model.window.field, {"dtype": model.dtype, "device": model.device}
     high = SampledPupil(model.pupil.aperture, field, model.band, rest, **kind).samples()
-    chosen = sorted({round(t) for t in torch.linspace(0, len(state.z) - 1, _FRAMES).tolist()})
+    chosen = sorted({round(t) for t in np.linspace(0, len(state.z) - 1, _FRAMES)})
     generator = torch.Generator().manual_seed(0)
     drawn = torch.randn(len(chosen), rest.n_parameters, dtype=torch.float64, generator=generator, device="cpu")
     phases = high.phase(math.sqrt(strength) * drawn.to(model.device))

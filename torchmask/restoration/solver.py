@@ -24,7 +24,7 @@ from torchmask.restoration.checkpoint import Checkpoint, Ending, Progress, Statu
 from torchmask.restoration.descent import Variables, descend
 from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.marginal import integrate_aberrations
-from torchmask.restoration.model_error import LeftOut, expected_error
+from torchmask.restoration.model_error import NO_MODEL_ERROR, LeftOut, expected_error
 from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.result import RestorationResult
@@ -265,7 +265,8 @@ class Solver:
         """Whether the frames are explained by what a start, or all of them, ended at."""
         objective, state = self.objective, ending.state
         pixels = (objective.precision.expand_as(objective.frames) > 0).sum((1, 2))
-        error = expected_error(objective, state, self._left_out)
+        # A full pupil has so many modes that its poor minima, and not what is left out, decide: `tolerance` knows.
+        error = NO_MODEL_ERROR if self.traits.many_minima else expected_error(objective, state, self._left_out)
         chi_square = fit_of_frames(objective, state)[1]
         at_rest = ending.status is not Status.ITERATION_LIMIT
         return judge(chi_square, pixels, self.contrast, error, self.tolerance, at_rest=at_rest)

@@ -67,10 +67,13 @@ class Verdict:
         return self.chi_square - 1
 
     def __str__(self) -> str:
+        passes = f"{self.limit:.4g} passes"
+        if self.model_error:
+            left_out = f"modes left out ({self.phase_error:.2g} rad rms)"
+            passes = f"{left_out} are expected to add {self.model_error:.2g} to 1, and {passes}"
         parts = [
             f"{self.finding.value}: chi-square {self.chi_square:.4g} of {self.degrees_of_freedom} degrees of freedom",
-            f"modes left out ({self.phase_error:.2g} rad rms) are expected to add {self.model_error:.2g} to 1, and "
-            f"{self.limit:.4g} passes",
+            passes,
         ]
         if self.frames:
             parts.append(f"{_listed(self.frames, self.n_frames)} not explained")
