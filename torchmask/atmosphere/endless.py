@@ -115,6 +115,10 @@ class ScreenWindow:
         float32 or float64.
     """
 
+    shape: tuple[int, int]
+    dtype: torch.dtype
+    device: torch.device
+
     def __init__(
         self,
         shape: tuple[int, int],

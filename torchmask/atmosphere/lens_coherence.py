@@ -39,10 +39,14 @@ class PolarTable:
     """A function that is even in the plane, known at distances `longest` (i / (n - 1))^power and evenly spread
     directions over half a turn: values (..., distances, directions)."""
 
+    values: np.ndarray
+    longest: float
+    power: float
+
     def __init__(self, values: Tensor, longest: float, power: float) -> None:
         # half a turn to either side, so that a cubic spline does not feel the seam
         self.values, self.longest, self.power = torch.cat([values] * 3, -1).numpy(), longest, power
-        self.n_directions = values.shape[-1]
+        self.n_directions: int = values.shape[-1]
 
     @staticmethod
     def nodes(sizes: tuple[int, int], longest: float, power: float) -> Tensor:

@@ -124,20 +124,20 @@ class OverlapRaster:
         self, aperture: Aperture, seeing: Seeing, shortest: float = 1.0, longest: float = 0.0, per_hole: int = 24
     ) -> None:
         self.aperture = aperture
-        self.centers = aperture.centers.detach().cpu().double()
+        self.centers: Tensor = aperture.centers.detach().cpu().double()
         diameter = aperture.subaperture_diameter
         step = min(seeing.r0 * shortest / _PER_R0, diameter * aperture.shape.fineness / per_hole)
         reach = float(self.centers.norm(dim=-1).max()) + aperture.outer_diameter / 2
         size = math.ceil(2 * reach / step) + 2
         axis = (torch.arange(size, dtype=torch.float64) - (size - 1) / 2) * step
-        self.points = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), -1)  # (size, size, 2)
-        self.cell = torch.tensor([step, step], dtype=torch.float64)
-        self.padded = (2 * size, 2 * size)
+        self.points: Tensor = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), -1)  # (size, size, 2)
+        self.cell: Tensor = torch.tensor([step, step], dtype=torch.float64)
+        self.padded: tuple[int, int] = (2 * size, 2 * size)
         lag = torch.fft.fftfreq(2 * size, 1 / (2 * size), dtype=torch.float64) * step
-        self.lattice = torch.stack(torch.meshgrid(lag, lag, indexing="xy"), -1).flatten(0, 1)
-        self.drift = seeing.drift()
+        self.lattice: Tensor = torch.stack(torch.meshgrid(lag, lag, indexing="xy"), -1).flatten(0, 1)
+        self.drift: tuple[Tensor, Tensor] = seeing.drift()
         furthest = 2 * reach + float(self.drift[0].norm(dim=-1).max()) + 2 * step
-        self.structure = seeing.structure(furthest + max(2 * reach, longest))
+        self.structure: StructureFunction = seeing.structure(furthest + max(2 * reach, longest))
 
     def _coverage(self, shift: Tensor) -> Tensor:
         """The open fraction of each cell of the pupil moved by -shift (2,)."""

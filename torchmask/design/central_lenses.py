@@ -37,14 +37,14 @@ class CentralLenses:
         lens = geometry.shape.otf(baselines[inside], geometry.diameter)
         maps = torch.zeros(len(factors.by_baseline.values), len(baselines), dtype=torch.float64)
         maps[:, inside] = lens**2 * factors.by_baseline(baselines[inside])
-        self.maps = maps.to(device, dtype)
-        self.step = geometry.diameter / _STEPS
+        self.maps: Tensor = maps.to(device, dtype)
+        self.step: float = geometry.diameter / _STEPS
         self.half: int = math.ceil(longest / self.step) + 2
         axis = self.step * torch.arange(-self.half, self.half + 1, dtype=torch.float64)
         places = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), -1).flatten(0, 1)
         values = factors.by_place(places).unflatten(-1, (len(axis), len(axis)))
         coefficients = torch.stack([torch.from_numpy(spline_filter(one.numpy(), order=3)) for one in values])
-        self.coefficients = coefficients.flatten(1).T.contiguous().to(device, dtype)
+        self.coefficients: Tensor = coefficients.flatten(1).T.contiguous().to(device, dtype)
 
     def __call__(self, centers: Tensor) -> Tensor:
         """Twice the sum over pairs of holes (B, P) for masks with `centers` (B, N, 2) [m]."""

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from torchmask.atmosphere.seeing import Seeing
+from torchmask.atmosphere.structure import StructureFunction
 from torchmask.design.overlap import Geometry, PatchPlan
 
 _SMALLEST = 3e-3  # products T T' exp(-Q / 2) below, as estimated from above, are left out
@@ -55,15 +56,19 @@ class Entries(NamedTuple):
 class LensPairs:
     """What the pairs of lenses of masks share, for holes of one geometry under one turbulence."""
 
+    geometry: Geometry
+    seeing: Seeing
+    pixel: Tensor
+
     def __init__(self, geometry: Geometry, seeing: Seeing, longest: float, pixel: Tensor) -> None:
         self.geometry, self.seeing, self.pixel = geometry, seeing, pixel
         reach = geometry.reach
         points, weights = geometry.shape.quadrature(4, geometry.diameter)
-        self.variance = float((weights @ points**2).mean())  # of the points of a hole, along either axis [m^2]
+        self.variance: float = float((weights @ points**2).mean())  # of the points of a hole, along either axis [m^2]
         steps, shares = seeing.drift()
         moments = (shares[:, None, None] * steps[:, :, None] * steps[:, None]).sum(0)
         self.drift: tuple[float, float, float] = (float(moments[0, 0]), float(moments[0, 1]), float(moments[1, 1]))
-        self.structure = seeing.structure(4 * longest + 4 * reach)
+        self.structure: StructureFunction = seeing.structure(4 * longest + 4 * reach)
 
     def far(self, baselines: Tensor) -> Tensor:
         """A factor (...) that follows exp(-D), the coherence of far lenses, where that is not small."""

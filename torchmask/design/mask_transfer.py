@@ -28,27 +28,32 @@ class MaskTransfer:
     Its tables take a second to make, and hold for any number and places of holes.
     """
 
+    geometry: Geometry
+    seeing: Seeing
+
     def __init__(
         self, geometry: Geometry, seeing: Seeing, longest: float, dtype: torch.dtype, device: torch.device
     ) -> None:
         self.geometry, self.seeing = geometry, seeing
         plan = cached_plan(geometry, 1, dtype, device)
         sides = geometry.grid[1], geometry.grid[0]
-        self.pixel = torch.tensor([geometry.period / side for side in sides], dtype=torch.float64)
-        self.splines = SplinePatches((float(plan.reach[0]), float(plan.reach[1])), (len(plan.column), len(plan.row)))
+        self.pixel: Tensor = torch.tensor([geometry.period / side for side in sides], dtype=torch.float64)
+        self.splines: SplinePatches = SplinePatches(
+            (float(plan.reach[0]), float(plan.reach[1])), (len(plan.column), len(plan.row))
+        )
         coherence = lens_coherence(geometry.shape, geometry.diameter, seeing, longest)
         x, y = self.splines.lattice()
         places = torch.stack(torch.meshgrid(x * self.pixel[0], y * self.pixel[1], indexing="xy"), -1)
         lens = geometry.shape.otf(places, geometry.diameter)
         by_place = coherence.by_place(places.flatten(0, 1)).unflatten(-1, lens.shape)
-        self.rank = len(by_place)
-        self.squares = self.splines.slices(lens**2 * by_place).to(device, dtype)
-        self.lenses = self.splines.slices(lens[None]).to(device, dtype)
+        self.rank: int = len(by_place)
+        self.squares: Tensor = self.splines.slices(lens**2 * by_place).to(device, dtype)
+        self.lenses: Tensor = self.splines.slices(lens[None]).to(device, dtype)
         baselines = half_plane(geometry)
-        self.by_baseline = coherence.by_baseline(baselines).to(device, dtype)
-        self.pairs = LensPairs(geometry, seeing, longest, self.pixel.to(device, dtype))
-        self.central = CentralLenses(geometry, seeing, longest, baselines, dtype, device)
-        self.far = self.pairs.far(baselines.to(device)).to(dtype)
+        self.by_baseline: Tensor = coherence.by_baseline(baselines).to(device, dtype)
+        self.pairs: LensPairs = LensPairs(geometry, seeing, longest, self.pixel.to(device, dtype))
+        self.central: CentralLenses = CentralLenses(geometry, seeing, longest, baselines, dtype, device)
+        self.far: Tensor = self.pairs.far(baselines.to(device)).to(dtype)
 
     def __call__(self, centers: Tensor) -> Tensor:
         """N^2 E|OTF|^2 (B, H // 2 + 1, W) of masks with `centers` (B, N, 2) [m]."""

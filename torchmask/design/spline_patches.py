@@ -23,12 +23,15 @@ class SplinePatches:
     size : (columns, rows) of a patch
     """
 
+    reach: tuple[float, float]
+    size: tuple[int, int]
+
     def __init__(self, reach: tuple[float, float], size: tuple[int, int]) -> None:
         self.reach, self.size = reach, size
-        self.parts = math.ceil(_FINENESS / min(reach))
-        self.n_rows = self.parts + 4  # slices of either axis
+        self.parts: int = math.ceil(_FINENESS / min(reach))
+        self.n_rows: int = self.parts + 4  # slices of either axis
         # of the lattice, a whole number of its steps from the middle: opposite places have equal errors
-        self.start = tuple(math.ceil(one * self.parts) / self.parts for one in reach)
+        self.start: tuple[float, ...] = tuple(math.ceil(one * self.parts) / self.parts for one in reach)
 
     def lattice(self) -> tuple[Tensor, Tensor]:
         """Where the functions must be known, x (X,) and y (Y,) [pixels]."""

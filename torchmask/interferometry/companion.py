@@ -149,6 +149,12 @@ class CompanionModel:
     torch.Size([32, 32])
     """
 
+    grid: Grid
+    radius: float
+    flux_error: float
+    n_subapertures: int
+    n_modes: int
+
     def __init__(
         self,
         aperture: Aperture,

@@ -74,6 +74,11 @@ class PixelNoise:
 class FringeModel:
     """The pattern of light and fringes of a mask, under the diffraction pattern of one hole and seen by pixels."""
 
+    aperture: Aperture
+    grid: Grid
+    pairs: Tensor
+    triangles: Tensor
+
     def __init__(self, aperture: Aperture, grid: Grid, pixel: PixelResponse | None = None) -> None:
         self.aperture, self.grid = aperture, grid
         self.pairs, self.triangles = pairs_and_triangles(aperture)

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchmask.restoration.adjoint import pull_back
 from torchmask.restoration.forward import ExposureModel, intensity
 from torchmask.restoration.parallel import Map
+from torchmask.restoration.pupil import OpenSamples
 
 
 class Linearization:
@@ -22,7 +23,7 @@ class Linearization:
     def __init__(self, model: ExposureModel, image: Tensor, z: Tensor, parallel: Map = map) -> None:
         self.model: ExposureModel = model
         self.parallel: Map = parallel
-        self.samples = model.pupil.samples()
+        self.samples: OpenSamples = model.pupil.samples()
         self.spectrum: Tensor = model.spectrum(image)
         self.parts: list[slice] = list(model.chunks(len(z)))
         self.fields: list[Tensor] = [self.samples.field(self.samples.phase(z[part])) for part in self.parts]

@@ -54,7 +54,7 @@ class ExposedPSF:
         band = band or Band.of([grid.wavelength])
         finest = Grid(grid.n_pixels, grid.pixel_scale, band.shortest)
         self.samples: PupilSamples = aperture.samples(finest, PHASE_OVERSAMPLING)
-        self.shares = band.shares
+        self.shares: tuple[float, ...] = band.shares
         self.phase_factors: list[float] = [grid.wavelength / wavelength for wavelength in band.wavelengths]
         like = self.samples.weights
         self.wider: list[tuple[Tensor, Tensor] | None] = [
