@@ -13,6 +13,8 @@ from torchmask.observation import Observation
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.detector import Detector
 from torchmask.optics.geometry import MaskGeometry
+from torchmask.restoration.myopic import MyopicDeconvolution
+from torchmask.restoration.result import RestorationResult
 from torchmask.simulation.exposures import simulate_observation
 
 TOLD = SparseAperture([[0.0, 0.35], [-0.35, -0.2], [0.3, -0.25]], 0.2, 1.0)
@@ -50,3 +52,27 @@ def test_without_a_star_or_a_mask_nothing_is_written(tmp_path, capsys):
         assert not (tmp_path / "run").exists()
     assert main(["calibrate"]) == 1
     assert "give .npz or FITS files" in capsys.readouterr().err
+
+
+def test_a_restoration_calibrates_on_its_star_first(star, tmp_path, capsys):
+    """The mask it restores through is the one that `torchmask calibrate` writes, and a sky is no star."""
+    scene = torch.zeros(64, 64, dtype=torch.float64)
+    scene[28:36, 26:38] = 1e5
+    seen = simulate_observation(scene, TRUE.apply(TOLD), GRID, None, Detector(), n_frames=2)
+    Observation(seen.frames, TOLD, GRID, 1.0).save(tmp_path / "stack.npz")
+    Observation(torch.ones(1, 64, 64), TOLD, GRID, 1.0).save(tmp_path / "sky.npz")
+    given = ["restore", str(tmp_path / "stack.npz"), "--max-iterations", "2", "--refine-geometry", "no"]
+    assert main([*given, "--star", str(tmp_path / "sky.npz"), "--out", str(tmp_path / "none")]) == 1
+    assert "--star" in capsys.readouterr().err
+    assert not (tmp_path / "none").exists()
+    assert main(["calibrate", str(star), "--out", str(tmp_path / "star")]) == 0
+    assert main([*given, "--star", str(star), "--out", str(tmp_path / "run")]) == 0
+    for name in ("mask.json", "calibration.json"):
+        assert (tmp_path / "run" / name).read_text() == (tmp_path / "star" / name).read_text()
+    method = MyopicDeconvolution(
+        load_mask(tmp_path / "star" / "mask.json"), GRID, max_iterations=2, readout_noise=1.0, refine_geometry=False
+    )
+    expected = method.restore(seen.frames)
+    found = RestorationResult.load(tmp_path / "run" / "restored.npz")
+    assert torch.allclose(found.object, expected.object, rtol=1e-9)
+    assert "rotation" in capsys.readouterr().out

@@ -10,13 +10,15 @@ from typing import Any
 import tyro
 
 from torchmask.cli.options import RunOptions
-from torchmask.cli.run import new_run
+from torchmask.cli.run import Run, new_run
 from torchmask.cli.stacks import StackOptions, read_stack
 from torchmask.design.manufacture import save_json
 from torchmask.interferometry.calibration import MaskCalibration, calibrate_mask
 from torchmask.io import write_json
+from torchmask.observation import Observation
 from torchmask.optics.aperture import SparseAperture
-from torchmask.optics.pixel import SquarePixel
+from torchmask.optics.pixel import PixelResponse, SquarePixel
+from torchmask.record import Callback
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,23 +43,48 @@ def run(options: Options) -> None:
     if not options.stacks:
         raise ValueError("there is no star to calibrate with: give .npz or FITS files")
     seen = read_stack(options.stacks, options)
-    if not isinstance(seen.aperture, SparseAperture):
-        raise ValueError("--mask is a full pupil: only a mask can be calibrated, by its fringes")
-    pixel = None if options.pixel_fill is None else SquarePixel(options.pixel_fill)
+    pixel = pixel_response(options.pixel_fill)
     with new_run("calibrate", options) as output:
-        found = calibrate_mask(
-            seen.frames,
-            seen.aperture,
-            seen.grid,
-            valid=seen.valid,
-            readout_noise=seen.readout_noise or 0.0,
-            pixel=pixel,
-            n_modes=options.n_modes,
-            callback=output.callback,
-        )
-        save_json(output.directory / "mask.json", found.aperture, seen.grid.wavelength)
-        write_json(output.directory / "calibration.json", estimates(found, options.stacks))
-        output.summary.append(str(found))
+        found = calibrate_on(seen, pixel, options.n_modes, output.callback)
+        write_calibration(output, found, options.stacks, seen.grid.wavelength)
+
+
+def pixel_response(fill: float | None) -> SquarePixel | None:
+    """What --pixel-fill stands for. Raises ValueError if it is no part of the pitch's area."""
+    return None if fill is None else SquarePixel(fill)
+
+
+def calibrate_on(
+    star: Observation, pixel: PixelResponse | None, n_modes: int = 6, callback: Callback | None = None
+) -> MaskCalibration:
+    """How the mask of a star's exposures lies. Raises ValueError as `calibrate_mask`, and for a full pupil."""
+    if not isinstance(star.aperture, SparseAperture):
+        raise ValueError("--mask is a full pupil: only a mask can be calibrated, by its fringes")
+    return calibrate_mask(
+        star.frames,
+        star.aperture,
+        star.grid,
+        valid=star.valid,
+        readout_noise=star.readout_noise or 0.0,
+        pixel=pixel,
+        n_modes=n_modes,
+        callback=callback,
+    )
+
+
+def read_star(path: Path, options: StackOptions, pixel_fill: float | None) -> MaskCalibration:
+    """How the mask of a file with a star lies. Raises ValueError, which names --star, if it tells nothing."""
+    try:
+        return calibrate_on(read_stack([path], options), pixel_response(pixel_fill))
+    except ValueError as error:
+        raise ValueError(f"--star {path}: {error}") from error
+
+
+def write_calibration(output: Run, found: MaskCalibration, files: Sequence[Path], wavelength: float) -> None:
+    """mask.json, for the wavelength [m] of the exposures, calibration.json, and what is printed."""
+    save_json(output.directory / "mask.json", found.aperture, wavelength)
+    write_json(output.directory / "calibration.json", estimates(found, files))
+    output.summary.append(str(found))
 
 
 def estimates(found: MaskCalibration, files: Sequence[Path]) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from typing import Any, Literal
 import tyro
 
 from torchmask import __version__
+from torchmask.cli.calibrate import pixel_response, read_star, write_calibration
 from torchmask.cli.config import stored
 from torchmask.cli.oifits import OIFITSOptions, measure_frames, write_frames
 from torchmask.cli.options import RunOptions, WorkerOptions
@@ -19,6 +21,7 @@ from torchmask.cli.report import restored_figure
 from torchmask.cli.run import CHECKPOINT, new_run
 from torchmask.cli.stacks import StackOptions, group_files, read_stack
 from torchmask.data.restored import save_restored
+from torchmask.interferometry.calibration import MaskCalibration
 from torchmask.interferometry.observables import Observables
 from torchmask.io import new_folder, write_json
 from torchmask.metrics import relative_error, ssim
@@ -31,6 +34,7 @@ from torchmask.restoration.result import RestorationResult
 from torchmask.tracking import RunLogger
 from torchmask.viz import figures as viz
 
+REFINEMENTS = {"if-seen": None, "yes": True, "no": False}
 SKIES = {"if-seen": Background.IF_SEEN, "per-frame": Background.PER_FRAME, "none": Background.NONE}
 
 
@@ -63,6 +67,12 @@ class Options(StackOptions, OIFITSOptions, WorkerOptions, RunOptions):
     """Zernike modes per hole of aberrations that all frames share, such as those of the telescope."""
     sky: float | Literal["if-seen", "per-frame", "none"] = "if-seen"
     """Its light [electrons per pixel]; or one constant for each frame, to be found always or if the frames show one."""
+    pixel_fill: float | None = None
+    """Part of the area of its pitch in which a pixel is sensitive, 1 for gapless pixels; None: pixels are points."""
+    star: Path | None = None
+    """Exposures of a star through the same mask, .npz or .fits: first they tell how it lies (`torchmask calibrate`)."""
+    refine_geometry: Literal["if-seen", "yes", "no"] = "if-seen"
+    """Find a turn and a magnification of the mask with the image; if-seen: where the frames ask for it."""
     prior: bool = True
     """Weigh aberrations by their von Karman statistics."""
     tv_weight: float = 1.0
@@ -91,17 +101,24 @@ def run(options: Options) -> int:
     stacks = group_files(options.stacks, options.join)
     if not stacks:
         raise ValueError("there is no stack to restore: give .npz or FITS files")
-    if len(stacks) == 1:
-        (files,) = stacks.values()
-        return restore_one(files, options)
-    if options.resume is not None:
+    if options.resume is not None and len(stacks) > 1:
         raise ValueError(f"--resume goes on with one stack, and {len(stacks)} are given")
-    return restore_several(stacks, options)
+    star = None if options.star is None else read_star(options.star, options, options.pixel_fill)
+    if len(stacks) > 1:
+        return restore_several(stacks, options, star)
+    (files,) = stacks.values()
+    return restore_one(files, options, star)
 
 
-def restore_one(files: Sequence[Path], options: Options) -> int:
-    """One stack, on all cores, with a checkpoint to go on from; returns the exit status."""
+def read_calibrated(files: Sequence[Path], options: Options, star: MaskCalibration | None) -> Observation:
+    """One stack, through the mask where the star has shown it."""
     observation = read_stack(files, options)
+    return observation if star is None else dataclasses.replace(observation, aperture=star.aperture)
+
+
+def restore_one(files: Sequence[Path], options: Options, star: MaskCalibration | None) -> int:
+    """One stack, on all cores, with a checkpoint to go on from; returns the exit status."""
+    observation = read_calibrated(files, options, star)
     checkpoint = None if options.resume is None else options.resume / CHECKPOINT
     if checkpoint is not None and not checkpoint.is_file():
         raise ValueError(f"there is no {checkpoint} to go on from: it is written at the 100th iteration")
@@ -120,6 +137,8 @@ def restore_one(files: Sequence[Path], options: Options) -> int:
             checkpoint=state,
             callback=output.callback,
         )
+        if star is not None and options.star is not None:
+            write_calibration(output, star, [options.star], observation.grid.wavelength)
         table = write(output.directory, files, observation, result, options)
         log(observation, result, table, output.logger)
         output.logger.conclude(verdict=table["verdict"])
@@ -127,7 +146,7 @@ def restore_one(files: Sequence[Path], options: Options) -> int:
     return 0 if table["verdict"]["explained"] else NOT_EXPLAINED
 
 
-def restore_several(stacks: Mapping[str, Sequence[Path]], options: Options) -> int:
+def restore_several(stacks: Mapping[str, Sequence[Path]], options: Options, star: MaskCalibration | None) -> int:
     """Each stack on a core, and what was found in a folder of its name; failures are told when all have ended.
 
     Returns the exit status, which is that of the worst verdict.
@@ -138,7 +157,7 @@ def restore_several(stacks: Mapping[str, Sequence[Path]], options: Options) -> i
     failures: dict[str, Exception] = {}
     for name, files in stacks.items():
         try:
-            observations[name] = read_stack(files, options)
+            observations[name] = read_calibrated(files, options, star)
             method = deconvolution(observations[name], options)
             observables[name] = measure_frames(observations[name], options, known_sky(options))
             methods.append(method)
@@ -149,6 +168,8 @@ def restore_several(stacks: Mapping[str, Sequence[Path]], options: Options) -> i
         raise _failed(failures, len(stacks))
     with new_run("restore", options) as output:
         names, seen = list(observations), list(observations.values())
+        if star is not None and options.star is not None:
+            write_calibration(output, star, [options.star], seen[0].grid.wavelength)
         keywords = options.keywords(output.callback)
         tables: dict[str, Any] = {}
         for number, result in restore_in_turn(methods, seen, n_samples=options.n_samples, **keywords):
@@ -191,6 +212,8 @@ def deconvolution(observation: Observation, options: Options) -> MyopicDeconvolu
         wavelengths=options.wavelengths or None,
         weights=options.weights or None,
         static_modes=options.static_modes,
+        pixel=pixel_response(options.pixel_fill),
+        refine_geometry=REFINEMENTS[options.refine_geometry],
         prior=TotalVariation(options.tv_weight),
         aberration_prior=options.prior,
         max_iterations=options.max_iterations,
@@ -222,6 +245,8 @@ def metrics(observation: Observation, result: RestorationResult) -> dict[str, An
         "noise": result.noise,
         "sky": result.sky,
         "r0": result.r0,
+        "rotation": result.rotation,
+        "magnification": result.magnification,
         "photons_per_frame": float(result.object.sum()),
         "cost": float(result.cost[-1]),
         "iterations": len(result.cost),

@@ -101,7 +101,7 @@ class Aperture(nn.Module):
             narrower than two samples.
         """
         self.require_sampling(grid)
-        return _sample_holes(self.centers, self.shape, self.subaperture_diameter, grid, oversampling)
+        return sample_holes(self.centers, self.shape, self.subaperture_diameter, grid, oversampling)
 
     def require_sampling(self, grid: Grid) -> None:
         """Raise ValueError if the grid aliases the image. Under `torch.func.vmap`, where no value can be seen, nothing
@@ -110,7 +110,11 @@ class Aperture(nn.Module):
             grid.require_sampling(self.extent)
 
 
-def _sample_holes(centers: Tensor, shape: Shape, diameter: float, grid: Grid, oversampling: int) -> PupilSamples:
+def sample_holes(centers: Tensor, shape: Shape, diameter: float, grid: Grid, oversampling: int) -> PupilSamples:
+    """The samples of sub-apertures of one shape and diameter [m] at `centers` (..., N, 2) [m], as `Aperture.samples`.
+
+    Whether the image is aliased is not looked at.
+    """
     if oversampling != int(oversampling) or oversampling < 1:
         raise ValueError(f"oversampling is {oversampling}: it must be a whole number of at least 1")
     raster = (grid.shape[0] * oversampling, grid.shape[1] * oversampling)

@@ -19,11 +19,16 @@ _PROBES = 4  # draws of noise per frame for the curvature
 
 
 class DataFidelity(NamedTuple):
-    """Half the weighted squared residuals, (T,), and the gradients of their sum; None where not asked for."""
+    """Half the weighted squared residuals, (T,), and the gradients of their sum; None where not asked for.
+
+    `weight_gradient` (P,) and `basis_gradient` (P, K) are those in the pupil's samples, which follow the mask.
+    """
 
     value: Tensor
     object_gradient: Tensor | None
     aberration_gradient: Tensor | None
+    weight_gradient: Tensor | None = None
+    basis_gradient: Tensor | None = None
 
 
 @torch.no_grad()
@@ -36,6 +41,7 @@ def data_fidelity(
     *,
     want_object: bool = True,
     want_aberrations: bool = True,
+    samples: OpenSamples | None = None,
     parallel: Map = map,
 ) -> DataFidelity:
     """1/2 sum precision (model + background - frames)^2 of every frame, and its gradients.
@@ -50,16 +56,19 @@ def data_fidelity(
         Inverse noise variance of each pixel, 0 where a pixel is not valid.
     want_object, want_aberrations : bool
         Which gradients to compute.
+    samples : OpenSamples, optional
+        Of the pupil where it may lie instead; the gradients in them are computed too. None: where the model has it.
     parallel : callable
         Goes over the frames, a few at a time, as `map` does.
     """
-    shape, samples = model.window.field.shape, model.pupil.samples()
+    shape, moved = model.window.field.shape, samples is not None
+    samples = model.pupil.samples() if samples is None else samples
     spectrum = model.spectrum(image)
     conjugate = spectrum.conj().resolve_conj()
     phase = samples.phase(z)  # of all frames at once: one large matrix product is faster than many small ones
 
     @torch.no_grad()  # which holds for one thread only
-    def compare(part: slice) -> tuple[Tensor, Tensor | None, Tensor | None]:
+    def compare(part: slice) -> tuple[Tensor | None, ...]:
         field = samples.field(phase[part])
         amplitude = model.amplitude(samples, field)
         transfer = torch.fft.rfft2(intensity(amplitude))
@@ -69,27 +78,45 @@ def data_fidelity(
         residual = error * weight
         value = 0.5 * torch.linalg.vecdot(residual.flatten(1), error.flatten(1)).double()
         if not (want_object or want_aberrations):
-            return value, None, None
+            return value, None, None, None
         back = torch.fft.rfft2(residual, s=shape)
         by_object = (transfer.conj() * back).sum(0) if want_object else None
         if not want_aberrations:
-            return value, by_object, None
-        psf_gradient = torch.fft.irfft2(back * conjugate, s=shape)
-        return value, by_object, pull_back(samples, field, amplitude, psf_gradient)
+            return value, by_object, None, None
+        back = pull_back_field(samples, amplitude, torch.fft.irfft2(back * conjugate, s=shape))
+        weights = along(field, back).sum(0) / samples.weights if moved else None
+        return value, by_object, across(field, back), weights
 
-    values, by_object, slopes = zip(*parallel(compare, model.chunks(len(z))), strict=True)
+    values, by_object, slopes, weights = zip(*parallel(compare, model.chunks(len(z))), strict=True)
+    slope = torch.cat(slopes) if want_aberrations else None
     return DataFidelity(
         torch.cat(values),
         model.spectrum_adjoint(reduce(torch.add, by_object)).to(image.dtype) if want_object else None,
-        (torch.cat(slopes) @ samples.basis).to(z.dtype) if want_aberrations else None,
+        None if slope is None else (slope @ samples.basis).to(z.dtype),
+        reduce(torch.add, weights) if moved else None,
+        slope.T @ z.to(slope.dtype) if moved and slope is not None else None,
     )
 
 
 def pull_back(samples: OpenSamples, field: Tensor, amplitude: Tensor, psf_gradient: Tensor) -> Tensor:
     """Gradient with respect to the phase (T, P) from that with respect to the PSF (T, H', W')."""
+    return across(field, pull_back_field(samples, amplitude, psf_gradient))
+
+
+def pull_back_field(samples: OpenSamples, amplitude: Tensor, psf_gradient: Tensor) -> Tensor:
+    """Half the gradient with respect to the pupil field (T, P), its two parts as one complex number."""
     back = torch.fft.ifft2(amplitude * psf_gradient[:, None], norm="forward").flatten(1)
-    back = back.index_select(1, samples.index)
+    return back.index_select(1, samples.index)
+
+
+def across(field: Tensor, back: Tensor) -> Tensor:
+    """Gradient (T, P) with respect to the field's phase, from half of that with respect to the field."""
     return 2 * (back.imag * field.real - back.real * field.imag)
+
+
+def along(field: Tensor, back: Tensor) -> Tensor:
+    """Gradient (T, P) with respect to the logarithm of the field's size."""
+    return 2 * (back.real * field.real + back.imag * field.imag)
 
 
 @torch.no_grad()

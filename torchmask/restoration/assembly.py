@@ -6,12 +6,15 @@ import math
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from torchmask.restoration.checkpoint import Progress, Status
 from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.objective import MyopicObjective
-from torchmask.restoration.posterior import standard_deviations
+from torchmask.restoration.posterior import place_deviations, standard_deviations
 from torchmask.restoration.result import RestorationResult
+from torchmask.restoration.state import State
+from torchmask.restoration.traits import Refinement
 from torchmask.restoration.verdict import Verdict
 
 
@@ -25,6 +28,7 @@ def assemble_result(
 ) -> RestorationResult:
     """The result of a restoration that has ended; `r0` [m] is that of the aberration basis, None if they are known."""
     model, state = objective.model, progress.state
+    refined = progress.refinement is Refinement.ON
     transmission, weight = state.calibration.transmission, state.calibration.aberration_weight
     made = torch.cat([model(state.image, state.z[part]) for part in model.chunks(len(state.z))])
     frames = made * transmission[:, None, None].to(made)
@@ -48,8 +52,18 @@ def assemble_result(
         message=_message(progress),
         n_evaluations=progress.n_evaluations,
         seconds=0.0,
+        rotation=state.geometry.rotation,
+        magnification=state.geometry.magnification,
+        geometry_std=_geometry_deviations(objective, state) if refined else None,
         verdict=verdict,
     )
+
+
+def _geometry_deviations(objective: MyopicObjective, state: State) -> Tensor:
+    """Standard deviations (2,) of rotation [rad] and magnification."""
+    cutoff = min(0.5, objective.model.window.grid.cutoff(objective.model.pupil.aperture.extent))
+    scale = torch.tensor([1.0, state.geometry.magnification], dtype=torch.float64, device="cpu")
+    return scale * place_deviations(objective, state, cutoff).cpu()
 
 
 def add_deviations(

@@ -36,7 +36,7 @@ def several(state: State, n_each: int) -> Candidates:
     """So many copies of `state` as candidates."""
     now = state.calibration
     repeated = Calibration(now.transmission.repeat(n_each), now.noise_inflation.repeat(n_each), now.aberration_weight)
-    return Candidates(State(state.image, state.z.repeat(n_each, 1), repeated), n_each)
+    return Candidates(replace(state, z=state.z.repeat(n_each, 1), calibration=repeated), n_each)
 
 
 def with_candidates(objective: MyopicObjective, n_each: int) -> MyopicObjective:

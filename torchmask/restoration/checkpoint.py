@@ -14,9 +14,11 @@ import torch
 from torch import Tensor
 
 from torchmask.io import as_array, load_npz, save_npz
+from torchmask.optics.geometry import MaskGeometry
 from torchmask.restoration.candidates import Candidates
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.state import Calibration, State
+from torchmask.restoration.traits import Refinement
 
 
 class Status(Enum):
@@ -50,6 +52,7 @@ class Progress:
     starts : how many there were, with the present one; began : iterations before it
     rival : where the best of the earlier starts ended
     alike : whether the last two starts ended alike
+    refinement : whether the mask's place is found too, or will be if the frames ask for it
     integrated : whether the aberrations have been integrated out, which is done at the end and not kept on disk
     """
 
@@ -63,6 +66,7 @@ class Progress:
     began: int = 0
     rival: Ending | None = None
     alike: bool = False
+    refinement: Refinement = Refinement.OFF
     integrated: bool = False
 
     @property
@@ -86,7 +90,7 @@ class Progress:
 
 
 _NUMBERS = ("n_evaluations", "escapes", "starts", "began", "alike")
-_NEEDED = ("image", "z", "status", *(item.name for item in fields(Calibration)))  # of an ending
+_NEEDED = ("image", "z", "geometry", "status", *(item.name for item in fields(Calibration)))  # of an ending
 
 
 @dataclass(frozen=True)
@@ -103,7 +107,7 @@ class Checkpoint:
         """Write or replace the file."""
         arrays: dict[str, Any] = {name: getattr(progress, name) for name in ("costs", *_NUMBERS)}
         arrays |= {"n_candidates": progress.candidates.n_each, "fingerprint": self.fingerprint}
-        arrays |= _ending_arrays("", progress.ending)
+        arrays |= {"refinement": progress.refinement.name} | _ending_arrays("", progress.ending)
         if progress.rival is not None:
             arrays |= _ending_arrays("rival_", progress.rival)
         save_npz(self.path, arrays, replace=True)
@@ -121,7 +125,7 @@ class Checkpoint:
         has_rival = any(name.startswith("rival_") for name in stored)
         prefixes = ("", "rival_") if has_rival else ("",)
         endings = [prefix + name for prefix in prefixes for name in _NEEDED]
-        missing = [name for name in ("costs", "n_candidates", *_NUMBERS, *endings) if name not in stored]
+        missing = [name for name in ("costs", "n_candidates", "refinement", *_NUMBERS, *endings) if name not in stored]
         if missing:
             raise ValueError(f"{self.path} has no {', '.join(missing)}: it is damaged, remove it to begin anew")
         now = _ending(stored, "", device)
@@ -131,6 +135,7 @@ class Checkpoint:
             status=now.status,
             decrease=now.decrease,
             rival=_ending(stored, "rival_", device) if has_rival else None,
+            refinement=Refinement[stored["refinement"].item()],
             **{name: stored[name].item() for name in _NUMBERS},
         )
 
@@ -148,7 +153,7 @@ def fingerprint_of(objective: MyopicObjective, settings: Sequence[object], known
 
 def _ending_arrays(prefix: str, ending: Ending) -> dict[str, Any]:
     state, calibration = ending.state, ending.state.calibration
-    values = {"image": state.image, "z": state.z, "status": ending.status.name}
+    values = {"image": state.image, "z": state.z, "geometry": state.geometry.matrix, "status": ending.status.name}
     values |= {item.name: getattr(calibration, item.name) for item in fields(Calibration)}
     if ending.decrease is not None:
         values["decrease"] = ending.decrease
@@ -160,9 +165,12 @@ def _ending(stored: dict[str, np.ndarray], prefix: str, device: torch.device) ->
         return torch.from_numpy(stored[prefix + name]).to(device)
 
     weight = float(stored[prefix + "aberration_weight"])
+    geometry = MaskGeometry.from_matrix(torch.from_numpy(stored[prefix + "geometry"]))
     calibration = Calibration(tensor("transmission"), tensor("noise_inflation"), weight)
     decrease = stored.get(prefix + "decrease")
     status = Status[stored[prefix + "status"].item()]
     return Ending(
-        State(tensor("image"), tensor("z"), calibration), status, None if decrease is None else float(decrease)
+        State(tensor("image"), tensor("z"), calibration, geometry),
+        status,
+        None if decrease is None else float(decrease),
     )

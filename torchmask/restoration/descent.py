@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -9,7 +10,8 @@ import torch
 from torch import Tensor
 
 from torchmask.restoration.adjoint import curvature
-from torchmask.restoration.objective import MyopicObjective
+from torchmask.restoration.objective import Free, MyopicObjective
+from torchmask.restoration.placement import information, largest_magnification, moved, slopes_of_frames
 from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.state import State
 
@@ -25,28 +27,46 @@ Listener = Callable[[float, int, Variables], None]
 def descend(
     objective: MyopicObjective, state: State, n_iterations: int, minimizer: Minimizer, listener: Listener
 ) -> State:
-    """Lower the objective from `state` for at most `n_iterations`, its calibration as it is, the object positive."""
+    """Lower the objective from `state` for at most `n_iterations`, its calibration as it is, the object positive.
+
+    Where the mask's place is free, the state that comes back holds its geometry: the objective has to be placed there
+    (`placement.placed_as`).
+    """
+    moves = Free.PLACE in objective.free
     image_scale, z_scale = scales(objective, state)
+    step_scale = place_scale(objective, state) if moves else state.z.new_zeros(0)
     evaluate = objective.evaluator(state.calibration)
-    n, seen = state.image.numel(), 0
+    n, place, seen = state.image.numel(), state.image.numel() + state.z.numel(), 0
 
     def split(x: Tensor) -> tuple[Tensor, Tensor]:
-        return x[:n].view_as(state.image) * image_scale, x[n:].view_as(state.z) * z_scale
+        return x[:n].view_as(state.image) * image_scale, x[n:place].view_as(state.z) * z_scale
 
     def cost(x: Tensor) -> tuple[float, Tensor]:
-        value, by_image, by_z = evaluate(*split(x))
-        return float(value), torch.cat([(by_image * image_scale).flatten(), (by_z * z_scale).flatten()])
+        value, by_image, by_z, by_step = evaluate(*split(x), x[place:] * step_scale if moves else None)
+        slopes = [(by_image * image_scale).flatten(), (by_z * z_scale).flatten()]
+        return float(value), torch.cat(slopes if by_step is None else [*slopes, by_step * step_scale])
 
     def after(x: Tensor, value: float, evaluations: int) -> None:
         nonlocal seen
         seen, new = evaluations, evaluations - seen
         listener(value, new, lambda: split(x))
 
-    start = torch.cat([(state.image / image_scale).flatten(), (state.z / z_scale).flatten()])
+    parts = [(state.image / image_scale).flatten(), (state.z / z_scale).flatten(), torch.zeros_like(step_scale)]
+    start = torch.cat(parts)
     lower = torch.full_like(start, -torch.inf)
     lower[:n] = 0
-    image, z = split(minimizer(cost, start, lower, max_iterations=n_iterations, callback=after).x)
-    return replace(state, image=image, z=z)
+    if moves:
+        lower[-1] = -math.log(largest_magnification(objective.model)) / step_scale[-1]
+    found = minimizer(cost, start, lower, max_iterations=n_iterations, callback=after).x
+    image, z = split(found)
+    state = replace(state, image=image, z=z)
+    return moved(state, found[place:] * step_scale) if moves else state
+
+
+def place_scale(objective: MyopicObjective, state: State) -> Tensor:
+    """The unit (2,) in which the misfit curves by one along a step of the mask."""
+    slopes = slopes_of_frames(objective.model, state.image, state.z)
+    return information(slopes, objective.scaled_data(state.calibration)[1]).diagonal().rsqrt()
 
 
 def scales(objective: MyopicObjective, state: State) -> tuple[Tensor, Tensor]:

@@ -182,13 +182,23 @@ class ExposureModel(nn.Module):
             spectrum = spectrum * self.response.conj().to(spectrum)
         return torch.fft.irfft2(spectrum, s=self.window.field.shape)
 
-    def psf(self, z: Tensor) -> Tensor:
-        """PSFs (T, H', W') of the optics, of unit sum, origin at [0, 0], for z (T, K)."""
-        samples = self.pupil.samples()
+    def through(self, aperture: Aperture) -> ExposureModel:
+        """The same model, aberration basis and all, through another aperture of as many sub-apertures."""
+        twin = copy.deepcopy(self)
+        kwargs = {"dtype": self.dtype, "device": self.device}
+        twin.pupil = SampledPupil(aperture, self.window.field, self.band, self.aberrations, **kwargs)
+        return twin
+
+    def psf(self, z: Tensor, samples: OpenSamples | None = None) -> Tensor:
+        """PSFs (T, H', W') of the optics, of unit sum, origin at [0, 0], for z (T, K).
+
+        `samples` are those of a pupil that lies elsewhere; None: where the model has it.
+        """
+        samples = samples or self.pupil.samples()
         return intensity(self.amplitude(samples, samples.field(samples.phase(z))))
 
-    def forward(self, image: Tensor, z: Tensor) -> Tensor:
-        transfer = torch.fft.rfft2(self.psf(z))
+    def forward(self, image: Tensor, z: Tensor, samples: OpenSamples | None = None) -> Tensor:
+        transfer = torch.fft.rfft2(self.psf(z, samples))
         return self.window.crop(torch.fft.irfft2(transfer * self.spectrum(image), s=self.window.field.shape))
 
 

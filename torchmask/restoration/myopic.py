@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -32,7 +31,7 @@ from torchmask.restoration.result import RestorationResult
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.solver import Solver
 from torchmask.restoration.starts import Known
-from torchmask.restoration.traits import Traits
+from torchmask.restoration.traits import Refinement, Traits, check_numbers
 
 
 class MyopicDeconvolution:
@@ -75,6 +74,9 @@ class MyopicDeconvolution:
     pixel : PixelResponse, optional
         How the detector's pixels blur the image: `SquarePixel(fill_factor)`, or `MappedPixel` with a map of their
         sensitivity. The object is restored without it. None: pixels are points.
+    refine_geometry : bool, optional
+        Whether a turn and an even magnification of the mask are found with the object. None: if the frames say clearly
+        that it lies otherwise than told. Frames of a star tell it more precisely, and more of it: `calibrate_mask`.
     prior : callable
         Of the object: a function or module that maps an image (H', W'), in units of the stack's mean pixel and on a
         field somewhat wider than the frames, to a scalar that PyTorch differentiates. At hand are `TotalVariation` and
@@ -129,6 +131,7 @@ class MyopicDeconvolution:
         static_modes: int = 0,
         background: Background | float | Tensor = Background.IF_SEEN,
         pixel: PixelResponse | None = None,
+        refine_geometry: bool | None = None,
         prior: Callable[[Tensor], Tensor] | None = None,
         aberration_prior: bool = True,
         max_iterations: int = 4000,
@@ -138,12 +141,7 @@ class MyopicDeconvolution:
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
     ) -> None:
-        if readout_noise is not None and not (math.isfinite(readout_noise) and readout_noise >= 0):
-            raise ValueError(f"readout_noise is {readout_noise}: it must be finite and at least 0, in electrons rms")
-        if max_iterations < 1 or not tolerance >= 0:
-            raise ValueError(
-                f"max_iterations is {max_iterations} and tolerance {tolerance}: they must be at least 1 and at least 0"
-            )
+        check_numbers(readout_noise, max_iterations, tolerance)
         if wavelengths is None and weights is not None:
             raise ValueError("weights are given without wavelengths: give both")
         self.many_minima: bool = aperture.n_subapertures == 1
@@ -162,6 +160,7 @@ class MyopicDeconvolution:
             dtype=dtype,
             device=device,
         )
+        self.refinement: Refinement = Refinement.of(refine_geometry, aperture)
         self.readout_noise: float | None = readout_noise
         self.background: Background | float | Tensor = background
         self.max_iterations: int = max_iterations
@@ -259,8 +258,7 @@ class MyopicDeconvolution:
         warn_of_orientation(stack.frames, self.recipe.aperture, self.recipe.grid)
         if n_samples < 0 or n_samples == 1:
             raise ValueError(f"n_samples is {n_samples}: 0 for no standard deviations, or at least 2")
-        known = Known(coefficients, covariance, known_object)
-        known.check()
+        (known := Known(coefficients, covariance, known_object)).check()
         model = (self.model if covariance is None else self.recipe.estimated_model(covariance)).beside(stack.free)
         stack = stack.to(model.dtype, model.device)
         with each_on_a_core(model.device) as parallel:
@@ -282,11 +280,12 @@ class MyopicDeconvolution:
         return FrameStack.of(frames, valid, grid, aperture, self.readout_noise, self.background, errors)
 
     def _checkpoint(self, path: str | Path | None, solver: Solver, known: Known) -> Checkpoint | None:
-        settings = (self.recipe.whitened, self.known_r0, self.minimizer, self.schedule, solver.traits.seed)
+        settings = (replace(solver.traits, max_iterations=0, tolerance=0.0), self.minimizer, self.schedule)
         fingerprint = fingerprint_of(solver.objective, settings, known.tensors)
         return None if path is None else Checkpoint(Path(path), fingerprint)
 
     def _traits(self, known: Known, seed: int) -> Traits:
+        blind = known.nothing and self.recipe.whitened
         return Traits(
             many_minima=self.many_minima,
             estimated=known.estimated,
@@ -297,4 +296,5 @@ class MyopicDeconvolution:
             max_iterations=self.max_iterations,
             tolerance=self.tolerance,
             seed=seed,
+            refinement=self.refinement if blind or self.refinement is Refinement.ON else Refinement.OFF,
         )

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torchmask.restoration.adjoint import data_fidelity
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.parallel import Map
+from torchmask.restoration.placed import PlacedSamples
 from torchmask.restoration.priors import ObjectPrior
 from torchmask.restoration.state import Calibration
 
@@ -24,14 +25,20 @@ class Free(Flag):
     """Those of each frame."""
     COMMON = auto()
     """Those common to all frames."""
+    PLACE = auto()
+    """How the mask lies: a turn and a magnification."""
 
 
 class CostAndGradients(NamedTuple):
-    """The cost, a scalar, and its gradients (H', W') and (T, K): zero where nothing is free."""
+    """The cost, a scalar, and its gradients (H', W') and (T, K): zero where nothing is free.
+
+    place_gradient : (2,) in a step of the mask; None where no step is made
+    """
 
     value: Tensor
     object_gradient: Tensor
     aberration_gradient: Tensor
+    place_gradient: Tensor | None = None
 
 
 class MyopicObjective(nn.Module):
@@ -153,14 +160,18 @@ class MyopicObjective(nn.Module):
         """The cost and its gradients in `image` (H', W') and `z` (T, K), by the adjoint."""
         return self.evaluator(calibration or self.neutral_calibration())(image, z)
 
-    def evaluator(self, calibration: Calibration) -> Callable[[Tensor, Tensor], CostAndGradients]:
-        """`value_and_gradients` for one calibration, whose frames are scaled once."""
+    def evaluator(self, calibration: Calibration) -> Callable[..., CostAndGradients]:
+        """`value_and_gradients` for one calibration, whose frames are scaled once.
+
+        A third argument, a step (2,), turns [rad] and shrinks the mask from where it lies (`placed.PlacedSamples`).
+        """
         frames, precision = self.scaled_data(calibration)
         by_object = Free.OBJECT in self.free
         by_aberrations = bool(self.free & (Free.ABERRATIONS | Free.COMMON))
 
         @torch.no_grad()
-        def evaluate(image: Tensor, z: Tensor) -> CostAndGradients:
+        def evaluate(image: Tensor, z: Tensor, step: Tensor | None = None) -> CostAndGradients:
+            placed = None if step is None else PlacedSamples(self.model.pupil, step)
             misfit = data_fidelity(
                 self.model,
                 image,
@@ -168,7 +179,8 @@ class MyopicObjective(nn.Module):
                 frames,
                 precision,
                 want_object=by_object,
-                want_aberrations=by_aberrations,
+                want_aberrations=by_aberrations or placed is not None,
+                samples=None if placed is None else placed.samples,
                 parallel=self.parallel,
             )
             penalty, slope = self._penalty_and_slope(image)
@@ -177,9 +189,14 @@ class MyopicObjective(nn.Module):
             image_gradient, z_gradient = torch.zeros_like(image), torch.zeros_like(z)
             if misfit.object_gradient is not None:
                 image_gradient = misfit.object_gradient + self.prior_copies * slope
-            if misfit.aberration_gradient is not None:
+            if by_aberrations and misfit.aberration_gradient is not None:
                 z_gradient = self._within_free(misfit.aberration_gradient + weight * away)
-            return CostAndGradients(value, image_gradient, z_gradient)
+            by_place = None
+            if placed is not None:
+                assert misfit.weight_gradient is not None
+                assert misfit.basis_gradient is not None
+                by_place = placed.pull_back(misfit.weight_gradient, misfit.basis_gradient)
+            return CostAndGradients(value, image_gradient, z_gradient, by_place)
 
         return evaluate
 

@@ -22,6 +22,7 @@ from torchmask.optics.conjugate import Operator, conjugate_gradients
 from torchmask.restoration.adjoint import curvature
 from torchmask.restoration.linearization import Linearization
 from torchmask.restoration.objective import Free, MyopicObjective
+from torchmask.restoration.placement import slopes_of_frames
 from torchmask.restoration.priors import divergence, gradient
 from torchmask.restoration.state import State
 
@@ -51,6 +52,21 @@ def standard_deviations(
     off = lowpass(_bias(state.image, slope, power, prior), cutoff).square() if Free.OBJECT in objective.free else 0.0
     variance = smooth(lowpass(objects, cutoff).square().mean(0) + off, reach)
     return variance.clamp(min=0).sqrt(), aberrations
+
+
+def place_deviations(objective: MyopicObjective, state: State, cutoff: float) -> Tensor:
+    """Standard deviations (2,) of the mask's turn [rad] and shrinkage, with all else as uncertain as it is.
+
+    What object and aberrations can imitate of the frames' slopes tells nothing of the mask (Schur's complement).
+    """
+    generator = torch.Generator().manual_seed(0)
+    _, power = objective.object_quadratic(state.image, state.z, state.calibration)
+    prior = _gradient_prior(power, state.image, _REACH / cutoff, generator)
+    joint = JointHessian(objective, state, power, prior, generator)
+    slopes = slopes_of_frames(objective.model, state.image, state.z)
+    imitated = joint.tangent.forward(*joint.solve(*joint.tangent.adjoint(joint.precision * slopes)))
+    told = torch.einsum("stij,utij->su", (joint.precision * slopes).double(), (slopes - imitated).double())
+    return torch.linalg.inv((told + told.T) / 2).diagonal().sqrt()
 
 
 def _gradient_prior(power: Tensor, image: Tensor, reach: float, generator: torch.Generator) -> Tensor:
@@ -88,40 +104,61 @@ def _sample(
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
     """Samples of object (S, H', W') and aberrations (S, T, K), given the gradients' inverse variances `prior`."""
-    model, basis = objective.model, objective.model.aberrations
-    precision = objective.scaled_data(state.calibration)[1]
-    tangent = Linearization(model, state.image, state.z, objective.parallel)
-    z_prior = torch.zeros_like(state.z[0]) + objective.aberration_weight(state.calibration, state.z)
-    z_curvature = curvature(model, state.image, state.z, precision, generator)[0] + z_prior
-    least = _LEAST * float(z_curvature.max())
-    z_curvature, hold = z_curvature.clamp(min=least), torch.where(z_prior > 0, z_prior, least)
-    by_object, by_aberrations = (float(part in objective.free) for part in (Free.OBJECT, Free.ABERRATIONS))
-    n, shape = state.image.numel(), (n_samples, *state.z.shape)
-    settle = _object_preconditioner(power, prior)
-
-    def split(x: Tensor) -> tuple[Tensor, Tensor]:
-        return x[:, :n].view(-1, *state.image.shape), x[:, n:].view(shape)
-
-    def join(image: Tensor, z: Tensor) -> Tensor:
-        return torch.cat([by_object * image.flatten(1), by_aberrations * basis.mean_common(z).flatten(1)], dim=1)
-
-    def hessian(x: Tensor) -> Tensor:
-        image, z = split(x)
-        by_image, by_z = tangent.adjoint(precision * tangent.forward(image, z))
-        return join(by_image + _curvature(image, prior), by_z + hold * z)
-
-    def precondition(x: Tensor) -> Tensor:
-        image, z = split(x)
-        return join(settle(image), z / z_curvature)
-
+    model, precision = objective.model, objective.scaled_data(state.calibration)[1]
+    joint = JointHessian(objective, state, power, prior, generator)
     brightness = model(state.image, state.z).clamp(min=0)
     share = photon_share / state.calibration.noise_inflation[:, None, None].to(brightness)
     variance = 1 + share * (brightness / brightness.mean() - 1)  # over that which the misfit assumes
     noise = (precision * variance).sqrt() * _white((n_samples, *objective.frames.shape), brightness, generator)
-    by_image, by_z = tangent.adjoint(noise)
+    by_image, by_z = joint.tangent.adjoint(noise)
     by_image = by_image + _prior_noise(prior, n_samples, generator)
-    by_z = by_z + z_prior.sqrt() * _white(shape, state.z, generator)
-    return split(conjugate_gradients(hessian, join(by_image, by_z), precondition, _ITERATIONS))
+    by_z = by_z + joint.z_prior.sqrt() * _white((n_samples, *state.z.shape), state.z, generator)
+    return joint.solve(by_image, by_z)
+
+
+class JointHessian:
+    """The Hessian of the cost in object and aberrations jointly, by Gauss and Newton, with the Gaussian prior above.
+
+    z_prior : (K,) curvature of the aberrations' prior
+    """
+
+    def __init__(
+        self, objective: MyopicObjective, state: State, power: Tensor, prior: Tensor, generator: torch.Generator
+    ) -> None:
+        self.objective: MyopicObjective = objective
+        self.prior: Tensor = prior
+        self.precision: Tensor = objective.scaled_data(state.calibration)[1]
+        self.tangent: Linearization = Linearization(objective.model, state.image, state.z, objective.parallel)
+        self.z_prior: Tensor = torch.zeros_like(state.z[0]) + objective.aberration_weight(state.calibration, state.z)
+        curved = curvature(objective.model, state.image, state.z, self.precision, generator)[0] + self.z_prior
+        least = _LEAST * float(curved.max())
+        self._z_curvature: Tensor = curved.clamp(min=least)
+        self._hold: Tensor = torch.where(self.z_prior > 0, self.z_prior, least)
+        self._settle: Operator = _object_preconditioner(power, prior)
+        self._shapes = state.image.shape, state.z.shape
+
+    def solve(self, by_image: Tensor, by_z: Tensor) -> tuple[Tensor, Tensor]:
+        """Objects (S, H', W') and aberrations (S, T, K) that the Hessian takes to these; what is not free stays 0."""
+        found = conjugate_gradients(self._apply, self._join(by_image, by_z), self._precondition, _ITERATIONS)
+        return self._split(found)
+
+    def _apply(self, x: Tensor) -> Tensor:
+        image, z = self._split(x)
+        by_image, by_z = self.tangent.adjoint(self.precision * self.tangent.forward(image, z))
+        return self._join(by_image + _curvature(image, self.prior), by_z + self._hold * z)
+
+    def _precondition(self, x: Tensor) -> Tensor:
+        image, z = self._split(x)
+        return self._join(self._settle(image), z / self._z_curvature)
+
+    def _split(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        image, z = self._shapes
+        return x[:, : image.numel()].view(-1, *image), x[:, image.numel() :].view(-1, *z)
+
+    def _join(self, image: Tensor, z: Tensor) -> Tensor:
+        by_object, by_aberrations = (float(part in self.objective.free) for part in (Free.OBJECT, Free.ABERRATIONS))
+        common = self.objective.model.aberrations.mean_common(z)
+        return torch.cat([by_object * image.flatten(1), by_aberrations * common.flatten(1)], dim=1)
 
 
 def _object_preconditioner(power: Tensor, prior: Tensor) -> Operator:

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.band import Band
+from torchmask.optics.pupil import sample_holes
 from torchmask.optics.zernike import zernike_basis
 from torchmask.restoration.aberrations import AberrationBasis
 
@@ -86,7 +87,7 @@ class SampledPupil(nn.Module):
         self.aberrations: AberrationBasis = aberrations
         kwargs = {"dtype": dtype or aperture.centers.dtype, "device": device}
         with torch.no_grad():
-            for name, values in self._sample()._asdict().items():
+            for name, values in self._sample_where_it_lies()._asdict().items():
                 values = values.to(device) if name == "index" else values.to(**kwargs)
                 self.register_buffer(name, values, persistent=False)
         self.register_buffer("centers", aperture.centers.detach().clone(), persistent=False)
@@ -96,27 +97,44 @@ class SampledPupil(nn.Module):
         """The open samples of the aperture where it lies now."""
         centers = self.aperture.centers
         if centers.requires_grad and torch.is_grad_enabled():
-            sampled = self._sample()
-            return OpenSamples(*(v if name == "index" else v.to(self.basis) for name, v in sampled._asdict().items()))
+            self._require_sampling()
+            return self.samples_at(centers)
         if not torch.equal(centers, self.centers):
             with torch.no_grad():
-                for name, values in self._sample()._asdict().items():
+                for name, values in self._sample_where_it_lies()._asdict().items():
                     setattr(self, name, values.to(self.index if name == "index" else self.basis))
             self.centers = centers.detach().clone()
         return OpenSamples(self.weights, self.index, self.basis, self.positions, self.chromaticity)
 
-    def _sample(self) -> OpenSamples:
+    def samples_at(self, centers: Tensor) -> OpenSamples:
+        """The open samples of the same sub-apertures at other `centers` (N, 2) [m], differentiable in them.
+
+        Whether the image is aliased is not looked at.
+        """
+        sampled = self._sample(centers)
+        return OpenSamples(
+            *(v.to(self.index if name == "index" else self.basis) for name, v in sampled._asdict().items())
+        )
+
+    def _sample_where_it_lies(self) -> OpenSamples:
+        self._require_sampling()
+        return self._sample(self.aperture.centers)
+
+    def _require_sampling(self) -> None:
+        self.aperture.require_sampling(replace(self.grid, wavelength=self.band.shortest))
+
+    def _sample(self, centers: Tensor) -> OpenSamples:
         pixels = math.prod(self.grid.shape)
         parts = []
         for number, (wavelength, share) in enumerate(zip(self.band.wavelengths, self.band.shares, strict=True)):
-            part = self._sample_at(wavelength)
+            part = self._sample_at(centers, wavelength)
             weights = math.sqrt(share) * part.weights
             parts.append(part._replace(weights=weights, index=part.index + number * pixels))
         return OpenSamples(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
-    def _sample_at(self, wavelength: float) -> OpenSamples:
+    def _sample_at(self, centers: Tensor, wavelength: float) -> OpenSamples:
         aperture, grid = self.aperture, replace(self.grid, wavelength=wavelength)
-        samples = aperture.samples(grid)
+        samples = sample_holes(centers, aperture.shape, aperture.subaperture_diameter, grid, 1)
         modes = zernike_basis(samples, aperture, self.aberrations.n_modes)  # (N, P, J)
         is_open = samples.weights > 0
         mixing = self.aberrations.mixing.to(modes).unflatten(0, (len(modes), self.aberrations.n_modes))
@@ -124,7 +142,7 @@ class SampledPupil(nn.Module):
         weights = samples.weights[is_open]
         # Parseval: this makes the sum of every PSF 1, whatever the phase, as long as holes share no cell.
         scale = weights.norm() * math.prod(grid.shape) ** 0.5
-        positions = (samples.offsets + aperture.centers[:, None])[is_open] / grid.period
+        positions = (samples.offsets + centers[:, None])[is_open] / grid.period
         ratio = self.grid.wavelength / wavelength
         chromaticity = weights.new_full((len(weights),), ratio)
         return OpenSamples(weights / scale, samples.index[is_open], mixed * ratio, positions, chromaticity)

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchmask.io import load_npz, save_npz
+from torchmask.optics.geometry import MaskGeometry
 from torchmask.record import Brief
 from torchmask.restoration.verdict import Verdict
 
@@ -39,6 +40,8 @@ class RestorationResult(Brief):
         brightness, which frames cannot tell, taken as found; None unless samples were asked for
     coefficients_std : (N, J) that of the coefficients of a frame [rad rms], or None
     background : (T,) mean light of a pixel of each frame that is not the object's [electrons]; None in files of 0.1
+    rotation, magnification : of the mask against what was told, [rad] from x to y; 0 and 1 where it was taken as told
+    geometry_std : (2,) standard deviations of both, as the noise leaves them, or None
     verdict : whether all this explains the frames; None in files of 0.1
 
     Examples
@@ -74,7 +77,15 @@ class RestorationResult(Brief):
     object_std: Tensor | None = None
     coefficients_std: Tensor | None = None
     background: Tensor | None = None
+    rotation: float = 0.0
+    magnification: float = 1.0
+    geometry_std: Tensor | None = None
     verdict: Verdict | None = None
+
+    @property
+    def geometry(self) -> MaskGeometry:
+        """How the mask lies against what was told, as far as the restoration has looked for it."""
+        return MaskGeometry(self.rotation, self.magnification, self.magnification)
 
     @property
     def sky(self) -> float:
@@ -119,6 +130,12 @@ class RestorationResult(Brief):
             + ("" if math.isnan(self.r0) else f", r0 {self.r0:.3g} m")
             + (f", sky {self.sky:.3g} electrons" if self.sky > 0 else ""),
         ]
+        if self.geometry_std is not None:
+            turn, scale = self.geometry_std.tolist()
+            lines.append(
+                f"mask turned by {math.degrees(self.rotation):.3f} +- {math.degrees(turn):.3f} deg from x to y and "
+                f"magnified by {self.magnification:.5f} +- {scale:.5f} against what was told"
+            )
         return "\n".join([*lines, *([] if self.verdict is None else [str(self.verdict)])])
 
 

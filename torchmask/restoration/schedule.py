@@ -34,6 +34,10 @@ class Schedule:
         falling noise, iterations of a round
     pixel_steps : by which the object is moved along each axis to find its place between the pixels
     pixel_iterations : that settle the object at such a place, at most
+    misplaced_gain, misplaced : the mask's place is looked for if moving it promises to lower the cost by more than the
+        first, and it has to move by more than the second, over the holes' distance from the centre
+    farthest : a mask that is found farther away than this is taken as told again
+    still : it has come to rest where a segment moves it by less than this
     faint : change from frame to frame, in noise variances, below which the aberrations are integrated out at the end
     rounds, moves : of that integration, and moves of the aberrations' samples in a round; the object is the mean of
         the later half of the rounds
@@ -63,6 +67,10 @@ class Schedule:
     restart_iterations: int = 30
     pixel_steps: tuple[float, ...] = (0.4, 0.2)
     pixel_iterations: int = 60
+    misplaced_gain: float = 5.0
+    misplaced: float = 6e-4
+    farthest: float = 0.05
+    still: float = 1e-4
     faint: float = 5.0
     rounds: int = 80
     moves: int = 10

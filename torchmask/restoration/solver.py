@@ -12,20 +12,23 @@ and the best is kept. Of faint frames, the aberrations are integrated out of wha
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property
+from dataclasses import replace
 
 from torch import Tensor
 
+from torchmask.optics.aperture import Aperture
+from torchmask.optics.geometry import MaskGeometry
 from torchmask.record import Callback, Record
 from torchmask.restoration import escapes
-from torchmask.restoration.calibration import fit_of_frames, recalibrate
+from torchmask.restoration.calibration import recalibrate
 from torchmask.restoration.candidates import Candidates, play_stage
 from torchmask.restoration.checkpoint import Checkpoint, Ending, Progress, Status
 from torchmask.restoration.descent import Variables, descend
 from torchmask.restoration.frames import FrameStack
+from torchmask.restoration.judge import Judge
 from torchmask.restoration.marginal import integrate_aberrations
-from torchmask.restoration.model_error import NO_MODEL_ERROR, LeftOut, expected_error
 from torchmask.restoration.objective import Free, MyopicObjective
+from torchmask.restoration.placement import distance, is_misplaced, placed_as
 from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.result import RestorationResult
 from torchmask.restoration.schedule import Schedule
@@ -38,8 +41,8 @@ from torchmask.restoration.starts import (
     start_from_result,
 )
 from torchmask.restoration.state import State
-from torchmask.restoration.traits import Traits
-from torchmask.restoration.verdict import Finding, Tolerance, Verdict, judge
+from torchmask.restoration.traits import Refinement, Traits
+from torchmask.restoration.verdict import Finding, Verdict
 
 
 class Solver:
@@ -67,6 +70,7 @@ class Solver:
         callback: Callback | None = None,
     ) -> None:
         self.objective: MyopicObjective = objective
+        self.told: Aperture = objective.model.pupil.aperture
         self.unit: float = stack.unit
         self.traits: Traits = traits
         self.schedule: Schedule = schedule
@@ -76,9 +80,7 @@ class Solver:
         self.first_inflation: float = max(1.0, change / schedule.first_inflation)
         held = traits.prior_on_aberrations and not traits.many_minima  # through a full pupil it was not tried
         self.is_faint: bool = held and Free.OBJECT | Free.ABERRATIONS in objective.free and change < schedule.faint
-        self.contrast: float = stack.contrast
-        least = schedule.missed * change if traits.many_minima else 0.0  # its poor minima are no worse than that
-        self.tolerance: Tolerance = Tolerance(schedule.model_errors, schedule.chance, least)
+        self.judge: Judge = Judge(objective.model, stack, traits, schedule)
 
     def solve(self, known: Known, start: RestorationResult | None = None, file: Checkpoint | None = None) -> Progress:
         """The restoration from its beginning, an earlier result or a checkpoint to its end."""
@@ -106,9 +108,10 @@ class Solver:
         if known.covariance is not None:  # the errors are those of what is expected
             self.objective = self.objective.with_changes(centre=state.z)
         if start is None:
-            return Progress(self._first_candidates(state, self.traits.seed))
+            return Progress(self._first_candidates(state, self.traits.seed), refinement=self.traits.refinement)
         warm, n_known = start_from_result(self.objective, state, start, self.unit)
-        progress = Progress(Candidates(warm, 1), escapes=self.schedule.escapes)
+        self._place(warm)
+        progress = Progress(Candidates(warm, 1), escapes=self.schedule.escapes, refinement=self.traits.refinement)
         if n_known < len(warm.z) and Free.ABERRATIONS in self.objective.free:
             rms = self._start_rms() if self._has_tournament() else None
             progress.state, progress.n_evaluations = fit_new_frames(
@@ -127,7 +130,19 @@ class Solver:
             if ended and may_start_again and progress.iterations > self.schedule.sharp_after:
                 self._judge_start(progress)
             save(progress)
+        self._place(progress.state)
         return progress
+
+    def _place(self, state: State) -> MyopicObjective:
+        """The objective, with the mask where the state has found it."""
+        self.objective = placed_as(self.objective, self.told, state.geometry)
+        return self.objective
+
+    def _look_at_place(self, progress: Progress) -> None:
+        """Decide whether the mask's place is found too, once the object is sharp enough to tell it."""
+        if progress.refinement is Refinement.IF_SEEN and progress.iterations >= self.schedule.sharp_after:
+            asked = not self.is_faint and is_misplaced(self.objective, progress.state, self.schedule)
+            progress.refinement = Refinement.ON if asked else Refinement.OFF
 
     def _first_state(self, known: Known) -> State:
         z = expected_parameters(self.objective, known.coefficients)
@@ -168,20 +183,25 @@ class Solver:
 
     def _advance(self, progress: Progress) -> None:
         """One segment, then what is brought up to date between two."""
-        objective, schedule = self.objective, self.schedule
-        state, done = progress.state, progress.iterations
-        evaluate = objective.evaluator(state.calibration)
-        before = float(evaluate(state.image, state.z).value)
-        state = self._descend(progress, objective, state, schedule.segment)
-        after = float(evaluate(state.image, state.z).value)
+        schedule, state, done = self.schedule, progress.state, progress.iterations
+        objective = self._place(state)
+        before, place = float(objective.evaluator(state.calibration)(state.image, state.z).value), state.geometry
+        found = self._descend(progress, objective, state, schedule.segment)
+        is_lost = distance(found.geometry, MaskGeometry()) > schedule.farthest  # nothing tells where the mask lies
+        progress.refinement = Refinement.OFF if is_lost else progress.refinement
+        state = state if is_lost else found
+        objective = self._place(state)
+        after = float(objective.evaluator(state.calibration)(state.image, state.z).value)
         progress.state, decrease = state, (before - after) / abs(after)
+        is_still = distance(place, state.geometry) < schedule.still
+        self._look_at_place(progress)
         limit = self._limit(progress)
         goes_on = limit is Status.RUNNING
         if goes_on and Free.ABERRATIONS in objective.free and progress.escapes < schedule.escapes:
             at_rest = progress.iterations == done
             if at_rest or Free.OBJECT not in objective.free or progress.iterations >= schedule.sharp_after:
                 self._escape(progress)
-        elif decrease <= self.traits.tolerance:
+        elif decrease <= self.traits.tolerance and is_still:
             progress.status, progress.decrease = Status.CONVERGED, decrease
             return
         progress.status = limit
@@ -207,6 +227,8 @@ class Solver:
             progress.n_evaluations += evaluations * n_each
             self._report(progress, variables)
 
+        if progress.refinement is Refinement.ON and progress.iterations:  # blind, nothing tells where the mask lies
+            objective = objective.with_changes(free=objective.free | Free.PLACE)
         left = self._last_iteration(progress) - len(progress.costs)
         return descend(objective, state, min(n_iterations, left), self.minimizer, listen)
 
@@ -238,20 +260,14 @@ class Solver:
 
         Two that end alike have found what there is to be found.
         """
-        now = progress.ending
-        best, verdict, progress.alike = now, self.verdict(now), False
-        if (rival := progress.rival) is not None:
-            before, after = self.verdict(rival), verdict
-            best, verdict = (rival, before) if before.excess < after.excess else (now, after)
-            scale = max(verdict.excess, verdict.limit - 1)
-            progress.alike = abs(before.excess - after.excess) < self.schedule.alike * scale
+        best, verdict, progress.alike = self.judge.compare(self.objective, progress.ending, progress.rival)
         missed = verdict.finding is Finding.NOT_EXPLAINED
         spent = len(progress.costs) >= self.traits.max_iterations
         if missed and not progress.alike and progress.starts < self.schedule.starts and not spent:
-            seed = self.traits.seed + progress.starts
+            seed, found = self.traits.seed + progress.starts, progress.state.geometry
             progress.rival, progress.began, progress.starts = best, len(progress.costs), progress.starts + 1
             progress.escapes, progress.status, progress.decrease = 0, Status.RUNNING, None
-            progress.candidates = self._first_candidates(self._first_state(Known()), seed)
+            progress.candidates = self._first_candidates(replace(self._first_state(Known()), geometry=found), seed)
         else:
             progress.state, progress.status, progress.decrease = best.state, best.status, best.decrease
 
@@ -263,18 +279,7 @@ class Solver:
 
     def verdict(self, ending: Ending) -> Verdict:
         """Whether the frames are explained by what a start, or all of them, ended at."""
-        objective, state = self.objective, ending.state
-        pixels = (objective.precision.expand_as(objective.frames) > 0).sum((1, 2))
-        # A full pupil has so many modes that its poor minima, and not what is left out, decide: `tolerance` knows.
-        error = NO_MODEL_ERROR if self.traits.many_minima else expected_error(objective, state, self._left_out)
-        chi_square = fit_of_frames(objective, state)[1]
-        at_rest = ending.status is not Status.ITERATION_LIMIT
-        return judge(chi_square, pixels, self.contrast, error, self.tolerance, at_rest=at_rest)
-
-    @cached_property
-    def _left_out(self) -> LeftOut:
-        model, traits = self.objective.model, self.traits
-        return LeftOut.of(model.pupil.aperture, model.aberrations.n_modes, traits.r0, traits.outer_scale)
+        return self.judge.verdict(self.objective, ending)
 
     def _report(self, progress: Progress, variables: Variables) -> None:
         if self.callback is None:

@@ -133,7 +133,7 @@ def start_from_result(
     if Free.ABERRATIONS in objective.free:
         z[:known] = basis.parameters_of(start.coefficients)
         z[known:] = basis.with_common_of(z[known:], z[:1])
-    return replace(state, image=image, z=z), known
+    return replace(state, image=image, z=z, geometry=start.geometry), known
 
 
 def fit_new_frames(

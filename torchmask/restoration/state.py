@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
+
+from torchmask.optics.geometry import MaskGeometry
 
 
 @dataclass(frozen=True)
@@ -33,11 +35,13 @@ class State:
 
     image : (H', W') object in units of the stack's mean pixel
     z : (T, K) parameters of the aberrations, the common ones the same in every frame
+    geometry : how the mask lies against what is told, as far as it has been found
     """
 
     image: Tensor
     z: Tensor
     calibration: Calibration
+    geometry: MaskGeometry = field(default_factory=MaskGeometry)
 
     def of_frames(self, part: slice | Tensor) -> State:
         """The same object with the aberrations of some of the frames."""

@@ -1,13 +1,37 @@
-"""What a solver must know of a restoration beside what is minimised."""
+"""What decides the course of a restoration beside its frames and its schedule."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from enum import Enum
+
+from torchmask.optics.aperture import Aperture, SparseAperture
+
+
+class Refinement(Enum):
+    """Whether a restoration finds how the mask lies, a turn and a magnification, together with the object."""
+
+    OFF = "the mask lies as told"
+    IF_SEEN = "found if the frames say clearly that it lies otherwise"
+    ON = "found"
+
+    @classmethod
+    def of(cls, refine: bool | None, aperture: Aperture) -> Refinement:
+        """What a caller's True, False or None stand for; an aperture without baselines has nothing to be seen by.
+
+        Raises ValueError for True with such an aperture.
+        """
+        if isinstance(aperture, SparseAperture) and aperture.n_subapertures > 1:
+            return cls.IF_SEEN if refine is None else cls.ON if refine else cls.OFF
+        if refine:
+            raise ValueError("refine_geometry is True: only a mask has baselines that tell how it lies, leave it out")
+        return cls.OFF
 
 
 @dataclass(frozen=True)
 class Traits:
-    """What sets one restoration apart from another.
+    """What a solver must know of the problem beside its objective.
 
     many_minima : of a full pupil, which needs a tournament of candidates
     estimated : the aberrations are known with errors, whose prior takes the place of turbulence
@@ -17,6 +41,7 @@ class Traits:
     max_iterations : of all starts together
     tolerance : a segment that lowers the cost by a smaller fraction is the last one
     seed : of random starts
+    refinement : whether the mask's place is found too
     """
 
     many_minima: bool
@@ -28,3 +53,14 @@ class Traits:
     max_iterations: int
     tolerance: float
     seed: int
+    refinement: Refinement
+
+
+def check_numbers(readout_noise: float | None, max_iterations: int, tolerance: float) -> None:
+    """Raise ValueError for a read-out noise [electrons rms], a number of iterations or a tolerance out of range."""
+    if readout_noise is not None and not (math.isfinite(readout_noise) and readout_noise >= 0):
+        raise ValueError(f"readout_noise is {readout_noise}: it must be finite and at least 0, in electrons rms")
+    if max_iterations < 1 or not tolerance >= 0:
+        raise ValueError(
+            f"max_iterations is {max_iterations} and tolerance {tolerance}: they must be at least 1 and at least 0"
+        )

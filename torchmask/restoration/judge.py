@@ -1,0 +1,63 @@
+"""Judge where the starts of one restoration have ended, and which of two is the better one."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import NamedTuple
+
+from torchmask.optics.aperture import Aperture
+from torchmask.restoration.calibration import fit_of_frames
+from torchmask.restoration.checkpoint import Ending, Status
+from torchmask.restoration.forward import ExposureModel
+from torchmask.restoration.frames import FrameStack
+from torchmask.restoration.model_error import LeftOut, expected_error
+from torchmask.restoration.objective import MyopicObjective
+from torchmask.restoration.placement import placed_as
+from torchmask.restoration.schedule import Schedule
+from torchmask.restoration.traits import Traits
+from torchmask.restoration.verdict import Tolerance, Verdict, judge
+
+
+class Comparison(NamedTuple):
+    """The better of two endings, the verdict on it, and whether both have found the same."""
+
+    best: Ending
+    verdict: Verdict
+    alike: bool
+
+
+class Judge:
+    """Verdicts on the endings of one stack, each with the mask where it has found it against what `model` was told."""
+
+    def __init__(self, model: ExposureModel, stack: FrameStack, traits: Traits, schedule: Schedule) -> None:
+        least = schedule.missed * stack.change if traits.many_minima else 0.0  # its poor minima are no worse than that
+        self.told: Aperture = model.pupil.aperture
+        self.n_modes: int = model.aberrations.n_modes
+        self.traits: Traits = traits
+        self.alike: float = schedule.alike
+        self.contrast: float = stack.contrast
+        self.tolerance: Tolerance = Tolerance(schedule.model_errors, schedule.chance, least)
+
+    def verdict(self, objective: MyopicObjective, ending: Ending) -> Verdict:
+        """Whether the frames are explained by what a start, or all of them, ended at."""
+        state = ending.state
+        objective = placed_as(objective, self.told, state.geometry)
+        pixels = (objective.precision.expand_as(objective.frames) > 0).sum((1, 2))
+        chi_square = fit_of_frames(objective, state)[1]
+        at_rest = ending.status is not Status.ITERATION_LIMIT
+        error = expected_error(objective, state, self._left_out)
+        return judge(chi_square, pixels, self.contrast, error, self.tolerance, at_rest=at_rest)
+
+    def compare(self, objective: MyopicObjective, now: Ending, rival: Ending | None) -> Comparison:
+        """The present ending beside the best of the earlier ones, if there is one."""
+        after = self.verdict(objective, now)
+        if rival is None:
+            return Comparison(now, after, alike=False)
+        before = self.verdict(objective, rival)
+        best, verdict = (rival, before) if before.excess < after.excess else (now, after)
+        scale = max(verdict.excess, verdict.limit - 1)
+        return Comparison(best, verdict, abs(before.excess - after.excess) < self.alike * scale)
+
+    @cached_property
+    def _left_out(self) -> LeftOut:
+        return LeftOut.of(self.told, self.n_modes, self.traits.r0, self.traits.outer_scale)

@@ -1,0 +1,34 @@
+"""The samples of a mask that has been turned and shrunk, and what leads back from them."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchmask.restoration.pupil import OpenSamples, SampledPupil
+
+
+def moved_centers(centers: Tensor, step: Tensor) -> Tensor:
+    """Centres (N, 2) turned from x to y by step[0] [rad] and divided by exp(step[1]); differentiable in both."""
+    turn, scale = step[0], (-step[1]).exp()
+    cosine, sine = scale * turn.cos(), scale * turn.sin()
+    x, y = centers.to(step).unbind(-1)
+    return torch.stack([cosine * x - sine * y, sine * x + cosine * y], -1)
+
+
+class PlacedSamples:
+    """The open samples of a pupil whose sub-apertures have been turned and shrunk about the origin by `step` (2,).
+
+    samples : OpenSamples, detached
+    """
+
+    def __init__(self, pupil: SampledPupil, step: Tensor) -> None:
+        self._step: Tensor = step.detach().clone().requires_grad_()
+        with torch.enable_grad():
+            self._moved = pupil.samples_at(moved_centers(pupil.aperture.centers.detach(), self._step))
+        self.samples: OpenSamples = OpenSamples(*(values.detach() for values in self._moved))
+
+    def pull_back(self, weights: Tensor, basis: Tensor) -> Tensor:
+        """The gradient (2,) in the step, from those in the samples' weights (P,) and basis (P, K)."""
+        (slope,) = torch.autograd.grad((self._moved.weights, self._moved.basis), self._step, (weights, basis))
+        return slope
