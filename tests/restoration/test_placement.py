@@ -82,7 +82,8 @@ def test_slope_of_the_moved_samples(three_holes):
 def test_steps_add_up_to_a_geometry(turn, shrinkage, more_turn, more_shrinkage):
     """Two steps one after the other are that of their sums, and what `MaskGeometry` makes of it."""
     centers = torch.tensor([[0.4, 0.1], [-0.2, 0.3], [0.0, -0.5]], dtype=torch.float64)
-    one, two = torch.tensor([turn, shrinkage]).double(), torch.tensor([more_turn, more_shrinkage]).double()
+    one = torch.tensor([turn, shrinkage], dtype=torch.float64)
+    two = torch.tensor([more_turn, more_shrinkage], dtype=torch.float64)
     together = moved_centers(centers, one + two)
     assert torch.allclose(moved_centers(moved_centers(centers, one), two), together, atol=1e-14)
     factor = math.exp(-shrinkage - more_shrinkage)
