@@ -10,7 +10,7 @@ from torchmask.restoration.calibration import fit_of_frames
 from torchmask.restoration.checkpoint import Ending, Status
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.frames import FrameStack
-from torchmask.restoration.model_error import LeftOut, expected_error
+from torchmask.restoration.model_error import NO_MODEL_ERROR, LeftOut, expected_error
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.placement import placed_as
 from torchmask.restoration.schedule import Schedule
@@ -45,7 +45,8 @@ class Judge:
         pixels = (objective.precision.expand_as(objective.frames) > 0).sum((1, 2))
         chi_square = fit_of_frames(objective, state)[1]
         at_rest = ending.status is not Status.ITERATION_LIMIT
-        error = expected_error(objective, state, self._left_out)
+        # A full pupil has so many modes that its poor minima, and not what is left out, decide: `tolerance` knows.
+        error = NO_MODEL_ERROR if self.traits.many_minima else expected_error(objective, state, self._left_out)
         return judge(chi_square, pixels, self.contrast, error, self.tolerance, at_rest=at_rest)
 
     def compare(self, objective: MyopicObjective, now: Ending, rival: Ending | None) -> Comparison:
