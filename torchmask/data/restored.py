@@ -87,8 +87,8 @@ def save_restored(
     }
     if (verdict := result.verdict) is not None:
         cards |= {
-            "VERDICT": (verdict.finding.value, "whether the frames are explained"),
-            "EXPLAIND": (verdict.explained, "the same"),
+            "VERDICT": (verdict.finding.value, "of the fit"),  # the longest fills its card
+            "EXPLAIND": (verdict.explained, "whether the frames are explained"),
             "CHISQDOF": (verdict.degrees_of_freedom, "degrees of freedom"),
             "CHISQRED": (verdict.chi_square, "chi-square over degrees of freedom"),
             "CHISQMOD": (verdict.model_error, "that modes left out are expected to add"),

@@ -67,17 +67,13 @@ class Verdict:
         return self.chi_square - 1
 
     def __str__(self) -> str:
-        passes = f"{self.limit:.4g} passes"
-        if self.model_error:
-            left_out = f"modes left out ({self.phase_error:.2g} rad rms)"
-            passes = f"{left_out} are expected to add {self.model_error:.2g} to 1, and {passes}"
-        parts = [
-            f"{self.finding.value}: chi-square {self.chi_square:.4g} of {self.degrees_of_freedom} degrees of freedom",
-            passes,
-        ]
-        if self.frames:
-            parts.append(f"{_listed(self.frames, self.n_frames)} not explained")
-        return "; ".join([*parts, *([f"check {self.check}"] if self.check else [])])
+        allowed = f"up to {self.limit:.4g} counts as explained"
+        if self.phase_error:
+            allowed += f", since modes left out ({self.phase_error:.2g} rad rms) add about {self.model_error:.2g}"
+        numbers = f"chi-square is {self.chi_square:.4g} over {self.degrees_of_freedom} degrees of freedom; {allowed}"
+        parts = [f"{_listed(self.frames, self.n_frames)} explained"] if self.frames else []
+        parts += [f"check {self.check}"] if self.check else []
+        return f"{self.finding.value}: {'; '.join([*parts, numbers])}"
 
     def to_json(self) -> dict[str, Any]:
         """The same as plain values, with what `str` says as "text"."""
@@ -138,18 +134,19 @@ def _what_to_check(finding: Finding, n_lost: int, n_frames: int, at_rest: bool) 
     few = 0 < n_lost <= n_frames / 2
     if finding is Finding.EXPLAINED:
         return "those frames for clouds and tracking errors" if n_lost else ""
-    if not at_rest:
-        return "again after more iterations: this search was stopped before it came to rest"
-    if few:
+    if few and at_rest:
         return "those frames for clouds and tracking errors, or leave them out"
-    return (
+    setting = (
         "the mask (which one, how it lies), wavelength and pixel scale, gain and read-out noise, and that all frames "
         "show one object"
+    )
+    return (
+        setting if at_rest else f"again after more iterations, since this search was stopped early, and then {setting}"
     )
 
 
 def _listed(frames: tuple[int, ...], n_frames: int) -> str:
     if len(frames) == n_frames:
-        return "all frames are" if n_frames > 1 else "the frame is"
+        return "no frame is"
     names = ", ".join(map(str, frames))
-    return f"frames {names} are" if len(frames) > 1 else f"frame {names} is"
+    return f"frames {names} are not" if len(frames) > 1 else f"frame {names} is not"
