@@ -19,19 +19,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from mask_vs_full_report import INSTRUMENTS
-from observing import (
-    DIAMETER,
-    SIZE,
-    WAVELENGTH,
-    ObservingOptions,
-    check,
-    curves,
-    observe,
-    scores,
-    setting_of,
-    smoke,
-    table,
-)
+from observing import DIAMETER, SIZE, WAVELENGTH, ObservingOptions, check, curves, observe, page, scores, smoke
 
 from torchmask.atmosphere.layers import Layers
 from torchmask.cli.program import run_script
@@ -162,9 +150,8 @@ def run(options: Options) -> None:
         cells = summarise(rows)
         found = findings(cells)
         columns = {"share": "share in height", "field": "field / theta0", "ratio": "score / isoplanatic"}
-        lines = ["# Anisoplanatism", "", setting_of(options), "", *(f"- {line}" for line in found), ""]
-        lines += table(cells, columns)
-        output.report("anisoplanatism", {"cells": cells, "rows": rows}, "\n".join(lines) + "\n", figure(cells, options))
+        text = page(options, "Anisoplanatism", found, cells, columns)
+        output.report("anisoplanatism", {"cells": cells, "rows": rows}, text, figure(cells, options))
         output.summary.extend(found)
 
 

@@ -14,20 +14,15 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from mask_vs_full_report import INSTRUMENTS
-from observing import ObservingOptions, check, curves, observe, optimum, scores, setting_of, smoke, table
+from observing import ObservingOptions, check, observe, page, smoke
+from trade import Trade, figure
 
 from torchmask.cli.program import run_script
 from torchmask.cli.run import new_run
-from torchmask.viz.style import FAINT, new_figure, styled
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,47 +42,6 @@ def kept_contrast(width: float, d_over_r0: float) -> float:
     return float(np.exp(-((a[:, None] - a) ** 2) * 6.88 * d_over_r0 ** (5 / 3) / 2).mean())
 
 
-def summarise(rows: Sequence[Mapping[str, Any]], d_over_r0: float) -> list[dict[str, Any]]:
-    """One cell for each instrument and width."""
-    keys = dict.fromkeys((row["instrument"], row["band"]) for row in rows)
-    return [
-        {"instrument": which, "band": band, "kept": kept_contrast(band, d_over_r0)}
-        | scores([row for row in rows if (row["instrument"], row["band"]) == (which, band)])
-        for which, band in keys
-    ]
-
-
-def findings(cells: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The optimum of each instrument."""
-    lines = []
-    for which, name in INSTRUMENTS.items():
-        own = [cell for cell in cells if cell["instrument"] == which]
-        if own:
-            best = min(own, key=lambda cell: cell["score"])
-            lines.append(
-                f"The {name} is best at width/wavelength = {optimum(own, 'band')}, with a score of "
-                f"{best['score']:.3f}; the baseline D keeps {best['kept']:.3f} of V^2 there."
-            )
-    return lines
-
-
-@styled
-def figure(cells: Sequence[Mapping[str, Any]]) -> Figure:
-    """Score against width, and what the longest baseline keeps of its contrast."""
-    sheet = new_figure(5.4, 3.6)
-    ax = sheet.subplots()
-    curves(ax, cells, "band")
-    ax.set(xscale="log", xlabel="width / wavelength", ylabel="score (0 is perfect)")
-    ticks = sorted({cell["band"] for cell in cells})
-    ax.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
-    ax.minorticks_off()
-    beside = ax.twinx()
-    beside.plot(ticks, [next(c["kept"] for c in cells if c["band"] == tick) for tick in ticks], "--", color=FAINT)
-    beside.set(ylim=(0, 1.02), ylabel="V$^2$ kept on the baseline D (dashed)")
-    sheet.legend(*ax.get_legend_handles_labels(), loc="outside upper left", ncols=2)
-    return sheet
-
-
 def run(options: Options) -> None:
     """Simulate, restore and compare in a new folder."""
     if options.smoke:
@@ -104,12 +58,24 @@ def run(options: Options) -> None:
             for width in options.widths
         ]
         rows = observe(options, "band", settings, output.callback)
-        cells = summarise(rows, options.d_over_r0)
-        found = findings(cells)
-        columns = {"band": "width / wavelength", "kept": "V^2 kept on the baseline D"}
-        lines = ["# Width of the band", "", setting_of(options), "The light is that in a tenth of the wavelength.", ""]
-        lines += [*(f"- {line}" for line in found), "", *table(cells, columns)]
-        output.report("band", {"cells": cells, "rows": rows}, "\n".join(lines) + "\n", figure(cells))
+        trade = Trade(
+            key="band",
+            name="width/wavelength",
+            label="width / wavelength",
+            kept=lambda width: kept_contrast(width, options.d_over_r0),
+            where="on the baseline D",
+        )
+        cells = trade.summarise(rows)
+        found = trade.findings(cells)
+        text = page(
+            options,
+            "Width of the band",
+            found,
+            cells,
+            trade.columns,
+            note="The light is that in a tenth of the wavelength.",
+        )
+        output.report("band", {"cells": cells, "rows": rows}, text, figure(trade, cells))
         output.summary.extend(found)
 
 

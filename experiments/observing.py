@@ -192,6 +192,20 @@ def table(cells: Sequence[Mapping[str, Any]], columns: Mapping[str, str]) -> lis
     return lines
 
 
+def page(
+    options: ObservingOptions,
+    title: str,
+    found: Sequence[str],
+    cells: Sequence[Mapping[str, Any]],
+    columns: Mapping[str, str],
+    note: str = "",
+) -> str:
+    """A page of Markdown: what all rows share, what was found, and the table."""
+    lines = [f"# {title}", "", setting_of(options), *([note] if note else []), ""]
+    lines += [*(f"- {line}" for line in found), "", *table(cells, columns)]
+    return "\n".join(lines) + "\n"
+
+
 def curves(ax: Axes, cells: Sequence[Mapping[str, Any]], key: str, value: str = "score") -> None:
     """One line with error bars for each instrument."""
     ends = ("low", "high") if value == "score" else (f"{value}_low", f"{value}_high")

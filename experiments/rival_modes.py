@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mask_vs_full_report import INSTRUMENTS
-from observing import ObservingOptions, check, curves, observe, optimum, scores, setting_of, smoke, table
+from observing import ObservingOptions, check, curves, observe, optimum, page, scores, smoke
 
 from torchmask.cli.program import run_script
 from torchmask.cli.run import new_run
@@ -104,9 +104,8 @@ def run(options: Options) -> None:
             rows += observe(alone, "rival_modes", [{"modes": modes} for modes in allowed], output.callback)
         cells = summarise(rows)
         found = findings(cells)
-        lines = ["# Modes of the rival under the published method", "", setting_of(options), ""]
-        lines += [*(f"- {line}" for line in found), "", *table(cells, {"modes": "modes"})]
-        output.report("rival_modes", {"cells": cells, "rows": rows}, "\n".join(lines) + "\n", figure(cells))
+        text = page(options, "Modes of the rival under the published method", found, cells, {"modes": "modes"})
+        output.report("rival_modes", {"cells": cells, "rows": rows}, text, figure(cells))
         output.summary.extend(found)
 
 

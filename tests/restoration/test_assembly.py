@@ -77,13 +77,13 @@ def test_deviations_are_of_what_is_free(ended):
     objective, stack, progress = ended
     result = assemble_result(objective, stack, progress, r0=None)
     assert result.object_std is None
-    whole = add_deviations(result, objective, stack, progress, 0.4, 2)
+    whole = add_deviations(result, objective, stack, progress, 2)
     assert whole.object_std.shape == (32, 32)
     assert whole.coefficients_std.shape == (5, 3)
     assert float(whole.object_std.mean()) > 0
-    of_object = add_deviations(result, objective.with_changes(free=Free.OBJECT), stack, progress, 0.4, 2)
+    of_object = add_deviations(result, objective.with_changes(free=Free.OBJECT), stack, progress, 2)
     assert float(of_object.coefficients_std.abs().max()) == 0
     brighter = replace(stack, unit=2 * UNIT, variance=4 * stack.variance)
-    twice = add_deviations(result, objective.with_changes(free=Free.OBJECT), brighter, progress, 0.4, 2)
+    twice = add_deviations(result, objective.with_changes(free=Free.OBJECT), brighter, progress, 2)
     assert stack.photon_share == 1  # of both
     torch.testing.assert_close(twice.object_std, 2 * of_object.object_std)

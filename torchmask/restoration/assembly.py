@@ -61,9 +61,8 @@ def assemble_result(
 
 def _geometry_deviations(objective: MyopicObjective, state: State) -> Tensor:
     """Standard deviations (2,) of rotation [rad] and magnification."""
-    cutoff = min(0.5, objective.model.window.grid.cutoff(objective.model.pupil.aperture.extent))
     scale = torch.tensor([1.0, state.geometry.magnification], dtype=torch.float64, device="cpu")
-    return scale * place_deviations(objective, state, cutoff).cpu()
+    return scale * place_deviations(objective, state, objective.model.cutoff).cpu()
 
 
 def add_deviations(
@@ -71,12 +70,11 @@ def add_deviations(
     objective: MyopicObjective,
     stack: FrameStack,
     progress: Progress,
-    cutoff: float,
     n_samples: int,
 ) -> RestorationResult:
-    """The result with standard deviations of the object below `cutoff` [cycles/pixel] and of the coefficients."""
+    """The result with standard deviations of the object up to the cut-off and of the coefficients."""
     model = objective.model
-    image, z = standard_deviations(objective, progress.state, cutoff, stack.photon_share, n_samples)
+    image, z = standard_deviations(objective, progress.state, model.cutoff, stack.photon_share, n_samples)
     spread = torch.stack([model.aberrations.coefficients(sample) for sample in z]).square().mean((0, 1)).sqrt()
     return replace(result, object_std=model.window.crop(image) * stack.unit, coefficients_std=spread)
 

@@ -153,6 +153,11 @@ class ExposureModel(nn.Module):
         twin.pupil.aberrations = self.aberrations
         return twin
 
+    @property
+    def cutoff(self) -> float:
+        """Highest frequency that the frames can tell of an object [cycles/pixel]."""
+        return min(0.5, self.window.grid.cutoff(self.pupil.aperture.extent))
+
     def beside(self, background: Background) -> ExposureModel:
         """The same model, arrays and all, of frames that may hold such a background."""
         twin = copy.copy(self)

@@ -253,11 +253,11 @@ class MyopicDeconvolution:
             If noise, border or fringes of the frames do not fit `readout_noise`, the field or the mask's orientation.
         """
         started = time.perf_counter()
+        if n_samples < 0 or n_samples == 1:
+            raise ValueError(f"n_samples is {n_samples}: 0 for no standard deviations, or at least 2")
         keep_freed_memory()
         stack = self._stack(frames, valid, errors)
         warn_of_orientation(stack.frames, self.recipe.aperture, self.recipe.grid)
-        if n_samples < 0 or n_samples == 1:
-            raise ValueError(f"n_samples is {n_samples}: 0 for no standard deviations, or at least 2")
         (known := Known(coefficients, covariance, known_object)).check()
         model = (self.model if covariance is None else self.recipe.estimated_model(covariance)).beside(stack.free)
         stack = stack.to(model.dtype, model.device)
@@ -265,14 +265,13 @@ class MyopicDeconvolution:
             objective = MyopicObjective(
                 model, stack.frames, stack.precision, self.prior, free=known.free, parallel=parallel
             )
-            traits = self._traits(known, seed)
-            solver = Solver(objective, stack, traits, self.schedule, self.minimizer, callback)
+            solver = Solver(objective, stack, self._traits(known, seed), self.schedule, self.minimizer, callback)
             check_prior(self.prior, model.window.embed(stack.frames.mean(0).clamp(min=0)).double())
             progress = solver.solve(known, start, self._checkpoint(checkpoint, solver, known))
             verdict = solver.verdict(progress.ending)
             result = assemble_result(solver.objective, stack, progress, solver.prior_r0, verdict)
             if n_samples:
-                result = add_deviations(result, solver.objective, stack, progress, self.recipe.cutoff, n_samples)
+                result = add_deviations(result, solver.objective, stack, progress, n_samples)
         return replace(result, seconds=time.perf_counter() - started)
 
     def _stack(self, frames: Array, valid: Array | None, errors: Array | None) -> FrameStack:
@@ -280,9 +279,10 @@ class MyopicDeconvolution:
         return FrameStack.of(frames, valid, grid, aperture, self.readout_noise, self.background, errors)
 
     def _checkpoint(self, path: str | Path | None, solver: Solver, known: Known) -> Checkpoint | None:
+        if path is None:
+            return None
         settings = (replace(solver.traits, max_iterations=0, tolerance=0.0), self.minimizer, self.schedule)
-        fingerprint = fingerprint_of(solver.objective, settings, known.tensors)
-        return None if path is None else Checkpoint(Path(path), fingerprint)
+        return Checkpoint(Path(path), fingerprint_of(solver.objective, settings, known.tensors))
 
     def _traits(self, known: Known, seed: int) -> Traits:
         blind = known.nothing and self.recipe.whitened

@@ -60,11 +60,6 @@ class ModelRecipe:
         return max(self.frame_modes, self.static_modes)
 
     @property
-    def cutoff(self) -> float:
-        """Highest frequency that the frames can tell of an object [cycles/pixel]."""
-        return min(0.5, self.grid.cutoff(self.aperture.extent))
-
-    @property
     def bluest_grid(self) -> Grid:
         """That of the shortest wavelength, whose cut-off is the highest."""
         return replace(self.grid, wavelength=self.band.shortest)
