@@ -8,6 +8,7 @@ import torch
 
 import torchmask
 from torchmask.design.drawing import save_dxf
+from torchmask.optics.passband import Passband
 
 HEAVY = (
     "kornia",
@@ -26,6 +27,7 @@ HEAVY = (
     "ray",
     "yaml",
     "sphinx",
+    "speclite",
 )
 
 
@@ -58,6 +60,7 @@ print(0 < float(criterion.relative(mask)) < 1)
         ("trimesh", "data", lambda: torchmask.make_scene((32, 32), 1e4)),
         ("skimage", "data", lambda: torchmask.shift_and_add(torch.rand(2, 8, 8))),
         ("astropy", "data", lambda: torchmask.read_observation("cube.fits", torchmask.FullAperture(1.0))),
+        ("speclite", "filters", lambda: Passband.find("bessell-V")),
         ("ezdxf", "design", lambda: save_dxf("mask.dxf", torchmask.SparseAperture([[0.0, 0.0]], 0.1, 1.0))),
     ],
 )

@@ -108,3 +108,29 @@ def test_the_wavelength_is_the_masks_unless_another_is_given(tmp_path, capsys):
         said = f"--wavelength is missing: give it in m, such as 550e-9. --mask {mask_without} holds none"
         assert said in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
+
+
+def test_a_filter_gives_the_band_and_without_a_wavelength_its_mean(tmp_path):
+    curve = tmp_path / "filter.txt"
+    curve.write_text("# even\n5e-7 1\n6e-7, 1\n")
+    golay = MASK[:-2]
+    conditions = ["--conditions.filter", str(curve), "--conditions.n-wavelengths", "2"]
+    assert main([*golay, *SMALL, *conditions, "--out", str(tmp_path / "by_filter")]) == 0
+    stack = Observation.load(tmp_path / "by_filter/stack.npz")
+    even = ["--conditions.band-width", "1e-7", "--conditions.n-wavelengths", "2"]
+    assert main([*MASK, *SMALL, *even, "--out", str(tmp_path / "by_width")]) == 0
+    assert stack.grid.wavelength == pytest.approx(550e-9, rel=1e-12)
+    torch.testing.assert_close(stack.frames, Observation.load(tmp_path / "by_width/stack.npz").frames)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--conditions.filter", "bessell-Q"], "of bessell they are bessell-U"),
+        (["--conditions.filter", "bessell-V", "--conditions.band-width", "1e-8"], "two bands: give one"),
+        (["--conditions.filter", "twomass-Ks"], "and not the wavelength 5.5e-07 m"),
+    ],
+)
+def test_filters_that_are_none_or_elsewhere_are_refused(options, said, tmp_path, capsys):
+    assert main([*MASK, *SMALL, *options, "--out", str(tmp_path / "run")]) == 1
+    assert said in capsys.readouterr().err

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 import torch
 
+from torchmask.cli.options import BandOptions
 from torchmask.cli.stacks import StackOptions, group_files, read_stack
 from torchmask.design.manufacture import save_json
 from torchmask.grid import Grid
 from torchmask.observation import Observation
 from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.band import Band
 
 FILES = [Path("a/cube.fits"), Path("b/cube.fits"), Path("b/other.npz"), Path("c/cube.fits")]
 
@@ -99,3 +101,15 @@ def test_an_unknown_filter_lists_the_known_ones(write_fits, fits_cube):
 def test_errors_that_cannot_be_are_refused(write_fits, fits_cube, errors, message):
     with pytest.raises(ValueError, match=message):
         read_stack([write_fits("a.fits", fits_cube, extensions=[("ERR", errors)])], StackOptions(**FULL))
+
+
+def test_a_filter_of_restore_is_its_band_at_the_observation():
+    band = Band.from_filter("bessell-V", 3)
+    found = BandOptions(filter="bessell-V", n_wavelengths=3).band(550e-9)
+    assert found == {"wavelengths": band.wavelengths, "weights": band.shares}
+    assert BandOptions(wavelengths=(5e-7,), weights=(1.0,)).band(550e-9) == {"wavelengths": (5e-7,), "weights": (1.0,)}
+    assert BandOptions().band(550e-9) == {"wavelengths": None, "weights": None}
+    with pytest.raises(ValueError, match="two bands"):
+        BandOptions(filter="bessell-V", wavelengths=(5e-7,)).band(550e-9)
+    with pytest.raises(ValueError, match=r"not the wavelength 2\.2e-06 m"):
+        BandOptions(filter="bessell-V").band(2.2e-6)

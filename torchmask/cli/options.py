@@ -12,7 +12,9 @@ import tyro
 from torchmask.design.manufacture import load_mask, mask_wavelength
 from torchmask.grid import ARCSEC
 from torchmask.optics.aperture import Aperture, FullAperture, SparseAperture
+from torchmask.optics.band import Band
 from torchmask.optics.overlaps import check_overlaps
+from torchmask.optics.passband import Passband
 from torchmask.record import Callback
 
 FULL = "full"  # what stands for a full pupil among the names of masks
@@ -91,6 +93,48 @@ def pixel_angle(arcsec: float | None) -> float | None:
     if not (math.isfinite(arcsec) and arcsec > 0):
         raise ValueError(f"--pixel-scale-arcsec is {arcsec:g}: it must be finite and positive, in arcsec")
     return arcsec * ARCSEC
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilterOptions:
+    """A broad band by its filter."""
+
+    filter: str | None = None
+    """Its name (bessell-V, twomass-Ks, ...), or a text file of two columns: wavelength [m] and transmission."""
+    n_wavelengths: int = 5
+    """That stand for the band: 3 are enough for a width of 5 percent of the wavelength, 5 for 15."""
+
+    def filter_band(self, wavelength: float) -> Band | None:
+        """What stands for the filter, None without one. Raises ValueError if it does not pass `wavelength` [m]."""
+        if self.filter is None:
+            return None
+        passband = Passband.find(self.filter)
+        first, last = passband.wavelengths[0], passband.wavelengths[-1]
+        if not first < wavelength < last:
+            raise ValueError(
+                f"filter {self.filter} passes {first:.4g} to {last:.4g} m, and not the wavelength {wavelength:.4g} m, "
+                f"at which r0 is quoted: give one in between, such as its mean, {passband.mean_wavelength:.4g} m"
+            )
+        return Band.from_filter(passband, self.n_wavelengths)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BandOptions(FilterOptions):
+    """A broad band, by its filter or as it is."""
+
+    wavelengths: tuple[float, ...] = ()
+    """A broad band as a few wavelengths, in place of a filter [m]; none: the filter, or --wavelength alone."""
+    weights: tuple[float, ...] = ()
+    """Share of the light of each of them, any positive numbers; none: equal."""
+
+    def band(self, wavelength: float) -> dict[str, Any]:
+        """The band as `MyopicDeconvolution` takes it. Raises ValueError for two bands, and for a filter elsewhere."""
+        band = self.filter_band(wavelength)
+        if band is None:
+            return {"wavelengths": self.wavelengths or None, "weights": self.weights or None}
+        if self.wavelengths or self.weights:
+            raise ValueError("--filter and --wavelengths are two bands: give one")
+        return {"wavelengths": band.wavelengths, "weights": band.shares}
 
 
 @dataclass(frozen=True)

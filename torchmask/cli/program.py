@@ -31,7 +31,7 @@ NOT_EXPLAINED = 3  # exit status
 _EXTRAS = (
     *("tyro", "rich", "yaml", "tensorboard", "matplotlib"),
     *("astropy", "imageio", "skimage", "kornia", "trimesh"),
-    *("cma", "joblib", "ezdxf"),
+    *("cma", "joblib", "ezdxf", "speclite"),
 )
 
 

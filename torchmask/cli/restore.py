@@ -15,7 +15,7 @@ from torchmask import __version__
 from torchmask.cli.calibrate import pixel_response, read_star, write_calibration
 from torchmask.cli.config import stored
 from torchmask.cli.oifits import OIFITSOptions, measure_frames, write_frames
-from torchmask.cli.options import RunOptions, WorkerOptions
+from torchmask.cli.options import BandOptions, RunOptions, WorkerOptions
 from torchmask.cli.program import NOT_EXPLAINED
 from torchmask.cli.report import restored_figure
 from torchmask.cli.run import CHECKPOINT, new_run
@@ -39,7 +39,7 @@ SKIES = {"if-seen": Background.IF_SEEN, "per-frame": Background.PER_FRAME, "none
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(StackOptions, OIFITSOptions, WorkerOptions, RunOptions):
+class Options(BandOptions, StackOptions, OIFITSOptions, WorkerOptions, RunOptions):
     """Restore the image behind a stack of short exposures with unknown aberrations (myopic deconvolution).
 
     A stack is an .npz file (`torchmask simulate` writes such) or a FITS cube; several are restored side by side, each
@@ -59,10 +59,6 @@ class Options(StackOptions, OIFITSOptions, WorkerOptions, RunOptions):
     """Of the turbulence [m]; None: as a simulated stack says, or else 20 mask diameters."""
     n_modes: int | None = None
     """Zernike modes per hole, Noll 1 (piston) to this; None: 6, or 231 for a full pupil."""
-    wavelengths: tuple[float, ...] = ()
-    """A broad band as a few wavelengths [m]; none: --wavelength alone."""
-    weights: tuple[float, ...] = ()
-    """Share of the light of each of them, any positive numbers; none: equal."""
     static_modes: int = 0
     """Zernike modes per hole of aberrations that all frames share, such as those of the telescope."""
     sky: float | Literal["if-seen", "per-frame", "none"] = "if-seen"
@@ -209,8 +205,7 @@ def deconvolution(observation: Observation, options: Options) -> MyopicDeconvolu
         outer_scale=observation.outer_scale if options.outer_scale is None else options.outer_scale,
         readout_noise=observation.readout_noise,
         background=SKIES[options.sky] if isinstance(options.sky, str) else options.sky,
-        wavelengths=options.wavelengths or None,
-        weights=options.weights or None,
+        **options.band(observation.grid.wavelength),
         static_modes=options.static_modes,
         pixel=pixel_response(options.pixel_fill),
         refine_geometry=REFINEMENTS[options.refine_geometry],

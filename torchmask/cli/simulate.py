@@ -11,6 +11,7 @@ from torchmask.atmosphere.layers import Layers
 from torchmask.atmosphere.phase import LayeredPhase, TurbulencePhase
 from torchmask.atmosphere.profiles import named_layers
 from torchmask.cli.options import (
+    FilterOptions,
     MaskOptions,
     RunOptions,
     load_aperture,
@@ -25,6 +26,7 @@ from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.band import Band
 from torchmask.optics.detector import Detector
 from torchmask.optics.geometry import MaskGeometry
+from torchmask.optics.passband import Passband
 from torchmask.optics.pixel import SquarePixel
 from torchmask.optics.pupil import Aperture
 from torchmask.simulation.conditions import Conditions
@@ -68,8 +70,8 @@ class TurbulenceOptions:
         return LayeredPhase(layers, wavelength, outer_scale, self.frame_interval)
 
 
-@dataclass(frozen=True)
-class ConditionOptions:
+@dataclass(frozen=True, kw_only=True)
+class ConditionOptions(FilterOptions):
     """What else the frames show."""
 
     sky: float = 0.0
@@ -77,9 +79,7 @@ class ConditionOptions:
     transparency_scatter: float = 0.0
     """Of clouds: standard deviation of the logarithm of each frame's transmission."""
     band_width: float = 0.0
-    """Of a filter of even transmission around the wavelength [m]; 0: one wavelength."""
-    n_wavelengths: int = 5
-    """That stand for the band: 3 are enough for 5 percent of the wavelength, 5 for 15."""
+    """Of a band of even transmission around the wavelength, in place of a filter [m]; 0: one wavelength."""
     pixel_fill_factor: float = 0.0
     """Sensitive part of the area of a square pixel, at most 1; 0: pixels are points."""
 
@@ -89,11 +89,14 @@ class ConditionOptions:
             raise ValueError(
                 f"--conditions.band-width is {self.band_width}: it must be at least 0 m and below twice the wavelength"
             )
+        if self.band_width and self.filter is not None:
+            raise ValueError("--conditions.band-width and --conditions.filter are two bands: give one")
+        even = Band.top_hat(wavelength, self.band_width, self.n_wavelengths) if self.band_width else None
         return Conditions(
             sky=self.sky,
             transparency_scatter=self.transparency_scatter,
             exposure_time=exposure_time,
-            band=Band.top_hat(wavelength, self.band_width, self.n_wavelengths) if self.band_width else None,
+            band=even or self.filter_band(wavelength),
             pixel=SquarePixel(self.pixel_fill_factor) if self.pixel_fill_factor else None,
         )
 
@@ -128,7 +131,7 @@ class Options(MaskOptions, RunOptions):
     scene: SceneOptions = field(default_factory=SceneOptions)
     """The target."""
     wavelength: float | None = None
-    """Of the observation [m]; None: that which the mask was designed for, as its .json file says."""
+    """Of the observation [m]; None: the mean of the filter, or that which the mask was designed for (its .json)."""
     n_pixels: int = 128
     """Of the image, per side."""
     pixel_scale_arcsec: float | None = None
@@ -154,10 +157,12 @@ class Options(MaskOptions, RunOptions):
 
 
 def observing_wavelength(options: Options) -> float:
-    """The wavelength [m] that is given, or else the mask's. Raises ValueError if there is neither."""
+    """The wavelength [m] that is given, or else the filter's or the mask's. Raises ValueError if there is none."""
     if options.wavelength is not None:
         require_wavelength(options.wavelength)
         return options.wavelength
+    if options.conditions.filter is not None:
+        return Passband.find(options.conditions.filter).mean_wavelength
     told = told_wavelength(options)
     if told is None:
         raise ValueError(

@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+
+from torchmask.optics.passband import Passband, check_curve
 
 _MOST_WAVELENGTHS = 32  # of a quadrature: far more than any image needs
 
@@ -71,7 +74,7 @@ class Band:
         [521.132, 578.868]
         """
         nodes, weights = np.asarray(wavelengths, dtype=float), np.asarray(transmission, dtype=float)
-        _check_curve(nodes, weights)
+        check_curve(nodes, weights)
         if not 1 <= n_wavelengths <= _MOST_WAVELENGTHS:
             raise ValueError(f"n_wavelengths is {n_wavelengths}: it must be from 1 to {_MOST_WAVELENGTHS}")
         found, shares = _gauss_quadrature(*_fine_samples(nodes, weights), n_wavelengths)
@@ -86,24 +89,34 @@ class Band:
         >>> len(Band.top_hat(550e-9, 80e-9, 3).wavelengths)
         3
         """
-        return cls.of_curve([wavelength - width / 2, wavelength + width / 2], [1.0, 1.0], n_wavelengths)
+        return cls.from_filter(Passband.top_hat(wavelength, width), n_wavelengths)
+
+    @classmethod
+    def from_filter(cls, name: str | Path | Passband, n_wavelengths: int = 5, temperature: float | None = None) -> Band:
+        """The few wavelengths that stand for a filter; errors as for `Passband.find` and `of_curve`.
+
+        Parameters
+        ----------
+        name : str, path or Passband
+            A filter's name such as "bessell-V" (extra `filters`), or a text file of wavelengths [m] and transmission.
+        n_wavelengths : int
+        temperature : float, optional
+            Of a black body whose light it is [K], such as 5772 for sunlight; None: as many photons at each wavelength.
+
+        Examples
+        --------
+        >>> band = Band.from_filter("bessell-V", n_wavelengths=3)
+        >>> [round(1e9 * wavelength) for wavelength in band.wavelengths]
+        [511, 565, 637]
+        """
+        passband = name if isinstance(name, Passband) else Passband.find(name)
+        wavelengths, light = passband.light(temperature)
+        return cls.of_curve(wavelengths.tolist(), light.tolist(), n_wavelengths)
 
     @property
     def shortest(self) -> float:
         """The shortest wavelength [m], which samples the image most coarsely."""
         return min(self.wavelengths)
-
-
-def _check_curve(wavelengths: np.ndarray, transmission: np.ndarray) -> None:
-    if wavelengths.ndim != 1 or wavelengths.shape != transmission.shape or len(wavelengths) < 2:
-        raise ValueError(
-            f"the curve has {wavelengths.shape} wavelengths and {transmission.shape} transmissions: as many, and at "
-            "least 2, are needed"
-        )
-    if not (np.isfinite(wavelengths).all() and wavelengths[0] > 0 and (np.diff(wavelengths) > 0).all()):
-        raise ValueError("the curve's wavelengths must be finite, positive and increasing, in m")
-    if not (np.isfinite(transmission).all() and transmission.min() >= 0 and transmission.max() > 0):
-        raise ValueError("the curve's transmission must be finite, nowhere negative and somewhere positive")
 
 
 def _fine_samples(wavelengths: np.ndarray, transmission: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,146 @@
+"""Transmission curves: of a filter by its name, of a file, or even over a width; and how many photons pass through."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy import constants
+
+from torchmask.io import extra
+
+_AB_ZERO = 3631e-26  # W / (m^2 Hz) of AB magnitude 0: Oke & Gunn, Astrophys. J. 266, 713 (1983), as 3631 Jy
+_LIGHT = (1e-8, 1e-2)  # m
+_FILES = (".txt", ".dat", ".csv")
+
+
+@dataclass(frozen=True)
+class Passband:
+    """The transmission at some wavelengths [m]: straight in between, and nothing outside.
+
+    What it includes beside the filter, such as the air or a camera, is up to its source.
+
+    Raises ValueError unless both are as long, at least 2, the wavelengths increase, and the transmission is nowhere
+    negative and somewhere positive.
+
+    Examples
+    --------
+    >>> passband = Passband.top_hat(550e-9, 100e-9)
+    >>> round(passband.ab_photons / 1e9, 2)  # 1e9 photons / (s m^2) of a source of AB magnitude 0
+    9.99
+    """
+
+    wavelengths: tuple[float, ...]
+    transmission: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        check_curve(np.asarray(self.wavelengths, dtype=float), np.asarray(self.transmission, dtype=float))
+
+    @classmethod
+    def top_hat(cls, wavelength: float, width: float) -> Passband:
+        """Even transmission of 1 over `width` [m] around `wavelength` [m]."""
+        return cls((wavelength - width / 2, wavelength + width / 2), (1.0, 1.0))
+
+    @classmethod
+    def find(cls, name: str | Path) -> Passband:
+        """The curve of a filter's name, or of a file.
+
+        Parameters
+        ----------
+        name : str or path
+            A name of speclite, GROUP-BAND such as "bessell-V", "sdss2010-r" or "twomass-Ks" (extra `filters`), or a
+            text file (.txt, .dat, .csv) of two columns: wavelength [m] and transmission.
+
+        Raises
+        ------
+        ValueError
+            For an unknown name (the known ones are listed) and a file that is missing or holds no curve.
+        ModuleNotFoundError
+            For a name, if speclite is not installed.
+        """
+        path = Path(name)
+        return _read_curve(path) if path.suffix.lower() in _FILES else _named_curve(str(name))
+
+    @property
+    def mean_wavelength(self) -> float:
+        """Of light that has as many photons at each wavelength [m]."""
+        x, y = np.array(self.wavelengths), np.array(self.transmission)
+        step, before, after = np.diff(x), y[:-1], y[1:]
+        moment = step * (x[:-1] * (2 * before + after) + x[1:] * (before + 2 * after)) / 6
+        return float(moment.sum() / (step * (before + after) / 2).sum())
+
+    @property
+    def ab_photons(self) -> float:
+        """Photons per second and square metre that pass of a source of AB magnitude 0, whatever its spectrum.
+
+        AB magnitudes compare the photons that pass with those of a source of 3631 Jy at all frequencies, of which
+        3631 Jy / h * integral of transmission / wavelength pass.
+        """
+        x, y = np.array(self.wavelengths), np.array(self.transmission)
+        slope = np.diff(y) / np.diff(x)
+        ratio = np.log(x[1:] / x[:-1])
+        return float(_AB_ZERO / constants.h * (slope * np.diff(x) + (y[:-1] - slope * x[:-1]) * ratio).sum())
+
+    def light(self, temperature: float | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Wavelengths [m] and the photons that pass at each, on any scale, of a black body of `temperature` [K].
+
+        None: as many photons at each wavelength. Raises ValueError for a temperature that is not positive.
+        """
+        x, y = np.array(self.wavelengths), np.array(self.transmission)
+        if temperature is None:
+            return x, y
+        if not (math.isfinite(temperature) and temperature > 0):
+            raise ValueError(f"temperature is {temperature}: it must be finite and positive, in K")
+        fine = np.unique(np.concatenate([x, np.linspace(x[0], x[-1], 400)]))
+        exponent = constants.h * constants.c / (fine * constants.k * temperature)
+        logarithm = -4 * np.log(fine) - np.log(-np.expm1(-exponent)) - exponent  # of Planck's photons
+        return fine, np.interp(fine, x, y) * np.exp(logarithm - logarithm.max())
+
+
+def check_curve(wavelengths: np.ndarray, transmission: np.ndarray) -> None:
+    """Raise ValueError unless these are a transmission curve as `Passband` describes it."""
+    if wavelengths.ndim != 1 or wavelengths.shape != transmission.shape or len(wavelengths) < 2:
+        raise ValueError(
+            f"the curve has {wavelengths.shape} wavelengths and {transmission.shape} transmissions: as many, and at "
+            "least 2, are needed"
+        )
+    if not (np.isfinite(wavelengths).all() and wavelengths[0] > 0 and (np.diff(wavelengths) > 0).all()):
+        raise ValueError("the curve's wavelengths must be finite, positive and increasing, in m")
+    if not (np.isfinite(transmission).all() and transmission.min() >= 0 and transmission.max() > 0):
+        raise ValueError("the curve's transmission must be finite, nowhere negative and somewhere positive")
+
+
+def _read_curve(path: Path) -> Passband:
+    if not path.is_file():
+        raise ValueError(f"there is no file {path} (needed: two columns, wavelength [m] and transmission)")
+    try:
+        lines = path.read_text(encoding="utf-8").replace(",", " ").splitlines()
+        table = np.loadtxt(lines, ndmin=2)
+        if table.shape[1] != 2:
+            raise ValueError(f"it has {table.shape[1]} columns, and 2 are needed")
+        if not _LIGHT[0] <= table[:, 0].min() <= table[:, 0].max() <= _LIGHT[1]:
+            raise ValueError(
+                f"its wavelengths run from {table[:, 0].min():g} to {table[:, 0].max():g}, and they must be in m: "
+                "multiply nm by 1e-9, Angstrom by 1e-10"
+            )
+        return Passband(tuple(table[:, 0].tolist()), tuple(table[:, 1].tolist()))
+    except ValueError as error:
+        raise ValueError(f"{path} holds no transmission curve: {error}") from error
+
+
+def _named_curve(name: str) -> Passband:
+    with extra("filters"):
+        from speclite import filters
+
+    try:
+        curve = filters.load_filter(name)
+    except ValueError as error:
+        group = name.partition("-")[0]
+        if group in filters.filter_group_names:
+            known = f"of {group} they are {', '.join(filters.load_filters(f'{group}-*').names)}"
+        else:
+            known = f"they are GROUP-BAND, such as bessell-V, with the groups {', '.join(filters.filter_group_names)}"
+        raise ValueError(f"there is no filter {name!r}: {known}; or give a file ({', '.join(_FILES)})") from error
+    return Passband(tuple((1e-10 * curve.wavelength).tolist()), tuple(curve.response.tolist()))
