@@ -16,6 +16,8 @@ from torchmask.design.search import SearchResult, search_mask
 from torchmask.design.table import design_table
 from torchmask.design.turbulent import TurbulentMSE
 from torchmask.grid import Grid
+from torchmask.instrument.instrument import Instrument
+from torchmask.instrument.parts import Camera, Site, Source, Telescope
 from torchmask.interferometry.calibration import MaskCalibration, calibrate_mask
 from torchmask.interferometry.fringes import frame_observables
 from torchmask.interferometry.observables import Observables
@@ -47,11 +49,13 @@ __all__ = [
     "OTF",
     "PSF",
     "AsymptoticMSE",
+    "Camera",
     "Conditions",
     "Detector",
     "EdgePreserving",
     "FullAperture",
     "Grid",
+    "Instrument",
     "LayeredPhase",
     "Layers",
     "MaskCalibration",
@@ -65,9 +69,12 @@ __all__ = [
     "RunLogger",
     "SceneOptions",
     "SearchResult",
+    "Site",
+    "Source",
     "SparseAperture",
     "StackDataset",
     "StackRanges",
+    "Telescope",
     "TotalVariation",
     "TurbulencePhase",
     "TurbulentMSE",

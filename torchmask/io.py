@@ -9,17 +9,23 @@ import dataclasses
 import json
 import math
 import os
+import types
+import typing
 import uuid
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Literal, TypeVar, Union
 
 import numpy as np
 import torch
 from torch import Tensor
+
+T = TypeVar("T")
+
+_KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text", Path: "a path"}
 
 
 def as_array(values: Any) -> np.ndarray:
@@ -166,6 +172,72 @@ def to_json(value: Any) -> Any:
     if isinstance(value, Path | torch.dtype | torch.device):
         return str(value)
     raise TypeError(f"{value!r} ({type(value).__name__}) has no place in JSON: give a number, text, list or mapping")
+
+
+def from_json(kind: type[T], values: Any, prefix: str = "", leave_out: Sequence[str] = ()) -> T:
+    """The dataclass `kind` from a mapping, as JSON or YAML hold one; what the mapping lacks has its default.
+
+    Strict, so that a misspelt key cannot be taken for a default. `prefix` begins the keys in messages, and fields in
+    `leave_out` are none.
+
+    Raises ValueError for an unknown or missing key and a value of the wrong kind: the message says which.
+    """
+    if not isinstance(values, dict):
+        raise ValueError(f"{prefix.rstrip('.')} holds {values!r}: names with values are needed")
+    fields = [field for field in dataclasses.fields(typing.cast(Any, kind)) if field.name not in leave_out]
+    known = [field.name for field in fields]
+    for key in values:
+        if key not in known:
+            raise ValueError(f"unknown key {prefix}{key}; known keys are {', '.join(prefix + name for name in known)}")
+    for field in fields:
+        default = (field.default, field.default_factory)
+        if field.name not in values and default == (dataclasses.MISSING, dataclasses.MISSING):
+            raise ValueError(f"{prefix}{field.name} is missing")
+    hints = typing.get_type_hints(kind)
+    return kind(**{key: _convert(hints[key], value, f"{prefix}{key}") for key, value in values.items()})
+
+
+def _convert(hint: Any, value: Any, key: str) -> Any:
+    """`value` as the type `hint`, or ValueError."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if dataclasses.is_dataclass(hint):
+        return from_json(typing.cast(type, hint), value, f"{key}.")
+    if origin in (Union, types.UnionType):
+        if value is None and type(None) in arguments:
+            return None
+        *others, last = (argument for argument in arguments if argument is not type(None))
+        for other in others:
+            with suppress(ValueError):
+                return _convert(other, value, key)
+        return _convert(last, value, key)
+    if origin is Literal:
+        if value not in arguments:
+            raise ValueError(f"{key} is {value!r}: known values are {', '.join(map(str, arguments))}")
+        return value
+    if origin is tuple:
+        return _convert_items(arguments, value, key)
+    if hint is float and isinstance(value, str):
+        try:
+            return float(value)  # YAML takes 550e-9, without a point, for text
+        except ValueError:
+            pass
+    accepted = {float: (int, float), Path: str}.get(hint, hint)
+    if not isinstance(value, accepted) or (isinstance(value, bool) and hint is not bool):
+        raise ValueError(f"{key} is {value!r}: {_KINDS[hint]} is needed")
+    return hint(value)
+
+
+def _convert_items(hints: tuple[Any, ...], values: Any, key: str) -> tuple[Any, ...]:
+    """A list as a tuple of fixed length, or of any length if `hints` ends in an ellipsis."""
+    if not isinstance(values, list):
+        raise ValueError(f"{key} is {values!r}: a list is needed")
+    if hints[-1] is Ellipsis:
+        hints = hints[:1] * len(values)
+    if len(values) != len(hints):
+        raise ValueError(f"{key} has {len(values)} items: {len(hints)} are needed")
+    return tuple(
+        _convert(hint, value, f"{key}[{i}]") for i, (hint, value) in enumerate(zip(hints, values, strict=True))
+    )
 
 
 def write_json(path: str | Path, value: Any, *, replace: bool = False) -> None:

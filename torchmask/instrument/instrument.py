@@ -1,0 +1,264 @@
+"""What a team knows of an observation, and what follows for the frames: photons, sky, pixels, number, noise.
+
+One frozen record, in the units that teams speak, which every command shares and writes.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from torchmask.atmosphere.seeing import Seeing
+from torchmask.grid import ARCSEC, Grid
+from torchmask.instrument.parts import Camera, Site, Source, Telescope, require
+from torchmask.io import extra, from_json, read_json, to_json, write_json
+from torchmask.optics.band import Band
+from torchmask.optics.passband import Passband
+from torchmask.spectra import NoisePSD, PowerLawPSD
+
+_FORMAT = "torchmask instrument, version 1"
+
+# AB - Vega magnitudes: Blanton & Roweis, Astron. J. 133, 734 (2007), table 1.
+VEGA_IN_AB = {
+    "bessell-U": 0.79,
+    "bessell-B": -0.09,
+    "bessell-V": 0.02,
+    "bessell-R": 0.21,
+    "bessell-I": 0.45,
+    "twomass-J": 0.91,
+    "twomass-H": 1.39,
+    "twomass-Ks": 1.85,
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Instrument:
+    """All that a team knows of an observation: from it follow photons, frames and noise for any mask on the telescope.
+
+    Raises ValueError for numbers that cannot be, a band that is given twice or not at all, and a total time that is
+    shorter than one exposure: the message says what is possible.
+
+    Examples
+    --------
+    >>> instrument = Instrument(
+    ...     telescope=Telescope(diameter=1.0, throughput=0.3),
+    ...     source=Source(magnitude=4.0),
+    ...     site=Site(r0=0.1, wind=10.0),
+    ...     filter="bessell-V",
+    ...     exposure=5e-3,
+    ...     observing_time=1.0,
+    ...     camera=Camera(readout_time=5e-3),
+    ... )
+    >>> instrument.frames, round(instrument.photons(area=0.1))  # holes of 0.1 m^2 altogether
+    (100, 33597)
+    """
+
+    telescope: Telescope
+    """What collects the light."""
+    source: Source
+    """The target."""
+    site: Site
+    """The air."""
+    camera: Camera = field(default_factory=Camera)
+    """The detector."""
+    wavelength: float | None = None
+    """Of the observation, at which r0 is quoted [m]; None: the mean of the filter."""
+    filter: str | None = None
+    """Name of the filter (bessell-V, twomass-Ks, ...), or a text file: wavelength [m] and transmission."""
+    width: float | None = None
+    """Of a band of even transmission around the wavelength, in place of a filter [m]."""
+    n_wavelengths: int = 5
+    """That stand for the band."""
+    exposure: float
+    """Of a frame [s]."""
+    observing_time: float | None = None
+    """In which frames are taken one after the other [s]."""
+    n_frames: int | None = None
+    """In place of the observing time: number of frames."""
+
+    def __post_init__(self) -> None:
+        require("wavelength", self.wavelength, ", in m", most=1e-2)
+        require("width", self.width, ", in m")
+        require("exposure", self.exposure, ", in s")
+        require("observing_time", self.observing_time, ", in s")
+        if (self.width is None) == (self.filter is None):
+            raise ValueError("the band is missing or given twice: give a filter, or wavelength and width [m]")
+        if self.wavelength is None and self.filter is None:
+            raise ValueError("wavelength is missing: give it in m, such as 550e-9")
+        if (self.observing_time is None) == (self.n_frames is None):
+            raise ValueError("give observing_time [s] or n_frames, and not both")
+        if self.n_frames is not None and (self.n_frames != int(self.n_frames) or self.n_frames < 1):
+            raise ValueError(f"n_frames is {self.n_frames}: it must be a whole number of at least 1")
+        self._check_time()
+        self._check_band()
+
+    def _check_time(self) -> None:
+        if self.observing_time is not None and self.frames < 1:
+            raise ValueError(
+                f"observing_time is {self.observing_time:g} s, but one frame takes {self._cadence:g} s: observe for at "
+                "least that, or expose for less"
+            )
+
+    def _check_band(self) -> None:
+        first, last = self.passband.wavelengths[0], self.passband.wavelengths[-1]
+        if not first < self.mean_wavelength < last:
+            raise ValueError(
+                f"wavelength is {self.mean_wavelength:.4g} m, and filter {self.filter} passes {first:.4g} to "
+                f"{last:.4g} m: leave the wavelength out, or give one in between"
+            )
+        if self.source.system == "Vega" and self.filter not in VEGA_IN_AB:
+            raise ValueError(
+                f"magnitudes of Vega are known for the filters {', '.join(VEGA_IN_AB)}: give the AB magnitude in "
+                f"{self.filter or 'the band'}"
+            )
+
+    @property
+    def passband(self) -> Passband:
+        """The transmission of the band."""
+        if self.filter is not None:
+            return Passband.find(self.filter)
+        assert self.wavelength is not None
+        assert self.width is not None
+        return Passband.top_hat(self.wavelength, self.width)
+
+    @property
+    def band(self) -> Band:
+        """The few wavelengths that stand for the band, with the source's light at each."""
+        return Band.from_filter(self.passband, self.n_wavelengths, self.source.temperature)
+
+    @property
+    def mean_wavelength(self) -> float:
+        """At which r0 is quoted [m]."""
+        return self.passband.mean_wavelength if self.wavelength is None else self.wavelength
+
+    @property
+    def _cadence(self) -> float:
+        return self.exposure + self.camera.readout_time
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        if self.observing_time is None:
+            assert self.n_frames is not None
+            return self.n_frames
+        return math.floor(self.observing_time / self._cadence * (1 + 1e-9))
+
+    @property
+    def pixel_scale(self) -> float:
+        """Angle on the sky of one pixel [rad]."""
+        if self.camera.pixel_scale is not None:
+            return self.camera.pixel_scale * ARCSEC
+        return Grid.nyquist(self.telescope.diameter, self.band.shortest, 2).pixel_scale
+
+    def grid(self, n_pixels: int | None = None) -> Grid:
+        """The camera's pixels, or a grid of as large ones with `n_pixels` a side, at the wavelength of r0."""
+        return Grid(self.camera.n_pixels if n_pixels is None else n_pixels, self.pixel_scale, self.mean_wavelength)
+
+    @property
+    def seeing(self) -> Seeing:
+        """The turbulence as an exposure sees it."""
+        return Seeing(self.site.r0, self.site.outer_scale, self.exposure, self.site.wind)
+
+    def _rate(self, magnitude: float) -> float:
+        """Electrons per second and square metre of the pupil."""
+        offset = VEGA_IN_AB[self.filter] if self.source.system == "Vega" and self.filter is not None else 0.0
+        return self.telescope.throughput * self.passband.ab_photons * 10 ** (-0.4 * (magnitude + offset))
+
+    def photons(self, area: float) -> float:
+        """Electrons per frame from the target, through an open area of the pupil [m^2]."""
+        require("area", area, ", in m^2")
+        source = self.source
+        if source.magnitude is not None:
+            rate = self._rate(source.magnitude)
+        else:
+            assert source.photon_rate is not None
+            rate = self.telescope.throughput * source.photon_rate
+        return rate * area * self.exposure
+
+    def sky(self, area: float) -> float:
+        """Electrons per pixel and frame from the sky, through an open area of the pupil [m^2]."""
+        require("area", area, ", in m^2")
+        if self.site.sky is None:
+            return 0.0
+        return self._rate(self.site.sky) * area * self.exposure * (self.pixel_scale / ARCSEC) ** 2
+
+    def noise_psd(self, area: float) -> NoisePSD:
+        """Photon noise of the target, and the read-out noise of all pixels of the camera; a sky comes on top."""
+        return NoisePSD(self.photons(area), self.camera.readout_noise, self.camera.n_pixels**2)
+
+    def object_psd(self, area: float) -> PowerLawPSD:
+        """The power spectrum of the target."""
+        knee = 1 / 64 if self.source.size is None else self.pixel_scale / (self.source.size * ARCSEC)
+        return PowerLawPSD(self.source.exponent, self.photons(area), knee)
+
+    def with_exposure(self, exposure: float) -> Instrument:
+        """The same with another exposure [s]; of the observing time, other frames follow."""
+        return replace(self, exposure=exposure)
+
+    def with_width(self, width: float) -> Instrument:
+        """The same with another width of the band [m]; a photon rate grows with it.
+
+        Raises ValueError for a filter, which has the width that it has.
+        """
+        if self.width is None:
+            raise ValueError(f"the band is the filter {self.filter}: give wavelength and width [m] to vary the width")
+        source, rate = self.source, self.source.photon_rate
+        if rate is not None:
+            source = replace(source, photon_rate=rate * width / self.width)
+        return replace(self, source=source, width=width)
+
+    def describe(self, area: float) -> str:
+        """What follows for an open area of the pupil [m^2], as a table (Markdown)."""
+        seeing, telescope = self.seeing, self.telescope
+        rows = [
+            ("quantity", "value"),
+            ("---", "---"),
+            ("wavelength", f"{1e9 * self.mean_wavelength:.4g} nm"),
+            ("collecting area", f"{area:.4g} m^2"),
+            ("photons per frame", f"{self.photons(area):.4g} electrons"),
+            ("sky", f"{self.sky(area):.4g} electrons per pixel and frame"),
+            ("read-out noise of a frame", f"{self.camera.readout_noise * self.camera.n_pixels:.4g} electrons rms"),
+            ("frames", f"{self.frames}"),
+            ("pixel", f"{self.pixel_scale / ARCSEC:.4g} arcsec"),
+            ("D / r0", f"{telescope.diameter / self.site.r0:.4g}"),
+            ("exposure / tau0", f"{self.exposure / seeing.tau0:.4g} (tau0 = {1e3 * seeing.tau0:.4g} ms)"),
+        ]
+        return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+    def save(self, path: str | Path) -> None:
+        """Write a new JSON file that `load` gives back to the last bit. Raises ValueError as `write_json`."""
+        write_json(path, {"format": _FORMAT} | to_json(self))
+
+    @classmethod
+    def load(cls, path: str | Path) -> Instrument:
+        """Read a JSON file that `save` wrote, or a YAML file (.yaml, .yml) with the same keys.
+
+        Raises
+        ------
+        ValueError
+            If the file is missing or damaged, holds an unknown key or lacks one, or numbers that cannot be.
+        """
+        values = _read_yaml(Path(path)) if Path(path).suffix.lower() in (".yaml", ".yml") else read_json(path)
+        try:
+            if isinstance(values, dict):
+                made = values.get("format", _FORMAT)
+                if made != _FORMAT:
+                    raise ValueError(f"it is {made!r}, not {_FORMAT!r}")
+                values = {key: value for key, value in values.items() if key != "format"}
+            return from_json(cls, values, "instrument.")
+        except ValueError as error:
+            raise ValueError(f"{path} is no instrument that can be read: {error}") from error
+
+
+def _read_yaml(path: Path) -> Any:
+    with extra("experiments"):
+        import yaml
+
+    if not path.is_file():
+        raise ValueError(f"there is no file {path} (needed: a JSON or YAML file)")
+    try:
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is no valid YAML: {error}") from error
