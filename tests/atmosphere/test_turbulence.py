@@ -257,9 +257,9 @@ def test_scales_must_be_positive(value):
 
 
 def test_flow_and_counts_are_checked():
-    with pytest.raises(ValueError, match="belong together"):
+    with pytest.raises(ValueError, match="only one of wind and frame_interval"):
         TurbulencePhase(0.1, 20.0, wind=(1.0, 0.0))
-    with pytest.raises(ValueError, match="belong together"):
+    with pytest.raises(ValueError, match="only one of wind and frame_interval"):
         TurbulencePhase(0.1, 20.0, frame_interval=0.01)
     with pytest.raises(ValueError, match=r"wind is \(1.0, nan\)"):
         TurbulencePhase(0.1, 20.0, (1.0, math.nan), 0.01)

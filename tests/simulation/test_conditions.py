@@ -159,5 +159,5 @@ def test_what_is_told_stands_in_the_observation_and_light_takes_the_true_way(tmp
 def test_phases_are_kept_of_snapshots_of_one_wavelength_only():
     windy = TurbulencePhase(0.2, 20.0, (5.0, 0.0), 0.01)
     for conditions in (Conditions(exposure_time=0.01), Conditions(band=Band.of([WAVELENGTH]))):
-        with pytest.raises(ValueError, match="keep_phases is for snapshots"):
+        with pytest.raises(ValueError, match="keep_phases needs monochromatic snapshots"):
             simulate_observation(box(), MASK, GRID, windy, Detector(), 2, conditions=conditions, keep_phases=True)

@@ -1,14 +1,16 @@
-"""Von Karman phase screens without end, of which any window can be looked at, again and again.
+"""Von Karman phase screens of unlimited size, which can be evaluated in any window, in any order.
 
-The spectrum is split by smooth cuts into bands, and each band is white noise filtered by its share of the spectrum. A
-smooth share has a short filter, so a window needs the noise of its own surroundings only; and the noise of any place is
-known, because a counter-based generator (Philox: Salmon et al., Supercomputing 2011) draws every tile of it by seed and
-place alone. Within a tile the window moves by the shift theorem, exactly; from tile to tile the noise further away than
-the filter reaches is exchanged, which changes the phase by some 1e-4 of its rms. The first band has the noise on the
-samples of the window, and holds the frequencies beyond Nyquist, folded; the lower ones have it on coarser rasters.
+Smooth cuts split the spectrum into bands, and each band is white noise filtered by its share of the spectrum. A smooth
+share has a short filter, so a window needs only the noise around it. That noise comes in tiles, which a counter-based
+generator (Philox: Salmon et al., Supercomputing 2011) draws from the seed and the tile's position alone, so the same
+place always has the same noise. Within a tile, the shift theorem moves the window exactly. When the window enters
+another tile, noise beyond the reach of the filter is replaced, which changes the phase by about 1e-4 of its rms. The
+first band has its noise on the samples of the window and includes the aliased frequencies beyond Nyquist; the lower
+bands have theirs on coarser rasters.
 
-The expected structure function is von Karman's to 0.1 % between samples of a window. Between windows it is so when they
-are whole samples apart, right to 1.5 % from one sample on, and too small by less: half a sample away by 13 %.
+Between samples of one window, and between windows that are a whole number of samples apart, the expected structure
+function is von Karman's to 0.1 %. Between other windows it is accurate to 1.5 % at separations of at least one sample
+and too small at shorter ones, by 13 % at half a sample.
 """
 
 from __future__ import annotations
@@ -25,18 +27,19 @@ from torch import Tensor
 from torchmask.atmosphere.random_field import COMPLEX, folded_density
 from torchmask.atmosphere.von_karman import von_karman_psd
 
-_RATIO = 3.0  # of the lower edges of successive bands
-_STEEPNESS = 8  # of the cuts exp(-x^8)
-_NEGLIGIBLE = 1.45  # their x where they end
-_REACH = 4.0  # of a band's filter, over the wavelength of its lower edge: 1.5e-4 of its amplitude lie beyond
+_RATIO = 3.0  # between the lower edges of successive bands
+_STEEPNESS = 8  # exponent of the cuts exp(-x^8)
+_NEGLIGIBLE = 1.45  # the x beyond which a cut counts as zero
+_REACH = 4.0  # reach of a band's filter, in wavelengths of its lower edge; 1.5e-4 of its amplitude lies beyond
 _HOST: dict[str, Any] = {"dtype": torch.float64, "device": "cpu"}
 
 
 @dataclass(frozen=True)
 class NoiseRaster:
-    """White noise as one band uses it: `tiles` x `tiles` tiles of `size` (y, x) samples in steps of `step` (y, x) [m].
+    """Raster of white noise for one band: `tiles` x `tiles` tiles of `size` (y, x) samples, `step` (y, x) [m] apart.
 
-    `lead` (y, x) [m] is the way from the corner of the noise to that of the window when the window is in mid-tile.
+    `lead` (y, x) [m] is the offset of the window's corner from the corner of the noise when the window is centred in
+    its tile.
     """
 
     tiles: int
@@ -46,21 +49,24 @@ class NoiseRaster:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Samples in all, odd: no wave is without its opposite."""
+        """Total number of samples (rows, columns), both odd so that every frequency has its negative."""
         return self.tiles * self.size[0], self.tiles * self.size[1]
 
     @property
     def first(self) -> tuple[int, int]:
-        """The sample (row, column) nearest to `lead`."""
+        """Sample (row, column) nearest to `lead`."""
         return round(self.lead[0] / self.step[0]), round(self.lead[1] / self.step[1])
 
     def frequencies(self) -> tuple[Tensor, Tensor]:
-        """Of rows and of columns from 0 on [cycles/m]."""
+        """Return the frequencies of the rows and the non-negative frequencies of the columns [cycles/m]."""
         (rows, columns), (dy, dx) = self.shape, self.step
         return torch.fft.fftfreq(rows, dy, **_HOST), torch.fft.rfftfreq(columns, dx, **_HOST)
 
     def amplitude(self, density: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-        """Of waves of power `density(fy, fx)` [rad^2 m^2], even in both, over that of the noise's transform."""
+        """Return the factor that gives the transform of unit noise the power `density(fy, fx)` [rad^2 m^2].
+
+        The density must be even in both frequencies. The result has the shape of `torch.fft.rfft2` of the noise.
+        """
         rows, columns = self.frequencies()
         quadrant = density(rows[: len(rows) // 2 + 1], columns)
         n_samples, cell = math.prod(self.shape), math.prod(self.step)
@@ -68,13 +74,13 @@ class NoiseRaster:
         return torch.cat([amplitude, amplitude[1:].flip(0)])
 
     def locate(self, corner: tuple[float, float]) -> tuple[tuple[int, int], tuple[float, float]]:
-        """The tile in which a window at `corner` (y, x) [m] is, and how far from its middle [m]."""
+        """Return the tile that holds a window at `corner` (y, x) [m], and the window's offset from its middle [m]."""
         pitch = [n * s for n, s in zip(self.size, self.step, strict=True)]
         tile = [math.floor(c / p + 0.5) for c, p in zip(corner, pitch, strict=True)]
         return (tile[0], tile[1]), (corner[0] - tile[0] * pitch[0], corner[1] - tile[1] * pitch[1])
 
     def draw(self, seed: int, band: int, tile: tuple[int, int]) -> Tensor:
-        """The noise around `tile`, float32 on the CPU."""
+        """Draw the noise around `tile`, float32 on the CPU."""
         rows = []
         for y in range(tile[0], tile[0] + self.tiles):
             row = []
@@ -87,12 +93,12 @@ class NoiseRaster:
 
 
 class LocalBand(NamedTuple):
-    """A band of the spectrum: its noise and how strong its waves are.
+    """One band of the spectrum: its noise and its filter.
 
-    raster : where the noise is
-    amplitude : (rows, columns // 2 + 1) of the waves of the noise's transform, those of `torch.fft.rfft2`
-    waves : (rows of the window, rows) complex, which carry them to the window's rows; None if the window's samples are
-        those of the noise
+    raster : raster of the noise
+    amplitude : (rows, columns // 2 + 1), the filter, by which `torch.fft.rfft2` of the noise is multiplied
+    waves : (rows of the window, rows) complex, evaluates the transform on the rows of the window; None if the noise
+        lies on the samples of the window
     """
 
     raster: NoiseRaster
@@ -101,18 +107,20 @@ class LocalBand(NamedTuple):
 
 
 class ScreenWindow:
-    """What endless screens of one outer scale, with r0 = 1 m, need to be seen through windows of one shape.
+    """Filters, for r0 = 1 m, that evaluate endless screens of one outer scale in windows of one shape.
 
     Parameters
     ----------
     shape : (rows, columns)
-        Of the window.
+        Number of samples of the window.
     step : (dy, dx)
-        Distance of samples [m].
+        Spacing of the samples [m].
     outer_scale : float
-        [m].
-    dtype, device
-        float32 or float64.
+        Outer scale of the turbulence [m].
+    dtype : torch.dtype
+        Type of the phases, float32 or float64.
+    device : torch.device
+        Device of the phases.
     """
 
     shape: tuple[int, int]
@@ -134,7 +142,7 @@ class ScreenWindow:
         levels = max(1, math.ceil(math.log(1.5 * outer_scale / reach, _RATIO)))  # until a filter spans the outer scale
 
         def below(frequency: Tensor, level: int) -> Tensor:
-            """Share of the spectrum that is left to the bands below band `level`."""
+            """Return the share of the spectrum that belongs to the bands below band `level`."""
             return torch.exp(-((frequency * _RATIO**level / edge) ** _STEEPNESS))
 
         raster = _fine_raster(extent, reach, step)
@@ -155,22 +163,24 @@ class ScreenWindow:
             y, x = (torch.arange(n, **_HOST) * s + lead for n, s, lead in zip(shape, step, raster.lead, strict=True))
             waves = _phasor(y[:, None] * fy).to(device, COMPLEX[dtype])
             self.bands.append(LocalBand(raster, raster.amplitude(density).to(device, dtype), waves))
-            wave = torch.where(fx > 0, 2, 1)[:, None] * _phasor(fx[:, None] * x)  # the opposite waves have no column
+            # The transform stores only fx >= 0, so each fx > 0 counts twice, for -fx too.
+            wave = torch.where(fx > 0, 2, 1)[:, None] * _phasor(fx[:, None] * x)
             columns += [wave.real, -wave.imag]
         self.columns: Tensor = torch.cat(columns).to(device, dtype)
-        """Real and imaginary waves that carry all bands but the first to the window's columns."""
+        """Real and imaginary waves that evaluate all bands but the first on the columns of the window."""
 
 
 class Screen:
-    """One endless screen: its phase is a function of place alone, given `seed`.
+    """One endless screen, whose phase at any place depends only on `seed`.
 
     Parameters
     ----------
     window : ScreenWindow
+        Shape and sampling of the windows in which the screen is evaluated.
     r0 : float
         Fried parameter [m].
     seed : int
-        At least 0 and below 2^64; screens of other seeds are independent.
+        At least 0 and below 2^64. Screens with different seeds are independent.
 
     Examples
     --------
@@ -188,7 +198,7 @@ class Screen:
         self._seen: list[tuple[tuple[int, int], Tensor] | None] = [None] * len(window.bands)
 
     def at(self, corner: tuple[float, float]) -> Tensor:
-        """The phase (rows, columns) [rad] on the samples of the window; the first of them is at `corner` (x, y) [m]."""
+        """Return the phase (rows, columns) [rad] in the window whose first sample is at `corner` (x, y) [m]."""
         fine, smooth = None, []
         for number, band in enumerate(self.window.bands):
             tile, offset = band.raster.locate((corner[1], corner[0]))
@@ -204,7 +214,7 @@ class Screen:
         return self.strength * (fine + torch.cat(smooth, dim=1) @ self.window.columns)
 
     def _waves(self, number: int, tile: tuple[int, int]) -> Tensor:
-        """The transform of a band's noise around `tile`, filtered; the last one is kept."""
+        """Return the filtered transform of a band's noise around `tile`; the latest one is kept for reuse."""
         seen = self._seen[number]
         if seen is None or seen[0] != tile:
             band = self.window.bands[number]
@@ -219,7 +229,10 @@ class Screen:
 
 
 def _fine_raster(extent: tuple[float, float], reach: float, step: tuple[float, float]) -> NoiseRaster:
-    """On the window's own samples: tiles of at least 33, so that a window moves by 16 before the noise changes."""
+    """Return the noise raster of the first band, which lies on the samples of the window.
+
+    Tiles have at least 33 samples a side, so a window can move by 16 samples before its noise changes.
+    """
     needed = [math.ceil((e + 2 * reach) / s) + 1 for e, s in zip(extent, step, strict=True)]
     choices = [(tiles, [_odd_fast(max(33, math.ceil(n / (tiles - 1)))) for n in needed]) for tiles in range(3, 17, 2)]
     tiles, size = min(choices, key=lambda choice: choice[0] ** 2 * math.prod(choice[1]))
@@ -228,7 +241,7 @@ def _fine_raster(extent: tuple[float, float], reach: float, step: tuple[float, f
 
 
 def _coarse_raster(extent: tuple[float, float], reach: float, highest: float) -> NoiseRaster:
-    """So fine that it holds the band, whose cut has the edge `highest` [cycles/m]."""
+    """Return the noise raster of a lower band, fine enough for the band's upper edge `highest` [cycles/m]."""
     tiles = 3
     pitch = [(e + 2 * reach) / (tiles - 1) for e in extent]
     size = [_odd_fast(math.ceil(2 * _NEGLIGIBLE * highest * p)) for p in pitch]
@@ -238,7 +251,7 @@ def _coarse_raster(extent: tuple[float, float], reach: float, highest: float) ->
 
 
 def _odd_fast(least: int) -> int:
-    """The smallest odd number from `least` on that has no prime factor above 13: a fast length for an FFT."""
+    """Return the smallest odd FFT length of at least `least` that is fast, with no prime factor above 13."""
     number = least | 1
     while True:
         rest = number

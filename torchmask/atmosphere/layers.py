@@ -1,8 +1,8 @@
-"""Turbulence in height: layers, how strong and how fast they are, and the scales r0, theta0 and tau0 that follow.
+"""Layers of turbulence with heights, strengths and winds, and the scales r0, theta0 and tau0 that follow from them.
 
-Kolmogorov turbulence in closed form (Fried, J. Opt. Soc. Am. 56, 1372, 1966, and 72, 52, 1982; Greenwood, J. Opt. Soc.
-Am. 67, 390, 1977; Roddier, Progress in Optics 19, 281, 1981, sections 7 and 8), with constants that follow from the
-definition of r0. Geometrical optics: scintillation, that is diffraction between layer and telescope, is left out.
+The scales are those of Kolmogorov turbulence in closed form (Fried, J. Opt. Soc. Am. 56, 1372, 1966, and 72, 52, 1982;
+Greenwood, J. Opt. Soc. Am. 67, 390, 1977; Roddier, Progress in Optics 19, 281, 1981, sections 7 and 8), with constants
+that follow from the definition of r0. Propagation is geometrical: scintillation is neglected.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from torchmask.grid import ARCSEC
 
 _PATH = (
     math.sqrt(math.pi) * math.gamma(-5 / 6) / math.gamma(-1 / 3)
-)  # 2.9144, of D = 2.91 k^2 r^(5/3) times the strength
-_SERVO = (math.gamma(8 / 3) / 2) ** (3 / 5) / (2 * math.pi)  # 0.134, Greenwood's frequency times tau0
+)  # 2.9144, the constant of D(r) = 2.91 k^2 r^(5/3) C_n^2 dh
+_SERVO = (math.gamma(8 / 3) / 2) ** (3 / 5) / (2 * math.pi)  # 0.134, Greenwood frequency times tau0
 
 Vector = tuple[float, float]
 
@@ -33,16 +33,17 @@ class Layers:
     Parameters
     ----------
     heights : sequence of L floats
-        Above the telescope, along the line of sight [m].
+        Distance of each layer from the telescope along the line of sight [m].
     strengths : sequence of L floats
         C_n^2 dh of each layer [m^(1/3)].
     winds : sequence of L pairs (vx, vy), optional
-        Across the line of sight [m/s]; they carry the phase towards +x, +y. Without any, nothing moves.
+        Wind velocity of each layer across the line of sight [m/s]; positive values carry the phase towards +x and +y.
+        By default there is no wind.
 
     Raises
     ------
     ValueError
-        If there is no layer, the lengths differ, a number is not finite, a height is negative or a strength not
+        If there is no layer, the lengths differ, a number is not finite, a height is negative or a strength is not
         positive.
 
     Examples
@@ -64,7 +65,7 @@ class Layers:
         winds = tuple((float(vx), float(vy)) for vx, vy in self.winds or [(0.0, 0.0)] * len(heights))
         if not len(heights) == len(strengths) == len(winds) > 0:
             given = f"{len(heights)} heights, {len(strengths)} strengths and {len(winds)} winds"
-            raise ValueError(f"there are {given}: each layer has one of each, and there is at least one layer")
+            raise ValueError(f"got {given}: give one of each for every layer, and at least one layer")
         for name, values, fits, unit in (
             ("heights", heights, lambda v: v >= 0, "at least 0, in m"),
             ("strengths", strengths, lambda v: v > 0, "positive, in m^(1/3)"),
@@ -85,10 +86,10 @@ class Layers:
         fractions: Sequence[float],
         winds: Sequence[Vector] = (),
     ) -> Layers:
-        """Layers that together have Fried parameter `r0` [m] at `wavelength` [m], `fractions` of the strength in each.
+        """Create layers from their fractions of the strength and the Fried parameter `r0` [m] at `wavelength` [m].
 
-        Only the ratios of `fractions` count. Raises ValueError as the constructor does, or for a length that is not
-        finite and positive.
+        Fractions need not add up to 1: only their ratios matter. Raises ValueError as the constructor does, and if
+        `r0`, `wavelength` or the sum of the fractions is not finite and positive.
         """
         for name, value in (("r0", r0), ("wavelength", wavelength), ("sum of fractions", math.fsum(fractions))):
             if not (math.isfinite(value) and value > 0):
@@ -97,21 +98,21 @@ class Layers:
         return cls(heights, [total * share / math.fsum(fractions) for share in fractions], winds)
 
     def at_airmass(self, airmass: float) -> Layers:
-        """The same layers seen aslant, through `airmass` = 1 / cos(zenith distance) times their thickness.
+        """Return the same layers seen at `airmass` = 1 / cos(zenith distance), which scales heights and strengths.
 
-        Heights become distances along the line of sight. Winds stay as they are: how much of them lies across the line
-        of sight depends on where one looks. Raises ValueError if `airmass` is not finite or below 1.
+        Heights become distances along the line of sight. Winds are kept, as their components across the line of sight
+        depend on the azimuth. Raises ValueError if `airmass` is not finite or is below 1.
         """
         if not (math.isfinite(airmass) and airmass >= 1):
             raise ValueError(f"airmass is {airmass}: it must be finite and at least 1, which is the zenith")
         return Layers([airmass * h for h in self.heights], [airmass * s for s in self.strengths], self.winds)
 
     def grouped(self, n_layers: int) -> Layers:
-        """Neighbours merged into at most `n_layers` layers; r0, theta0 and tau0 stay exactly what they are.
+        """Merge neighbouring layers into at most `n_layers`, preserving r0, theta0 and tau0 exactly.
 
-        The groups have equal shares of the turbulence, counted half by strength and half by what it does to theta0. A
-        group lies at the mean height of its members and has their mean speed, both in the 5/3 power, weighed by
-        strength; its wind blows the way their mean does.
+        Every group has about the same share of the turbulence, where half of the share is strength and half is the
+        contribution to theta0. The height and the wind speed of a group are 5/3-power means over its members, weighted
+        by strength; its wind has the direction of their mean wind.
 
         Raises ValueError if `n_layers` is not a whole number of at least 1.
         """
@@ -137,36 +138,39 @@ class Layers:
         return Layers(heights, strengths, winds)
 
     def _coherent(self, wavelength: float, lengths: Sequence[float]) -> float:
-        """That multiple of `lengths`, one for each layer, by which two rays are apart when they differ by 1 rad^2."""
+        """Return the factor on `lengths`, one for each layer, at which two rays differ by 1 rad^2 in phase."""
         if not (math.isfinite(wavelength) and wavelength > 0):
             raise ValueError(f"wavelength is {wavelength}: it must be finite and positive, in m")
         total = math.fsum(s * x ** (5 / 3) for s, x in zip(self.strengths, lengths, strict=True))
         return (_PATH * (2 * math.pi / wavelength) ** 2 * total) ** -0.6 if total > 0 else math.inf
 
     def r0(self, wavelength: float) -> float:
-        """Fried parameter at `wavelength` [m], in m: [0.423 k^2 sum C_n^2 dh]^(-3/5), k = 2 pi / wavelength."""
+        """Return the Fried parameter [m] at `wavelength` [m]: (0.423 k^2 sum C_n^2 dh)^(-3/5), k = 2 pi/wavelength."""
         return STRUCTURE_CONSTANT**0.6 * self._coherent(wavelength, [1.0] * len(self.heights))
 
     def layer_r0(self, wavelength: float) -> tuple[float, ...]:
-        """Fried parameter of each layer by itself [m]; the sum of their -5/3 powers is that of all."""
+        """Return the Fried parameter of each layer alone [m]; their -5/3 powers add up to that of the total r0."""
         return tuple(Layers([h], [s]).r0(wavelength) for h, s in zip(self.heights, self.strengths, strict=True))
 
     def theta0(self, wavelength: float) -> float:
-        """Isoplanatic angle at `wavelength` [m], in rad: [2.91 k^2 sum C_n^2 dh h^(5/3)]^(-3/5).
+        """Return the isoplanatic angle [rad] at `wavelength` [m]: [2.91 k^2 sum C_n^2 dh h^(5/3)]^(-3/5).
 
-        Two directions that far apart differ by 1 rad^2 in phase, mean square, without an outer scale.
+        The mean square phase difference of two stars at this angle is 1 rad^2 if the outer scale is infinite.
         """
         return self._coherent(wavelength, self.heights)
 
     def tau0(self, wavelength: float) -> float:
-        """Coherence time at `wavelength` [m], in s: [2.91 k^2 sum C_n^2 dh v^(5/3)]^(-3/5).
+        """Return the coherence time [s] at `wavelength` [m]: [2.91 k^2 sum C_n^2 dh v^(5/3)]^(-3/5).
 
-        The phase at one point of the pupil changes by 1 rad^2 meanwhile, mean square, without an outer scale.
+        In this time the phase at a point of the pupil changes by 1 rad^2, mean square, if the outer scale is infinite.
         """
         return self._coherent(wavelength, [math.hypot(*wind) for wind in self.winds])
 
     def greenwood_frequency(self, wavelength: float) -> float:
-        """Bandwidth [Hz] with which a first-order servo leaves 1 rad^2 at `wavelength` [m]: 0.134 / tau0."""
+        """Return the Greenwood frequency [Hz] at `wavelength` [m]: 0.134 / tau0.
+
+        It is the bandwidth at which a first-order servo leaves a residual phase variance of 1 rad^2.
+        """
         return _SERVO / self.tau0(wavelength)
 
     def structure_function(
@@ -178,24 +182,26 @@ class Layers:
         direction: Tensor | Vector = (0.0, 0.0),
         delay: Tensor | float = 0.0,
     ) -> Tensor:
-        """Mean square phase difference [rad^2] of two rays at `wavelength` [m], under frozen flow.
+        """Return the mean square phase difference [rad^2] of two rays under frozen flow.
 
         Parameters
         ----------
-        wavelength, outer_scale : float
-            [m]. Without an outer scale the turbulence is Kolmogorov's; with one, von Karman's, whose rays differ less.
+        wavelength : float
+            Wavelength of the light [m].
+        outer_scale : float
+            Outer scale of the turbulence [m]; infinite, the default, for Kolmogorov turbulence.
         baseline : (..., 2) tensor or (x, y)
-            Between the points of the pupil that they meet [m].
+            Separation of the two rays in the pupil [m].
         direction : (..., 2) tensor or (x, y)
-            Between the stars that they come from [rad].
+            Angle between the stars from which the rays come [rad].
         delay : (...) tensor or float
-            Between their times [s].
+            Time between the two rays [s].
 
         Returns
         -------
         Tensor
-            (...), float64: sum over the layers of D(|baseline + h direction - v delay|). On the CPU, not
-            differentiable.
+            (...), float64: the sum over the layers of D(|baseline + h direction - v delay|). It is computed on the CPU
+            and not differentiable.
 
         Examples
         --------
@@ -221,7 +227,7 @@ class Layers:
         return total
 
     def describe(self, wavelength: float) -> str:
-        """The layers and their scales at `wavelength` [m], as tables (Markdown)."""
+        """Return Markdown tables of the layers and of their scales at `wavelength` [m]."""
         rows = [("height", "share", "wind"), ("---", "---", "---")]
         for h, s, wind in zip(self.heights, self.strengths, self.winds, strict=True):
             rows.append((f"{h:.0f} m", f"{s / math.fsum(self.strengths):.3f}", f"{math.hypot(*wind):.1f} m/s"))

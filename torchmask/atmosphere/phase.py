@@ -1,4 +1,4 @@
-"""The phase that turbulence lays on a pupil."""
+"""The phase that turbulence adds to the wavefront over a pupil."""
 
 from __future__ import annotations
 
@@ -19,14 +19,17 @@ from torchmask.optics.pupil import PupilSamples
 
 
 class TurbulencePhase(nn.Module):
-    """Phase of von Karman turbulence on the samples of a pupil.
+    """Random phase of von Karman turbulence on the samples of a pupil.
 
     Parameters
     ----------
-    r0, outer_scale : float
-        Fried parameter at the imaging wavelength and outer scale [m].
+    r0 : float
+        Fried parameter at the imaging wavelength [m].
+    outer_scale : float
+        Outer scale of the turbulence [m].
     wind : (vx, vy), optional
-        [m/s]. Without it every frame has a screen of its own; with it one screen drifts by (frozen flow).
+        Wind velocity [m/s], with which one screen drifts over the pupil (frozen flow). By default every frame has an
+        independent screen.
     frame_interval : float, optional
         Time between frames [s]; needed with `wind`.
 
@@ -38,8 +41,8 @@ class TurbulencePhase(nn.Module):
 
     Notes
     -----
-    `forward(samples, n_frames, generator)` returns (..., n_frames, N, P) [rad], dtype and device of the samples
-    (..., N, P); all masks of a population see the same screens. Frames are snapshots: nothing moves during an exposure.
+    `forward(samples, n_frames, generator)` returns (..., n_frames, N, P) [rad] with the dtype and device of the samples
+    (..., N, P). All masks of a population see the same screens. Frames are snapshots: nothing moves during an exposure.
 
     Examples
     --------
@@ -60,7 +63,7 @@ class TurbulencePhase(nn.Module):
         super().__init__()
         require_turbulence(r0, outer_scale)
         if (wind is None) != (frame_interval is None):
-            raise ValueError("wind and frame_interval belong together: give both (frozen flow) or neither")
+            raise ValueError("only one of wind and frame_interval is given: give both (frozen flow) or neither")
         if wind is not None and not (len(wind) == 2 and all(math.isfinite(v) for v in wind)):
             raise ValueError(f"wind is {wind}: it must be two finite numbers (vx, vy), in m/s")
         _require_interval(frame_interval)
@@ -87,19 +90,19 @@ class TurbulencePhase(nn.Module):
 
 
 class LayeredPhase(nn.Module):
-    """Phase of turbulence in layers on the samples of a pupil, as a star in any direction shows it at any time.
+    """Random phase of layered turbulence on the samples of a pupil, for a star in any direction.
 
     Parameters
     ----------
     layers : Layers
-        Heights, strengths and winds.
+        Heights, strengths and winds of the layers.
     wavelength : float
-        At which the phase is wanted [m].
+        Wavelength of the light [m].
     outer_scale : float
-        Of all layers [m].
+        Outer scale of all layers [m].
     frame_interval : float, optional
-        Time between frames [s], for one stack of screens that the winds carry on (frozen flow). Without it every frame
-        has screens of its own, as frames far apart in time do.
+        Time between frames [s], during which the winds carry the screens on (frozen flow). By default every frame has
+        independent screens, as frames taken far apart in time do.
 
     Raises
     ------
@@ -108,11 +111,12 @@ class LayeredPhase(nn.Module):
 
     Notes
     -----
-    `forward(samples, n_frames, generator, direction)` returns (..., n_frames, N, P) [rad], dtype and device of the
-    samples (..., N, P). `direction` (..., 2), (x, y) [rad], tells where the star is: in the middle of the field without
-    it, or where its image is direction / pixel_scale pixels from there. Its leading axes come before all others. A ray
-    that goes to the point x of the pupil meets a layer of height h at x + h direction; all directions, and all masks of
-    a population, see the same screens. Frames are snapshots; for what happens within an exposure, see `draws`.
+    `forward(samples, n_frames, generator, direction)` returns (..., n_frames, N, P) [rad] with the dtype and device of
+    the samples (..., N, P). `direction` (..., 2), (x, y) [rad], is the position of the star from the middle of the
+    field, where it is by default; the star's image lies direction / pixel_scale pixels from there. The leading axes of
+    `direction` come before all others. A ray to the point x of the pupil crosses a layer of height h at
+    x + h direction. All directions and all masks of a population see the same screens. Frames are snapshots; for the
+    phase within an exposure, see `draws`.
 
     Examples
     --------
@@ -121,7 +125,7 @@ class LayeredPhase(nn.Module):
     >>> from torchmask.optics.aperture import FullAperture
     >>> samples = FullAperture(1.0).samples(Grid.nyquist(1.0, 550e-9, 64))
     >>> turbulence = LayeredPhase(named_layers("hv57", n_layers=3), wavelength=550e-9, outer_scale=20.0)
-    >>> stars = torch.tensor([[0.0, 0.0], [7e-6, 0.0]])  # a second one, an isoplanatic angle to the right
+    >>> stars = torch.tensor([[0.0, 0.0], [7e-6, 0.0]])  # the second is an isoplanatic angle to the right
     >>> turbulence(samples, n_frames=4, direction=stars).shape
     torch.Size([2, 4, 1, 1225])
     """
@@ -139,7 +143,7 @@ class LayeredPhase(nn.Module):
 
     @property
     def r0(self) -> float:
-        """Fried parameter of all layers [m]."""
+        """Fried parameter of all layers together [m]."""
         return self.layers.r0(self.wavelength)
 
     def forward(
@@ -159,7 +163,7 @@ class LayeredPhase(nn.Module):
         return together.unflatten(0, stars.shape[:-1]) if stars.ndim > 1 else together[0]
 
     def draws(self, samples: PupilSamples, generator: torch.Generator | None = None) -> Iterator[DrawnLayers]:
-        """The layers at the start of one frame after another, without end."""
+        """Yield the layers at the start of each frame, without end."""
         place, shape = _window(samples)
         weights = samples.weights
         window = ScreenWindow(shape, samples.step, self.outer_scale, weights.dtype, weights.device)
@@ -183,18 +187,19 @@ class LayeredPhase(nn.Module):
 
 @dataclass(frozen=True)
 class DrawnLayers:
-    """The layers above a pupil as one frame finds them."""
+    """The random screens of all layers above a pupil at the start of one frame."""
 
     layers: Layers
+    """Heights, strengths and winds of the layers."""
     screens: list[Screen]
-    """One for each layer."""
+    """Screen of each layer."""
     place: Tensor
-    """Of the pupil's samples in the screens' window, flattened."""
+    """Indices of the pupil's samples in the flattened window of the screens."""
     time: float
-    """When the frame begins [s]."""
+    """Time at which the frame begins [s]."""
 
     def phase(self, delay: float = 0.0, direction: Vector = (0.0, 0.0)) -> Tensor:
-        """The phase (..., N, P) [rad], `delay` [s] after the frame began, of a star in `direction` (x, y) [rad]."""
+        """Return the phase (..., N, P) [rad] for a star in `direction` (x, y) [rad], `delay` [s] into the frame."""
         later, parts = self.time + delay, []
         for screen, height, wind in zip(self.screens, self.layers.heights, self.layers.winds, strict=True):
             x, y = (height * angle - speed * later for angle, speed in zip(direction, wind, strict=True))
@@ -208,12 +213,15 @@ def _require_interval(frame_interval: float | None) -> None:
 
 
 def _window(samples: PupilSamples) -> tuple[Tensor, tuple[int, int]]:
-    """The smallest rectangle around a pupil that may lie across the raster's border: places in it, and its shape."""
+    """Return the indices of a pupil's samples in the smallest rectangle around it, and that rectangle's shape.
+
+    The pupil may lie across the border of the raster.
+    """
     coordinates, shape = [], []
     places = (samples.index // samples.raster[1], samples.index % samples.raster[1])
-    weights = samples.weights.detach()  # holes may train: where they lie decides which samples to take, not more
+    weights = samples.weights.detach()  # holes may be trainable, but the choice of samples is not differentiable
     for place, size in zip(places, samples.raster, strict=True):
-        angle = 2 * math.pi / size * place  # the middle of a pupil that spans at most half the raster is a mean angle
+        angle = 2 * math.pi / size * place  # on a periodic raster the middle is a mean angle
         middle = torch.atan2((weights * angle.sin()).sum(), (weights * angle.cos()).sum())
         local = (place - round(float(middle) * size / (2 * math.pi)) + size // 2) % size
         coordinates.append(local - local.min())

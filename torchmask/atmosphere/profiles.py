@@ -8,36 +8,40 @@ import numpy as np
 
 from torchmask.atmosphere.layers import Layers
 
-_TOP = 40e3  # m: no model has turbulence above
-_CELLS = 2000  # of a continuous profile before it is grouped, closer to each other near the ground
+_TOP = 40e3  # [m], above which no model has turbulence
+_CELLS = 2000  # cells that sample a continuous profile before it is grouped, thinner near the ground
 
 
 def named_layers(name: str, n_layers: int = 8) -> Layers:
-    """A published profile in at most `n_layers` layers, above a telescope on the ground that looks at the zenith.
+    """Return a published profile as at most `n_layers` layers, for a telescope on the ground pointing at the zenith.
 
     Parameters
     ----------
     name : str
-        "hv57": Hufnagel and Valley's model, with a wind of 21 m/s rms aloft and 1.7e-14 m^(-2/3) at the ground, named
-        after the 5 cm of its r0 and the 7 microrad of its theta0 at 500 nm (Tyson, Principles of Adaptive Optics,
-        section 2.1; Hardy, Adaptive Optics for Astronomical Telescopes, section 3.6). Bufton's wind, 5 m/s at the
-        ground and 30 m/s more at 9.4 km (Appl. Opt. 12, 1785, 1973).
-        "las_campanas": seven layers, r0 16 cm at 500 nm (Males & Guyon, J. Astron. Telesc. Instrum. Syst. 4, 019001,
-        2018, after Prieto et al., Proc. SPIE 7733, 77334O, 2010).
-        "mauna_kea": six layers, r0 20 cm at 500 nm, all at 10 m/s (Guyon, Astrophys. J. 629, 592, 2005, after Tokovinin
-        et al., Publ. Astron. Soc. Pac. 117, 395, 2005).
+        Name of the profile.
+
+        "hv57" is the Hufnagel-Valley model with an upper-altitude wind of 21 m/s rms and a ground strength of
+        1.7e-14 m^(-2/3), named after its r0 of 5 cm and its theta0 of 7 microrad at 500 nm (Tyson, Principles of
+        Adaptive Optics, section 2.1; Hardy, Adaptive Optics for Astronomical Telescopes, section 3.6). Its wind is
+        Bufton's, 5 m/s at the ground and 35 m/s at 9.4 km (Appl. Opt. 12, 1785, 1973).
+
+        "las_campanas" has seven layers and an r0 of 16 cm at 500 nm (Males & Guyon, J. Astron. Telesc. Instrum.
+        Syst. 4, 019001, 2018, after Prieto et al., Proc. SPIE 7733, 77334O, 2010).
+
+        "mauna_kea" has six layers with winds of 10 m/s and an r0 of 20 cm at 500 nm (Guyon, Astrophys. J. 629, 592,
+        2005, after Tokovinin et al., Publ. Astron. Soc. Pac. 117, 395, 2005).
     n_layers : int
-        See `Layers.grouped`: r0, theta0 and tau0 do not depend on it.
+        Largest number of layers. Grouping preserves r0, theta0 and tau0; see `Layers.grouped`.
 
     Returns
     -------
     Layers
-        The sources give speeds without directions, so every wind blows towards +x.
+        Layers whose winds all blow towards +x, because the sources give speeds without directions.
 
     Raises
     ------
     ValueError
-        For an unknown name (the known ones are listed) or a number of layers below 1.
+        If the name is unknown (the message lists the known ones) or `n_layers` is below 1.
 
     Examples
     --------
@@ -97,4 +101,4 @@ PROFILES: dict[str, Callable[[], Layers]] = {
     "las_campanas": _las_campanas,
     "mauna_kea": _mauna_kea,
 }
-"""Profiles by name, whole."""
+"""Functions that return the ungrouped profiles, by name."""

@@ -1,11 +1,12 @@
 """Stationary Gaussian fields with the spectrum of von Karman turbulence, on a raster.
 
-The spectrum is split by smooth windows into bands, each sampled on a frequency lattice of its own: the first by FFT,
-the lower ones, the sub-harmonics, as explicit sums of waves on lattices ever finer. A lattice makes its band periodic;
-the smooth window gives the band a finite correlation length; and the period exceeds the field by at least that length.
-So no separation within the field meets the periodicity, and the covariance there is that of the spectrum (Poisson's
-summation formula). What is sampled also holds the frequencies beyond Nyquist, folded. The expected structure function
-is von Karman's to 0.3 %, 0.2 % for outer scales up to 20 times the field, from one sample to the whole field.
+Smooth windows split the spectrum into bands, each sampled on its own frequency lattice: the first band by FFT, the
+lower ones (the sub-harmonics) as explicit sums of waves on finer and finer lattices. A lattice makes its band periodic,
+but the smooth window gives the band a finite correlation length, and the period exceeds the field by at least that
+length. So no separation within the field is affected by the periodicity, and the covariance there is that of the
+spectrum (Poisson's summation formula). The first band includes the aliased frequencies beyond Nyquist. From one sample
+to the whole field, the expected structure function is von Karman's to 0.3 %, or 0.2 % for outer scales up to 20 times
+the field.
 """
 
 from __future__ import annotations
@@ -20,17 +21,17 @@ from torch import Tensor
 
 from torchmask.atmosphere.von_karman import PSD_CONSTANT, von_karman_psd
 
-_RATIO = 3.0  # of the frequencies of successive bands
-_CUTOFF = 2.0  # of the first band, in units of 1 / margin
-_STEEPNESS = 6  # of the windows exp(-x^6)
-_NEGLIGIBLE = 1.55  # their x where they end
-_ALIASES = 1  # of the frequencies beyond Nyquist, on either side, that are told apart
+_RATIO = 3.0  # between the frequencies of successive bands
+_CUTOFF = 2.0  # lower edge of the first band, in units of 1 / margin
+_STEEPNESS = 6  # exponent of the windows exp(-x^6)
+_NEGLIGIBLE = 1.55  # the x beyond which a window counts as zero
+_ALIASES = 1  # aliases on either side that are summed one by one
 COMPLEX = {torch.float32: torch.complex64, torch.float64: torch.complex128}
-_HOST: dict[str, Any] = {"dtype": torch.float64, "device": "cpu"}  # small arrays that are always made there
+_HOST: dict[str, Any] = {"dtype": torch.float64, "device": "cpu"}  # for small arrays, always made on the CPU
 
 
 class Band(NamedTuple):
-    """Waves on a rectangular lattice: frequencies [cycles/m] of rows and columns, rms amplitudes [rad]."""
+    """Waves on a rectangular lattice, with row and column frequencies [cycles/m] and rms amplitudes [rad]."""
 
     frequency_y: Tensor
     frequency_x: Tensor
@@ -40,15 +41,18 @@ class Band(NamedTuple):
 def split_spectrum(
     extent: tuple[float, float], margin: float, step: tuple[float, float], r0: float, outer_scale: float
 ) -> list[Band]:
-    """Bands for a field over `extent` (y, x) [m] in steps of `step`; the first is the FFT's. float64, on the CPU."""
+    """Return the bands, float64 on the CPU, for a field over `extent` (y, x) [m] sampled every `step` (y, x) [m].
+
+    The first band is the one for the FFT. `margin` [m] is the distance over which it loses its correlation.
+    """
     cutoff = _CUTOFF / margin
 
     def below(frequency: Tensor, level: int) -> Tensor:
-        """Share of the spectrum that is left to the bands below band `level`."""
+        """Return the share of the spectrum that belongs to the bands below band `level`."""
         return torch.exp(-((frequency * _RATIO**level / cutoff) ** _STEEPNESS))
 
     sizes = [int(next_fast_len(math.ceil((e + margin) / s)) or 0) for e, s in zip(extent, step, strict=True)]
-    # The spectrum is even, so one quadrant tells all.
+    # The spectrum is even, so one quadrant is enough.
     fy, fx = (torch.arange(n // 2 + 1, **_HOST) / (n * s) for n, s in zip(sizes, step, strict=True))
     density = folded_density(fy, fx, step, r0, outer_scale, lambda f: 1 - below(f, 0))
     density /= sizes[0] * step[0] * sizes[1] * step[1]
@@ -77,7 +81,10 @@ def folded_density(
     outer_scale: float,
     share: Callable[[Tensor], Tensor],
 ) -> Tensor:
-    """Spectrum [rad^2 m^2] times `share` of the frequency, as samples in steps of `step` hold it: with its aliases."""
+    """Return the von Karman spectrum times `share(frequency)`, aliased by sampling every `step` (y, x) [m].
+
+    The result (len(fy), len(fx)) [rad^2 m^2] is float64 on the CPU.
+    """
     density = torch.full((len(fy), len(fx)), _beyond(step, r0, outer_scale), **_HOST)
     for alias_y in range(-_ALIASES, _ALIASES + 1):
         for alias_x in range(-_ALIASES, _ALIASES + 1):
@@ -87,10 +94,10 @@ def folded_density(
 
 
 def _beyond(step: tuple[float, float], r0: float, outer_scale: float) -> float:
-    """Density that the power beyond all aliases adds to the sampled spectrum, as if it were white [rad^2 m^2].
+    """Return the density [rad^2 m^2] that the power beyond the explicit aliases adds, treated as white.
 
-    The radial integral of the spectrum from the edge of the aliases, a rectangle, to infinity is closed; the angular
-    one is a mean over a quarter turn.
+    The radial integral of the spectrum, from the rectangular edge of the aliases to infinity, has a closed form; the
+    angular one is a mean over a quarter turn.
     """
     n = 64
     angle = math.pi / (2 * n) * (torch.arange(n, **_HOST) + 0.5)
@@ -100,7 +107,7 @@ def _beyond(step: tuple[float, float], r0: float, outer_scale: float) -> float:
 
 
 class RandomField:
-    """A random field of `bands`, to be summed on a raster. Coefficients are lists, one tensor for each band."""
+    """A random field made of `bands` and summed on a raster. Its coefficients are a list, one tensor for each band."""
 
     def __init__(
         self,
@@ -113,7 +120,7 @@ class RandomField:
         self.bands = bands
         self.shape = shape
         self.kind: dict[str, Any] = {"dtype": COMPLEX[dtype], "device": device}
-        # randn gives complex numbers a mean square of 1: half of it for each of the two fields
+        # Complex randn has a mean square of 1, of which the real and the imaginary field have half each.
         self.amplitudes: list[Tensor] = [(math.sqrt(2) * band.amplitude).to(device, dtype) for band in bands]
         places = [torch.arange(n, **_HOST) * s for n, s in zip(shape, step, strict=True)]
         self.waves: list[tuple[Tensor, Tensor]] = [
@@ -122,7 +129,7 @@ class RandomField:
         ]
 
     def draw(self, generator: torch.Generator | None) -> list[Tensor]:
-        """Random coefficients; the real and the imaginary part of their sum are two independent screens."""
+        """Draw random coefficients; the real and the imaginary part of their sum are two independent screens."""
         source = self.kind["device"] if generator is None else generator.device
         noise = [
             torch.randn(a.shape, generator=generator, dtype=self.kind["dtype"], device=source) for a in self.amplitudes
@@ -130,7 +137,7 @@ class RandomField:
         return [n.to(a.device) * a for n, a in zip(noise, self.amplitudes, strict=True)]
 
     def sum(self, coefficients: list[Tensor]) -> Tensor:
-        """The field on the raster, complex (rows, columns)."""
+        """Return the field on the raster, complex (rows, columns)."""
         rows, columns = self.shape
         strip = torch.fft.ifft(coefficients[0], dim=0, norm="forward")[:rows]
         field = torch.fft.ifft(strip, dim=1, norm="forward")[:, :columns]

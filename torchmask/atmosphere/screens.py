@@ -23,26 +23,31 @@ def phase_screens(
     dtype: torch.dtype | None = None,
     device: torch.device | str | None = None,
 ) -> Tensor:
-    """Independent von Karman phase screens (n_screens, rows, columns) [rad].
+    """Draw independent von Karman phase screens (n_screens, rows, columns) [rad].
 
     Parameters
     ----------
     shape : (rows, columns)
+        Number of samples of a screen.
     step : float or (dy, dx)
-        Distance of samples [m].
-    r0, outer_scale : float
-        Fried parameter and outer scale [m].
+        Spacing of the samples [m].
+    r0 : float
+        Fried parameter [m].
+    outer_scale : float
+        Outer scale of the turbulence [m].
     n_screens : int
-        A screen does not depend on how many follow it.
+        Number of screens. The first ones are the same however many are drawn.
     generator : torch.Generator, optional
-        Seeded, on the CPU or on `device`.
-    dtype, device : optional
-        float32 or float64; by default torch's default dtype on the CPU.
+        Source of randomness, on the CPU or on `device`.
+    dtype : torch.dtype, optional
+        float32 or float64; torch's default dtype by default.
+    device : torch.device, optional
+        Device of the screens, the CPU by default.
 
     Raises
     ------
     ValueError
-        If a length is not finite and positive, or a count not a whole number of at least 1.
+        If a length is not finite and positive, or a count is not a whole number of at least 1.
     TypeError
         If `dtype` is neither float32 nor float64.
 
@@ -77,10 +82,10 @@ def frozen_flow(
     dtype: torch.dtype | None = None,
     device: torch.device | str | None = None,
 ) -> Tensor:
-    """One screen moved as a whole: (n_frames, rows, columns) [rad], frame t being screen(x - displacements[t]).
+    """Return one random screen displaced as a whole (n_frames, rows, columns) [rad].
 
-    `displacements` (n_frames, 2) [m], (x, y), as far and by as small a fraction of a sample as one likes: see
-    `torchmask.atmosphere.endless`. Other arguments and errors as for `phase_screens`.
+    Frame t is screen(x - displacements[t]). `displacements` (n_frames, 2) [m], (x, y), may be of any size, fractions
+    of a sample included (see `torchmask.atmosphere.endless`). Other arguments and errors are those of `phase_screens`.
     """
     shape, step, dtype, device = _resolve(shape, step, dtype, device)
     require_turbulence(r0, outer_scale)
@@ -89,13 +94,13 @@ def frozen_flow(
 
 
 def draw_seed(generator: torch.Generator | None) -> int:
-    """A seed for generators of another kind."""
+    """Draw a seed for generators of another kind, such as NumPy's."""
     device = "cpu" if generator is None else generator.device
     return int(torch.randint(2**62, (1,), generator=generator, device=device))
 
 
 def _margin(extent: tuple[float, float], step: tuple[float, float]) -> float:
-    """Distance [m] over which the first band loses its correlation."""
+    """Return the distance [m] over which the first band loses its correlation."""
     return max(0.25 * max(extent), 16 * max(step))
 
 

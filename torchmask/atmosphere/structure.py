@@ -1,7 +1,7 @@
-"""The phase structure function as a smooth, differentiable function of the displacement, whatever the outer scale.
+"""The phase structure function as a smooth, differentiable function of the displacement, for any outer scale.
 
-Over Kolmogorov's 6.88 (r / r0)^(5/3), von Karman's structure function is analytic in (r / L0)^(1/3), so a short
-Chebyshev series stands for its Bessel function (`von_karman_structure_function`) to 1e-7.
+Divided by Kolmogorov's 6.88 (r / r0)^(5/3), von Karman's structure function is analytic in (r / L0)^(1/3). A short
+Chebyshev series therefore replaces its Bessel function (`von_karman_structure_function`) to 1e-7.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from torch import Tensor
 
 from torchmask.atmosphere.von_karman import STRUCTURE_CONSTANT, require_turbulence, von_karman_structure_function
 
-_SATURATED = 3.0  # outer scales: beyond, the structure function is constant to 2e-8
-_TOLERANCE = 1e-8  # of the Chebyshev series
+_SATURATED = 3.0  # in outer scales; beyond, the structure function is constant to 2e-8
+_TOLERANCE = 1e-8  # largest of the last coefficients of the Chebyshev series
 _DEGREES = (6, 8, 12, 16, 24, 32, 48)
 
 
@@ -29,17 +29,17 @@ class StructureFunction:
     Parameters
     ----------
     r0 : float
-        Fried's parameter [m].
+        Fried parameter [m].
     outer_scale : float
-        L0 [m]; infinite for Kolmogorov turbulence.
+        Outer scale [m]; infinite for Kolmogorov turbulence.
     reach : float
-        The longest displacement that will be asked for [m]; a known one makes the series shorter. Longer ones are
-        taken as this one.
+        Largest displacement that will be needed [m]; longer ones are clamped to it. A finite value makes the series
+        shorter.
 
     Raises
     ------
     ValueError
-        For scales that are not positive, and an r0 that is not finite.
+        If a scale is not positive, or r0 is not finite.
 
     Examples
     --------
@@ -59,11 +59,14 @@ class StructureFunction:
                 raise ValueError(f"{name} is {value}: it must be positive, in m")
 
     def __call__(self, displacement: Tensor) -> Tensor:
-        """At `displacement` (..., 2) [m]: (...), in its dtype and differentiable in it, with gradient 0 at 0."""
+        """Return the structure function (...) at `displacement` (..., 2) [m].
+
+        It has the dtype of `displacement` and is differentiable in it, with gradient 0 at 0.
+        """
         return self.of_square((displacement**2).sum(-1))
 
     def of_square(self, squared: Tensor) -> Tensor:
-        """At the squared distance (...) [m^2]."""
+        """Return the structure function at the squared distance (...) [m^2]."""
         # The offset, a billionth of r0 squared, keeps the derivative finite at 0.
         unit = squared / self.r0**2 + 1e-18
         if math.isinf(self.outer_scale):
@@ -77,10 +80,13 @@ class StructureFunction:
 
 @lru_cache(maxsize=64)
 def _series(longest: float) -> tuple[float, ...]:
-    """Chebyshev coefficients of von Karman's over Kolmogorov's on (r / L0)^(1/3) from 0 to that of `longest`."""
+    """Return Chebyshev coefficients of the ratio of von Karman's to Kolmogorov's structure function.
+
+    The variable is (r / L0)^(1/3), from r = 0 to r = `longest` L0.
+    """
 
     def ratio(position: np.ndarray) -> np.ndarray:
-        # 1 at 0, which the factor r^(5/3) hides: a tiny distance stands for it
+        # At 0 the ratio is 1 but computes as 0/0, so a tiny distance replaces 0.
         root = np.maximum((position + 1) / 2 * longest ** (1 / 3), 1e-5)
         values = von_karman_structure_function(torch.from_numpy(root**3), 1.0, 1.0).numpy()
         return values / (STRUCTURE_CONSTANT * root**5)
@@ -94,7 +100,7 @@ def _series(longest: float) -> tuple[float, ...]:
 
 
 def _clenshaw(coefficients: tuple[float, ...], x: Tensor) -> Tensor:
-    """The Chebyshev series at x (...)."""
+    """Evaluate the Chebyshev series at x (...)."""
     after, current = torch.zeros_like(x), torch.full_like(x, coefficients[-1])
     for coefficient in coefficients[-2:0:-1]:
         current, after = 2 * x * current - after + coefficient, current

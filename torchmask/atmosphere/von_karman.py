@@ -1,7 +1,8 @@
-"""Statistics of the turbulent phase: von Karman spectrum, covariance, structure function, and that of Zernike modes.
+"""Statistics of von Karman turbulence: spectrum, covariance, structure function and the covariance of Zernike modes.
 
-W(f) = c r0^(-5/3) (f^2 + 1/L0^2)^(-11/6), f in cycles/m, with c from the definition of r0, that is from the structure
-function 6.88 (r/r0)^(5/3) of Kolmogorov turbulence. Covariance: Assemat & Wilson, Opt. Express 14, 988 (2006).
+The spectrum is W(f) = c r0^(-5/3) (f^2 + 1/L0^2)^(-11/6), f in cycles/m, with c from the definition of r0, that is from
+the structure function 6.88 (r/r0)^(5/3) of Kolmogorov turbulence. Source of the covariance: Assemat & Wilson, Opt.
+Express 14, 988 (2006).
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ from torchmask.optics.zernike import aperture_modes, noll
 
 STRUCTURE_CONSTANT = 2 * (24 / 5 * math.gamma(6 / 5)) ** (5 / 6)  # 6.883877
 PSD_CONSTANT = STRUCTURE_CONSTANT * math.gamma(11 / 6) ** 2 * math.sin(5 * math.pi / 6) / (2 * math.pi ** (11 / 3))
-_VARIANCE_CONSTANT = PSD_CONSTANT * 6 * math.pi / 5  # of the total variance, in (L0/r0)^(5/3)
-# The integral over frequencies ceases to couple sub-apertures, and ends, where pi |f| outer_diameter is this plus 2 for
-# every radial order.
+_VARIANCE_CONSTANT = PSD_CONSTANT * 6 * math.pi / 5  # total variance in units of (L0/r0)^(5/3)
+# Values of pi |f| outer_diameter, plus 2 for every radial order, above which the integral over frequencies neglects the
+# coupling of sub-apertures, and where it ends.
 _SHARED = 10
 _HIGHEST = 24
 
@@ -35,16 +36,16 @@ def require_turbulence(r0: float, outer_scale: float) -> None:
 
 
 def von_karman_psd(frequency: Tensor, r0: float, outer_scale: float) -> Tensor:
-    """Power spectral density of the phase [rad^2 m^2] at `frequency` >= 0 [cycles/m], any shape."""
+    """Return the power spectral density of the phase [rad^2 m^2] at `frequency` >= 0 [cycles/m], of any shape."""
     require_turbulence(r0, outer_scale)
     return PSD_CONSTANT * r0 ** (-5 / 3) * (frequency**2 + outer_scale**-2) ** (-11 / 6)
 
 
 def von_karman_covariance(distance: Tensor, r0: float, outer_scale: float) -> Tensor:
-    """Covariance of the phase [rad^2] of two points `distance` [m] apart, any shape.
+    """Return the covariance B [rad^2] of the phases of two points `distance` [m] apart, of any shape.
 
-    0.0863 (L0/r0)^(5/3) times x^(5/6) K_5/6(x) 2^(1/6) / Gamma(5/6), x = 2 pi distance / L0. Evaluated by SciPy on
-    the CPU; not differentiable.
+    B = 0.0863 (L0/r0)^(5/3) x^(5/6) K_5/6(x) 2^(1/6) / Gamma(5/6), x = 2 pi distance / L0. SciPy computes it on the
+    CPU; it is not differentiable.
     """
     require_turbulence(r0, outer_scale)
     variance = _VARIANCE_CONSTANT * (outer_scale / r0) ** (5 / 3)
@@ -52,10 +53,10 @@ def von_karman_covariance(distance: Tensor, r0: float, outer_scale: float) -> Te
 
 
 def von_karman_structure_function(distance: Tensor, r0: float, outer_scale: float) -> Tensor:
-    """Mean square phase difference [rad^2] of two points `distance` [m] apart, any shape: 2 (B(0) - B(distance)).
+    """Return the structure function 2 (B(0) - B(distance)) [rad^2] at `distance` [m], of any shape.
 
-    Accurate at all distances: where that difference would cancel, it is summed as a series in distance / L0 whose first
-    term is 6.88 (distance / r0)^(5/3). Evaluated on the CPU; not differentiable.
+    It is accurate at all distances: where the difference would cancel, it is summed as a series in distance / L0 whose
+    first term is 6.88 (distance / r0)^(5/3). SciPy computes it on the CPU; it is not differentiable.
     """
     require_turbulence(r0, outer_scale)
     variance = _VARIANCE_CONSTANT * (outer_scale / r0) ** (5 / 3)
@@ -74,42 +75,45 @@ def _argument(distance: Tensor, outer_scale: float) -> np.ndarray:
 
 
 def _correlation(x: np.ndarray) -> np.ndarray:
-    """x^(5/6) K_5/6(x), normalised to 1 at 0."""
+    """Return x^(5/6) K_5/6(x), normalised to 1 at 0."""
     safe = np.where(x > 0, x, 1.0)
     return np.where(x > 0, 2 ** (1 / 6) / special.gamma(5 / 6) * safe ** (5 / 6) * special.kv(5 / 6, safe), 1.0)
 
 
 def modal_covariance(aperture: Aperture, n_modes: int, r0: float, outer_scale: float) -> Tensor:
-    """Joint covariance [rad^2] of the Zernike coefficients of all sub-apertures under von Karman turbulence.
+    """Return the joint covariance [rad^2] of the Zernike coefficients of all sub-apertures in von Karman turbulence.
 
     Parameters
     ----------
     aperture : Aperture
-        One mask: centres (N, 2).
+        One mask, with centres (N, 2).
     n_modes : int
-        J, Noll modes 1 (piston) to J.
-    r0, outer_scale : float
-        [m].
+        Number of modes J per sub-aperture, from Noll mode 1 (piston).
+    r0 : float
+        Fried parameter [m].
+    outer_scale : float
+        Outer scale of the turbulence [m].
 
     Returns
     -------
     Tensor
-        (N J, N J), ordered by sub-aperture, then mode: row p J + j - 1 is mode j of sub-aperture p. On the device of
-        the centres but always float64, because the common piston is so much larger than the high modes that float32
-        would make it indefinite: take its Cholesky factor first and round that. Not differentiable.
+        (N J, N J), ordered by sub-aperture, then mode: row p J + j - 1 is mode j of sub-aperture p. It lies on the
+        device of the centres but is always float64, because the common piston is so much larger than the high modes
+        that float32 would make the matrix indefinite. If you need float32, round its Cholesky factor. It is not
+        differentiable.
 
     Raises
     ------
     ValueError
-        For a population of masks, or scales that are not finite and positive.
+        If the aperture is a population of masks, or a scale is not finite and positive.
 
     Notes
     -----
-    The covariance is the integral of W(f) M_p(f) M_q(f)* over frequencies, M the Fourier transforms of the modes. The
-    quadrature keeps that form, a Gram matrix, so the result is positive semi-definite to rounding. Frequencies are
-    polar: Gauss nodes in |f|, packed towards f = 0 where the outer scale bends the spectrum, and uniform angles, which
-    converge exponentially once they resolve the longest baseline. Relative to the variances, accurate to 3e-4 up to
-    radial order 5 and to 6e-4 at order 10.
+    The covariance is the integral of W(f) M_p(f) M_q(f)* over frequencies, with M the Fourier transforms of the modes.
+    The quadrature has the same form, a Gram matrix, so the result is positive semi-definite to rounding. It is polar:
+    Gauss nodes in |f|, denser towards f = 0 where the outer scale bends the spectrum, and uniform angles, which
+    converge exponentially once they resolve the longest baseline. The error is 3e-4 of the variances up to radial order
+    5 and 6e-4 at order 10.
 
     Examples
     --------
@@ -121,8 +125,8 @@ def modal_covariance(aperture: Aperture, n_modes: int, r0: float, outer_scale: f
     require_turbulence(r0, outer_scale)
     if aperture.centers.ndim != 2:
         raise ValueError(
-            f"centers has shape {tuple(aperture.centers.shape)}: the covariance is that of one mask, "
-            "(n_subapertures, 2); take the masks of a population one by one"
+            f"centers has shape {tuple(aperture.centers.shape)}: one mask, (n_subapertures, 2), is needed; pass the "
+            "masks of a population one by one"
         )
     centers = aperture.centers.detach().cpu().double()
     bend = math.pi * aperture.outer_diameter / outer_scale + 2 * noll(n_modes)[0]
@@ -136,7 +140,7 @@ def modal_covariance(aperture: Aperture, n_modes: int, r0: float, outer_scale: f
 def _gram(
     aperture: Aperture, n_modes: int, r0: float, outer_scale: float, places: Tensor, start: float, stop: float
 ) -> Tensor:
-    """What frequencies `start` <= pi |f| outer_diameter < `stop` add to the covariance of holes at `places` (N, 2)."""
+    """Return the part of the covariance of holes at `places` (N, 2) from `start` <= pi |f| outer_diameter < `stop`."""
     order, diameter = noll(n_modes)[0], aperture.outer_diameter
     points, weights = aperture.shape.quadrature(math.ceil(stop) + order + 16, aperture.subaperture_diameter)
     modes = weights[:, None] * aperture_modes(aperture, points, n_modes)  # (Q, J)
@@ -144,7 +148,7 @@ def _gram(
     total = modes.new_zeros(len(places) * n_modes, len(places) * n_modes)
     for frequency, area in _panels(start / (math.pi * diameter), stop / (math.pi * diameter), outer_scale, reach):
         turns = math.pi * float(frequency[-1])
-        n_angles = math.ceil(turns * reach) + 2 * order + 24  # on half a turn: the other half is the conjugate
+        n_angles = math.ceil(turns * reach) + 2 * order + 24  # on half a turn, as the other half is the conjugate
         n_known = order + 2 if aperture.shape.is_round else math.ceil(turns * diameter) + order + 20
         transform = _mode_transforms(points, modes, frequency, n_known, n_angles)  # (R, A, J)
         weight = 2 * math.pi / n_angles * area * von_karman_psd(frequency, r0, outer_scale)
@@ -156,10 +160,11 @@ def _gram(
 
 
 def _mode_transforms(points: Tensor, modes: Tensor, frequency: Tensor, n_known: int, n_angles: int) -> Tensor:
-    """Fourier transforms of `modes` (Q, J) at `frequency` (R,) and `n_angles` angles on half a turn: (R, A, J).
+    """Return the Fourier transforms (R, A, J) of `modes` (Q, J) at `frequency` (R,) and `n_angles` angles.
 
-    In angle they are trigonometric polynomials: evaluated at `n_known` angles, they are interpolated to the many that a
-    baseline needs. Round shapes need no more than the azimuthal order of the modes.
+    The angles span half a turn. The transforms are trigonometric polynomials in angle, so they are evaluated at only
+    `n_known` angles and interpolated to the many that a long baseline needs. For round shapes the azimuthal order of
+    the modes is enough.
     """
     half = _phasor(frequency[:, None, None] * (_directions(n_known) @ points.T)) @ modes.to(torch.complex128)
     series = torch.fft.fft(torch.cat([half, half.conj()], dim=1), dim=1, norm="forward")
@@ -170,7 +175,7 @@ def _mode_transforms(points: Tensor, modes: Tensor, frequency: Tensor, n_known: 
 
 
 def _panels(start: float, stop: float, outer_scale: float, reach: float) -> Iterator[tuple[Tensor, Tensor]]:
-    """Gauss nodes and weights |f| d|f| on panels that double from the outer scale, as wide as the phases allow."""
+    """Yield Gauss nodes and weights |f| d|f| on panels that double in width until phases vary too fast across them."""
     nodes, weights = (torch.from_numpy(a) for a in np.polynomial.legendre.leggauss(16))
     low = start
     while low < stop:
@@ -181,7 +186,7 @@ def _panels(start: float, stop: float, outer_scale: float, reach: float) -> Iter
 
 
 def _directions(n_angles: int) -> Tensor:
-    """Unit vectors (A, 2) at uniform angles on half a turn."""
+    """Return unit vectors (A, 2) at uniform angles on half a turn."""
     angle = math.pi / n_angles * torch.arange(n_angles, dtype=torch.float64, device="cpu")
     return torch.stack([angle.cos(), angle.sin()], dim=-1)
 

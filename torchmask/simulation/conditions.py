@@ -1,4 +1,4 @@
-"""What an observation adds to snapshots of one wavelength through a perfect instrument: each effect and its checks."""
+"""Observing conditions: sky, transparency, exposure time, band and pixels."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from torchmask.optics.pixel import PixelResponse
 
 @dataclass(frozen=True, kw_only=True)
 class Conditions:
-    """How exposures are taken. The defaults are snapshots of one wavelength by pixels that are points, on a black sky.
+    """Conditions under which exposures are taken. The defaults are monochromatic snapshots by point pixels, no sky.
 
     sky : float
-        Electrons per pixel and frame that no object sends.
+        Sky background [electrons per pixel and frame].
     transparency_scatter : float
-        Standard deviation of the logarithm of each frame's transmission, which is log-normal with mean 1, so the light
-        of the object varies from frame to frame while the sky does not.
+        Standard deviation of the logarithm of the transmission, which is log-normal with mean 1 and drawn for each
+        frame. It scales the light of the object, not the sky.
     exposure_time : float
-        How long a frame lasts, while the wind carries the turbulence on [s].
+        Duration of a frame [s], during which the wind moves the turbulence.
     band : Band, optional
-        Wavelengths and the share of the light at each; the path differences of turbulence are the same for all. None:
-        the wavelength of the grid alone.
+        Wavelengths and their shares of the light. Turbulence has the same path differences at all of them. By default
+        all light has the wavelength of the grid.
     pixel : PixelResponse, optional
-        How the detector's pixels blur the image; None: pixels are points.
+        Blur by the detector's pixels, which are points by default.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Simulated stacks as a torch Dataset, for those who train networks on them."""
+"""Simulated stacks as a torch Dataset, to train networks on."""
 
 from __future__ import annotations
 
@@ -22,31 +22,31 @@ from torchmask.simulation.render import Mesh, load_mesh, render_mesh
 from torchmask.simulation.satellite import satellite_mesh
 
 Range = tuple[float, float]
-"""Lowest and highest value; twice the same to hold it fixed."""
+"""Lowest and highest value; give the same one twice for a constant."""
 
 Scene = Callable[[int, torch.Generator], Tensor]
-"""Gives the target of a stack, (H, W), from the stack's index and a generator that is seeded for it alone."""
+"""Function that returns the target of a stack, (H, W), for the stack's index and a generator seeded for that stack."""
 
 
 @dataclass(frozen=True)
 class StackRanges:
-    """What differs from stack to stack, and how far: each value is drawn between the two that are given.
+    """Ranges of the quantities that are drawn at random for each stack.
 
-    Angles are uniform, the rest log-uniform. Raises ValueError for a range that is not finite, turned round, or out of
-    bounds.
+    Angles are drawn uniformly, other quantities log-uniformly. Raises ValueError for a range that is not finite, in
+    descending order, or out of bounds.
 
     Examples
     --------
-    >>> StackRanges(n_photons=(1e6, 1e6)).r0  # one flux, turbulence as by default
+    >>> StackRanges(n_photons=(1e6, 1e6)).r0  # constant flux, default turbulence
     (0.1, 0.25)
     """
 
     attitude: tuple[Range, Range, Range] = ((-180.0, 180.0), (-180.0, 180.0), (-180.0, 180.0))
-    """Turns of the target about the axes to the right, up and towards the viewer [degrees]."""
+    """Rotation of the target about the axes right, up and towards the viewer [degrees]."""
     sun_angle: Range = (10.0, 70.0)
-    """Angle between the sun and the viewer as the target sees them, in [0, 180]; on all sides alike [degrees]."""
+    """Angle at the target between the sun and the viewer, in [0, 180]; its azimuth is uniform [degrees]."""
     n_photons: Range = (1e6, 1e8)
-    """Electrons per frame, before light leaves the field."""
+    """Electrons per frame, including those that fall outside the field."""
     r0: Range = (0.1, 0.25)
     """Fried parameter at the imaging wavelength [m]."""
 
@@ -67,59 +67,61 @@ class StackRanges:
 class StackDataset(Dataset[dict[str, Tensor]]):
     """Stacks of short exposures of random targets in random flux and turbulence, with the truth.
 
-    Stack i is drawn when it is asked for, from `seed` and i alone: the same whichever worker draws it, in whatever
-    order.
+    Stack i is drawn on demand and depends only on `seed` and i, whichever worker draws it and in whatever order.
 
     Parameters
     ----------
     aperture : Aperture
-        One aperture; a mask that trains on does not change the stacks.
+        Aperture of the telescope, of which a copy is taken: training a mask does not change the stacks.
     grid : Grid
-        Of the frames.
+        Pixels and wavelength of the frames.
     length : int
         Number of stacks.
     n_frames : int
-        Exposures in a stack, T.
+        Number of exposures in a stack, T.
     ranges : StackRanges, optional
+        Ranges of attitude, sunlight, flux and turbulence.
     scene : callable, optional
-        Targets of your own: `scene(index, generator)` gives what stack `index` shows, a tensor (H, W) on the grid's
-        pixels, at least 0 and of any brightness. An archive of images takes the index; chance comes from the
-        generator, never from elsewhere, so that a stack stays the same in every worker. Without it, a mesh in random
-        poses and sunlight.
+        Your own targets: `scene(index, generator)` returns the target of stack `index`, a tensor (H, W) on the grid's
+        pixels that is at least 0 and of any brightness. Use the index to read from an archive of images, and draw
+        random numbers only from the generator, so that every worker gets the same stack. By default the target is a
+        mesh in random attitude and sunlight.
     path : str or Path, optional
-        The mesh (.obj, .stl, .ply, .glb ...); without one, the packaged satellite.
+        File of the mesh (.obj, .stl, .ply, .glb ...); the packaged satellite by default.
     size : float
         Larger side of the mesh's outline as a fraction of the field.
     outer_scale : float
-        Of the turbulence [m].
+        Outer scale of the turbulence [m].
     readout_noise : float
-        Electrons rms per pixel and frame.
+        Read-out noise [electrons rms per pixel and frame].
     seed : int
+        Seed of all stacks, at least 0.
     dtype : torch.dtype
-        Of the simulation and of what it gives.
+        Type of the simulation and of the tensors it returns.
 
     Raises
     ------
     ValueError
-        For a length or number of frames below 1, a negative seed, a mesh file that is missing or damaged or beside a
-        `scene`, a black scene, and whatever `simulate_observation` refuses; for stack 0 when it is made, which takes
-        as long as one stack.
+        If the length or the number of frames is below 1, the seed is negative, the mesh file is missing or damaged,
+        both `path` and `scene` are given, a scene is black, or `simulate_observation` refuses an argument. Stack 0 is
+        drawn at once as a check, which takes as long as drawing any one stack.
     TypeError
-        If `scene` is not callable or gives something other than a tensor.
+        If `scene` is not callable or returns something other than a tensor.
 
     Notes
     -----
-    An item is a dict, as the default collate of a DataLoader batches it, of tensors on the CPU:
+    An item is a dict of tensors on the CPU, which the default collate function of a DataLoader can batch:
 
     frames : (T, H, W) [electrons]
     object : (H, W) the truth, expected electrons per pixel and frame before any blur
     psfs : (T, H, W) centred on pixel [H // 2, W // 2], cropped to the field
-    n_photons, r0 : () of this stack [electrons per frame], [m]
-    attitude, sun : (3,) of the mesh [degrees]; unit vector, right, up and towards the viewer
+    n_photons : () flux [electrons per frame]
+    r0 : () Fried parameter [m]
+    attitude : (3,) rotation of the mesh [degrees], only without `scene`
+    sun : (3,) unit vector towards the sun (right, up, towards the viewer), only without `scene`
 
-    With the start method "spawn", or "forkserver", a script needs the usual `if __name__ == "__main__"`, and `scene`
-    must be a function of a module or another object that can be pickled. For several meshes, use
-    `torch.utils.data.ConcatDataset`.
+    With the start methods "spawn" and "forkserver", a script needs the usual `if __name__ == "__main__"`, and `scene`
+    must be picklable, such as a function of a module. For several meshes, use `torch.utils.data.ConcatDataset`.
 
     Examples
     --------
@@ -131,7 +133,7 @@ class StackDataset(Dataset[dict[str, Tensor]]):
     >>> batch["frames"].shape, batch["object"].shape
     (torch.Size([2, 4, 32, 32]), torch.Size([2, 32, 32]))
 
-    Own scenes, here three stars:
+    With your own scenes, here three stars:
 
     >>> def stars(index, generator):
     ...     image = torch.zeros(32, 32)
@@ -165,7 +167,7 @@ class StackDataset(Dataset[dict[str, Tensor]]):
         if scene is not None and not callable(scene):
             raise TypeError(f"scene is a {type(scene).__name__}: it must be a function of an index and a generator")
         if scene is not None and path is not None:
-            raise ValueError("scene and path are two targets: give one of them")
+            raise ValueError("both scene and path are given: give only one of them")
         self.aperture: Aperture = aperture.still().to("cpu", dtype)
         self.grid = grid
         self.length: int = int(length)
@@ -178,7 +180,7 @@ class StackDataset(Dataset[dict[str, Tensor]]):
         self.dtype = dtype
         self.scene = scene
         self._mesh = None if scene is not None else satellite_mesh() if path is None else load_mesh(path)
-        self[0]  # refuses what cannot be simulated now rather than in a worker
+        self[0]  # raises errors here rather than in a worker
 
     def __len__(self) -> int:
         return self.length
@@ -206,21 +208,21 @@ class StackDataset(Dataset[dict[str, Tensor]]):
         return arrays | {name: torch.tensor(value, **like) for name, value in conditions.items()}
 
     def _posed(self, mesh: Mesh, random: np.random.Generator) -> tuple[Tensor, dict[str, Any]]:
-        """The mesh as it is seen this time, and how it is turned and lit."""
+        """Render the mesh in a random attitude and sunlight, and return the image and both."""
         attitude = [random.uniform(*turn) for turn in self.ranges.attitude]
         sun = _direction(math.radians(random.uniform(*self.ranges.sun_angle)), random.uniform(0, 2 * math.pi))
         image = render_mesh(mesh, self.grid.shape, attitude=attitude, sun=sun, size=self.size, device="cpu")
         return image, {"attitude": attitude, "sun": sun}
 
     def _own(self, index: int, random: np.random.Generator) -> tuple[Tensor, dict[str, Any]]:
-        """What the caller's scene gives, checked as far as its brightness is concerned."""
+        """Return the image of the caller's scene, after checking its type and its brightness."""
         assert self.scene is not None
         image = self.scene(index, _seeded(random))
         if not isinstance(image, Tensor):
-            raise TypeError(f"scene({index}, generator) gave a {type(image).__name__}: it must give a tensor (H, W)")
+            raise TypeError(f"scene({index}, generator) gave a {type(image).__name__}: it must return a tensor (H, W)")
         light = float(image.sum())
         if not light > 0:
-            raise ValueError(f"scene({index}, generator) gave {light:.3g} as its light: it must be positive")
+            raise ValueError(f"scene({index}, generator) gave an image with a sum of {light:.3g}: it must be positive")
         return image.detach().to("cpu", torch.float64), {}
 
 
@@ -229,7 +231,7 @@ def _seeded(random: np.random.Generator) -> torch.Generator:
 
 
 def _direction(polar: float, azimuth: float) -> tuple[float, float, float]:
-    """Unit vector at an angle `polar` from the viewer."""
+    """Return the unit vector at an angle `polar` from the direction to the viewer."""
     return math.sin(polar) * math.cos(azimuth), math.sin(polar) * math.sin(azimuth), math.cos(polar)
 
 

@@ -1,4 +1,4 @@
-"""The PSF of an exposure that lasts, in a band of wavelengths, seen by pixels that have a size."""
+"""The PSF of an exposure with finite duration, bandwidth and pixel size."""
 
 from __future__ import annotations
 
@@ -17,17 +17,18 @@ from torchmask.optics.pupil import Aperture, PupilSamples
 
 
 class ExposedPSF:
-    """From the phases that a wavefront has in turn to the PSF of the exposure.
+    """PSF of an exposure, computed from the successive phases of its wavefront.
 
     Parameters
     ----------
     aperture : Aperture
+        Aperture through which the exposure is taken.
     grid : Grid
-        Phases are those at its wavelength.
+        Pixels of the image, and the wavelength at which phases are given.
     band : Band, optional
-        None: the wavelength of the grid alone.
+        Wavelengths and their shares of the light; the wavelength of the grid by default.
     pixel : PixelResponse, optional
-        None: pixels are points.
+        Blur by the detector's pixels, which are points by default.
 
     Raises
     ------
@@ -36,9 +37,9 @@ class ExposedPSF:
 
     Notes
     -----
-    The pupil is sampled once, for the shortest wavelength. A path difference is a phase in proportion to
-    1 / wavelength, and a longer wavelength makes an image that is wider in proportion: as intensities are
-    band-limited, their Fourier series takes it to the pixels exactly.
+    The pupil is sampled once, for the shortest wavelength. Phases scale as 1 / wavelength. The image at a longer
+    wavelength is wider in proportion; because intensities are band-limited, their Fourier series resamples it onto the
+    pixels exactly.
 
     Examples
     --------
@@ -64,10 +65,10 @@ class ExposedPSF:
         self.blur: Tensor | None = None if pixel is None else _transfer(pixel, self.samples.raster, like)
 
     def __call__(self, phases: Iterable[Tensor | None]) -> Tensor:
-        """The PSF (rows, columns) on the raster of `samples`, origin at [0, 0]: the mean over `phases` (N, P) [rad].
+        """Return the mean PSF (rows, columns) over `phases` (N, P) [rad], on the raster of `samples`, origin at [0, 0].
 
-        None is a perfect wavefront. The sum is 1 for the shortest wavelength; light of longer ones that falls outside
-        the raster is missing.
+        A phase of None is a perfect wavefront. At the shortest wavelength the PSF has unit sum; at longer ones the
+        light that falls outside the raster is missing.
         """
         count, images = 0, [torch.zeros(()) for _ in self.shares]
         for count, phase in enumerate(phases, 1):
@@ -86,9 +87,10 @@ class ExposedPSF:
 
 
 def _widen(raster: tuple[int, int], factor: float, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Matrices for rows and columns that make an image on a periodic raster wider by `factor` >= 1 around [0, 0].
+    """Return matrices for rows and columns that widen an image by `factor` >= 1 around [0, 0] of a periodic raster.
 
-    They evaluate its Fourier series, of an even number of samples, and keep the light of what stays on the raster.
+    They evaluate the Fourier series of the image, whose number of samples is even, and conserve the light that stays on
+    the raster.
     """
     matrices = []
     for size in raster:

@@ -1,8 +1,8 @@
-"""The end-to-end simulation of a stack of short exposures.
+"""End-to-end simulation of a stack of short exposures.
 
-It shares no model with the inversion: the turbulent phase is sampled within each sub-aperture rather than
-expanded in modes, on a pupil raster four times as fine, whose image is four times as wide as the field, and light that
-leaves the field is lost.
+It shares no model with the inversion. The turbulent phase is sampled within each sub-aperture rather than expanded in
+modes, on a pupil raster four times as fine, so that the image is four times as wide as the field, and light that leaves
+the field is lost.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from torchmask.simulation.wavefronts import (
     with_layers,
 )
 
-_CHUNK = 2**21  # pixels of unfolded PSFs: frames of about as many have their noise drawn together
-_MIDDLE = (0.0, 0.0)  # of the field: direction [rad]
+_CHUNK = 2**21  # pixels of unfolded PSFs whose frames are processed together
+_MIDDLE = (0.0, 0.0)  # direction [rad] of the middle of the field
 
 
 def simulate_observation(
@@ -50,47 +50,49 @@ def simulate_observation(
     keep_phases: bool = False,
     callback: Callback | None = None,
 ) -> Observation:
-    """Draw short exposures of a scene, end to end.
+    """Simulate short exposures of a scene, end to end.
 
     Parameters
     ----------
     scene : (H, W) tensor
-        Expected electrons per pixel and frame before any blur; its sum is the number of photons that the aperture
-        collects in a frame. All of it lies within the field.
+        Expected electrons per pixel and frame before any blur, none of them outside the field. The sum is the number
+        of photons that the aperture collects in a frame.
     aperture : Aperture
         One aperture, without leading axes.
     grid : Grid
+        Pixels and wavelength of the frames.
     turbulence : TurbulencePhase, LayeredPhase or None
-        With layers in height the PSF varies over the field. None for a perfect atmosphere.
+        Random phase of the atmosphere; None for a perfect one. With layers at height the PSF varies over the field.
     detector : Detector
+        Noise of the detector.
     n_frames : int
+        Number of exposures.
     generator : torch.Generator, optional
-        Seeds one stream for the screens and one for the noise: another flux or read-out noise leaves the screens as
-        they were.
+        Source of randomness. It seeds separate streams for the screens and for the noise, so the screens do not depend
+        on the flux or the read-out noise.
     conditions : Conditions, optional
-        Sky, transparency, exposure time, band and pixels. None: snapshots of one wavelength on a black sky.
+        Sky, transparency, exposure time, band and pixels. By default, monochromatic snapshots on a black sky.
     told : Aperture, optional
-        What the observer takes the aperture for, if that is not what the light goes through: it stands in the
-        observation, with the true one as `true_aperture`.
+        Aperture that the observer believes was used, if it differs from `aperture`. The observation then has it as its
+        `aperture` and the real one as its `true_aperture`.
     keep_phases : bool
-        Whether the observation keeps the phase of every frame's wavefront (`Observation.phases`), to compare with a
-        restored one: in the middle of the field, flat for a perfect atmosphere, and for snapshots of one wavelength
-        only.
+        Whether the observation keeps the phase of every frame in the middle of the field (`Observation.phases`), for
+        comparison with a restored one. Only for monochromatic snapshots.
     callback : callable, optional
         Receives a `Record` of stage "simulation" after each chunk of frames, with the frames so far.
 
     Returns
     -------
     Observation
-        Of the scene's dtype and device, detached; phases have the dtype of the aperture, in which they were drawn.
+        Frames and truth with the dtype and device of the scene, detached; phases have the dtype of the aperture.
 
     Raises
     ------
     ValueError
-        If the scene does not fit the grid, is negative, black or not finite, the aperture is a population,
-        `n_frames` is below 1, the grid samples the aperture too coarsely at the shortest wavelength, an exposure lasts
-        under turbulence without wind or longer than the frames are apart, or phases are to be kept of what is no
-        snapshot of one wavelength through the aperture that is told.
+        If the scene does not fit the grid or is negative, black or not finite; the aperture is a population;
+        `n_frames` is below 1; the grid samples the aperture too coarsely at the shortest wavelength; `exposure_time`
+        is given but the turbulence has no wind, or it exceeds the time between frames; or `keep_phases` is combined
+        with `exposure_time`, `band` or `told`.
 
     Examples
     --------
@@ -106,13 +108,13 @@ def simulate_observation(
     >>> observation.frames.shape
     torch.Size([4, 32, 32])
 
-    How far the phases of a restoration's coefficients are from the truth, both on the same samples, [rad] rms over the
-    open pupil and free of each frame's mean piston, which no image shows:
+    The rms error [rad] of restored phases over the open pupil, without the mean piston of each frame, which no image
+    shows:
 
     >>> observation = simulate_observation(
     ...     scene, mask, Grid.nyquist(1.0, 550e-9, 32), TurbulencePhase(0.15, 20.0), Detector(1.5), n_frames=4,
     ...     keep_phases=True)
-    >>> coefficients = torch.zeros(4, 3, 6, dtype=torch.float64)  # of a restoration: (frame, hole, mode)
+    >>> coefficients = torch.zeros(4, 3, 6, dtype=torch.float64)  # from a restoration: (frame, hole, mode)
     >>> phase = ZernikePhase(mask, observation.grid, n_modes=6, oversampling=PHASE_OVERSAMPLING)
     >>> wrong = phase(coefficients) - observation.phases
     >>> weights = mask.samples(observation.grid, PHASE_OVERSAMPLING).weights
@@ -128,8 +130,8 @@ def simulate_observation(
     delays = exposure_delays(turbulence, conditions.exposure_time)
     if keep_phases and (len(delays) > 1 or conditions.band is not None or told is not None):
         raise ValueError(
-            "keep_phases is for snapshots of one wavelength through the aperture that is told: leave out "
-            "exposure_time, band and told, or it"
+            "keep_phases needs monochromatic snapshots through a known aperture: leave out exposure_time, band and "
+            "told, or keep_phases"
         )
     device = None if generator is None else generator.device
     screens_seed, noise_seed = torch.randint(2**62, (2,), generator=generator, device=device).tolist()
@@ -156,7 +158,7 @@ def simulate_observation(
                 callback(Record("simulation", now.stop, n_frames, {"kept_light": light}, arrays))
     return Observation(
         frames=frames,
-        aperture=(told or aperture).still(),  # a mask that trains on does not change the past
+        aperture=(told or aperture).still(),  # a copy, because the caller's mask may be trained later
         grid=grid,
         readout_noise=detector.readout_noise,
         object=scene,
@@ -174,7 +176,7 @@ def simulate_observation(
 def _expose(
     points: Sequence[FieldPoint], optics: ExposedPSF, wavefront: Wavefront, scene: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """The expected image (H, W) of one frame without the sky, and the PSF of the middle of the field, centred."""
+    """Return the expected image (H, W) of one frame without sky, and the centred PSF of the middle of the field."""
     images, centred = [], None
     for direction, light in points:
         psf = optics(wavefront(direction)).to(scene)
@@ -187,7 +189,7 @@ def _expose(
 
 
 def _draw_transmission(n_frames: int, scatter: float, generator: torch.Generator | None) -> Tensor:
-    """(n_frames,) log-normal with mean 1. The stream of the screens and that of the noise do not know of it."""
+    """Draw the transmission (n_frames,) of each frame, log-normal with mean 1, from a stream of its own."""
     if scatter == 0:
         return torch.ones(n_frames, dtype=torch.float64, device="cpu")
     own = torch.Generator().manual_seed(draw_seed(generator))
@@ -217,6 +219,6 @@ def _check(scene: Tensor, aperture: Aperture, grid: Grid, n_frames: int) -> None
 
 
 def _centre(psfs: Tensor, shape: tuple[int, int]) -> Tensor:
-    """Crop PSFs with their origin at [0, 0] to `shape`, the origin at its middle."""
+    """Crop PSFs with their origin at [0, 0] to `shape`, with the origin in the middle."""
     middle = (shape[0] // 2, shape[1] // 2)
     return psfs.roll(middle, dims=(-2, -1))[..., : shape[0], : shape[1]].clone()

@@ -1,4 +1,4 @@
-"""PSFs that vary over the field: where they are computed, and how much of the scene's light belongs to each."""
+"""Points of the field at which a varying PSF is computed, and the light of the scene that each of them stands for."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from torch import Tensor
 from torchmask.atmosphere.layers import Vector
 from torchmask.grid import Grid
 
-SPACING = 0.5  # of the points, in units of theta0
+SPACING = 0.5  # distance between points in units of theta0
 
 
 class FieldPoint(NamedTuple):
-    """A point of the field whose PSF stands for its surroundings.
+    """A point of the field whose PSF is used for the light around it.
 
     direction : (x, y) from the middle of the field [rad]
-    light : (H, W) the part of the scene that is blurred by this PSF
+    light : (H, W) part of the scene that this PSF blurs
     """
 
     direction: Vector
@@ -26,10 +26,11 @@ class FieldPoint(NamedTuple):
 
 
 def field_points(scene: Tensor, grid: Grid, spacing: float) -> list[FieldPoint]:
-    """Points at most `spacing` [rad] apart that enclose all light of a scene (H, W), and their shares of it.
+    """Return points at most `spacing` [rad] apart that enclose the light of a scene (H, W), and their shares of it.
 
-    Between four points the PSF is interpolated bilinearly: the light of each pixel is divided among them, so the frame
-    is the sum of as many images. With an infinite spacing there is one point, in the middle of the field.
+    The light of each pixel is divided bilinearly among the four points around it, which interpolates the PSF between
+    them; the frame is the sum of the images of all points. With an infinite spacing there is one point, in the middle
+    of the field.
 
     Examples
     --------

@@ -19,19 +19,19 @@ from torchmask.io import extra
 
 Array = NDArray[np.float64]
 
-_SAMPLES = 1024  # samples of a rendering on a side, at least, before they are averaged into pixels
-_FRAGMENTS = 1 << 21  # samples handled at once
-_EDGE_ON = 1e-9  # a face whose normal is this close to the image plane shows no area
-_MAX_SLOPE = 10.0  # of a face towards the sun, for the tolerance of the shadow test
+_SAMPLES = 1024  # minimum samples on the longer side of a rendering, before they are averaged into pixels
+_FRAGMENTS = 1 << 21  # samples processed together
+_EDGE_ON = 1e-9  # a face whose normal is this close to the image plane is seen edge-on and skipped
+_MAX_SLOPE = 10.0  # limit on the slope of a face towards the sun, in the tolerance of the shadow test
 
 
 class Mesh(NamedTuple):
-    """Triangles and how they reflect light.
+    """Triangles and their reflectance.
 
-    triangles : (F, 3, 3) corners (x, y, z), any unit of length; faces are two-sided, so their winding is free
+    triangles : (F, 3, 3) corners (x, y, z) in any unit of length; faces are two-sided, so either winding will do
     albedo : (F,) Lambertian reflectance
-    specular : (F,) strength of the mirror-like reflection
-    shininess : (F,) exponent of its lobe: the larger, the sharper the glint
+    specular : (F,) strength of the specular reflection
+    shininess : (F,) exponent of the specular lobe: the larger, the sharper the glint
     """
 
     triangles: Array
@@ -41,15 +41,15 @@ class Mesh(NamedTuple):
 
 
 def load_mesh(path: str | Path) -> Mesh:
-    """Read a mesh by trimesh (.obj with its .mtl, .stl, .ply, .glb, .off ...).
+    """Read a mesh with trimesh (.obj with its .mtl, .stl, .ply, .glb, .off ...).
 
-    The albedo of a face is the mean of its material's red, green and blue (textures are not read), or the colour
-    of the face itself where the file has no materials. Faces are matt: `specular` is 0.
+    The albedo of a face is the mean of the red, green and blue of its material (textures are not read), or of the
+    face's own colour if the file has no materials. Faces are matt: `specular` is 0.
 
     Raises
     ------
     ValueError
-        If the file is missing, cannot be read, or holds no triangle or a corner that is not finite.
+        If the file is missing, cannot be read, has no triangle, or has a corner that is not finite.
     """
     with extra("data"):
         import trimesh
@@ -59,13 +59,13 @@ def load_mesh(path: str | Path) -> Mesh:
         raise ValueError(f"there is no mesh file {path}")
     try:
         parts = [p for p in trimesh.load_scene(path, process=False).dump() if isinstance(p, trimesh.Trimesh)]
-    except Exception as error:  # the readers of the many formats fail in as many ways
+    except Exception as error:  # each format has its own reader, with its own exceptions
         raise ValueError(f"{path} cannot be read as a mesh: {error}") from error
     if not sum(len(part.faces) for part in parts):
         raise ValueError(f"the mesh {path} is empty: it needs at least one triangle")
     triangles = np.concatenate([np.asarray(part.triangles, dtype=float) for part in parts])
     if not np.isfinite(triangles).all():
-        raise ValueError(f"the mesh {path} holds corners that are not finite")
+        raise ValueError(f"the mesh {path} has corners that are not finite: repair the file")
     albedo = np.concatenate([_albedo(part) for part in parts])
     matt = np.zeros(len(triangles))
     return Mesh(triangles, albedo, matt, matt + 1)
@@ -88,36 +88,42 @@ def render_mesh(
     dtype: torch.dtype | None = None,
     device: torch.device | str | None = None,
 ) -> Tensor:
-    """Radiance of a sunlit mesh as a distant viewer sees it.
+    """Render the radiance of a sunlit mesh as a distant viewer sees it.
 
     Each face reflects `albedo (ambient + n.s) + specular (n.h)^shininess`, with s the direction of the sun and h
-    midway between sun and viewer (Blinn 1977), and only the first term's ambient part where it lies in shadow.
-    Hidden surfaces and shadows come from z-buffers of at least 4 x 4 samples a pixel, which the pixel averages.
+    midway between sun and viewer (Blinn 1977). In shadow, only `albedo ambient` remains. Hidden surfaces and shadows
+    are found by z-buffers with at least 4 x 4 samples per pixel, which are averaged.
 
     Parameters
     ----------
     mesh : Mesh
+        Triangles and their reflectance.
     shape : (int, int)
         Rows and columns of the image.
     attitude : (float, float, float)
-        Degrees by which the mesh is turned about the fixed axes x (to the right), then y (up), then z (towards the
-        viewer, anticlockwise in the image).
+        Rotation [degrees] about the fixed axes x (to the right), then y (up), then z (towards the viewer,
+        anticlockwise in the image).
     sun : (float, float, float)
-        Direction in which the sun stands, (x, y, z) as the viewer sees it; its length is free.
+        Direction of the sun, (x, y, z) in the viewer's frame, of any length.
     size : float
-        The larger side of the mesh's outline as a fraction of the field, in (0, 1]; the outline is centred.
+        Larger side of the mesh's outline as a fraction of the field, in (0, 1]; the outline is centred.
     ambient : float
-        Light that comes from all sides, relative to the sun's.
+        Ambient light relative to that of the sun.
+    dtype : torch.dtype, optional
+        Type of the image, float64 by default.
+    device : torch.device, optional
+        Device of the image.
 
     Returns
     -------
-    (rows, columns) tensor, non-negative, arbitrary units, row 0 at the top, background exactly 0.
+    Tensor
+        (rows, columns), non-negative, in arbitrary units, row 0 at the top, background exactly 0.
 
     Raises
     ------
     ValueError
-        For a mesh without extent, an attitude that is not finite, a sun without direction, a `size` outside (0, 1],
-        a negative `ambient`, or if no light reaches the viewer.
+        If the mesh has no extent, the attitude is not finite, the sun is not a direction, `size` lies outside (0, 1],
+        `ambient` is negative, or no light reaches the viewer.
 
     Examples
     --------
@@ -140,7 +146,7 @@ def render_mesh(
     rows, columns = np.nonzero(seen)
     normals = _normals(triangles)
     points = np.stack([columns + 0.5, rows + 0.5, depth[seen]], axis=-1, dtype=np.float64)
-    # Rows run downwards, so that the raster's y axis is minus the viewer's.
+    # Rows run downwards, so the raster's y axis is the reverse of the viewer's.
     sun_raster = towards_sun * (1, -1, 1)
     lit = _sunlit(triangles, points, normals[face[seen]], sun_raster)
     diffuse, glint = _reflect(mesh, normals, sun_raster)
@@ -148,12 +154,12 @@ def render_mesh(
     light[seen] = mesh.albedo[face[seen]] * ambient + lit * (diffuse + glint)[face[seen]]
     image = light.reshape(shape[0], samples, shape[1], samples).mean(axis=(1, 3))
     if not image.any():
-        raise ValueError("the rendering is black: no face that reflects light is lit, so move the sun")
+        raise ValueError("the rendering is black because no reflecting face is lit: change sun or attitude")
     return torch.as_tensor(image, dtype=dtype or torch.float64, device=device)
 
 
 def _check_view(attitude: Sequence[float], sun: Sequence[float]) -> tuple[Array, Array]:
-    """Rotation matrix of the attitude and unit vector towards the sun."""
+    """Return the rotation matrix of the attitude and the unit vector towards the sun."""
     from scipy.spatial.transform import Rotation
 
     angles, direction = np.asarray(attitude, dtype=float), np.asarray(sun, dtype=float)
@@ -166,7 +172,7 @@ def _check_view(attitude: Sequence[float], sun: Sequence[float]) -> tuple[Array,
 
 
 def _to_raster(triangles: Array, raster: tuple[int, int], size: float) -> Array:
-    """Scale and centre so that x is the column, y the row (downwards) and z the nearness, in samples."""
+    """Scale and centre the triangles so that x is the column, y the row (downwards) and z the nearness, in samples."""
     low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
     extent = high - low
     if not (np.isfinite(extent).all() and extent[:2].max() > 0):
@@ -178,14 +184,14 @@ def _to_raster(triangles: Array, raster: tuple[int, int], size: float) -> Array:
 
 
 def _normals(triangles: Array) -> Array:
-    """Unit normals on the viewer's side (F, 3); zero for a face without area."""
+    """Return the unit normals (F, 3) on the viewer's side; zero for a face without area."""
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     length = np.linalg.norm(normals, axis=-1, keepdims=True)
     return normals / np.where(length > 0, length, 1) * np.where(normals[:, 2:] < 0, -1, 1)
 
 
 def _reflect(mesh: Mesh, normals: Array, sun: Array) -> tuple[Array, Array]:
-    """Diffuse and mirror-like light of every face that the sun reaches, (F,) each."""
+    """Return the diffuse and the specular light, (F,) each, of every face as if the sun reached it."""
     incidence = np.clip(normals @ sun, 0, None)
     halfway = sun + (0, 0, 1)
     halfway = halfway / max(float(np.linalg.norm(halfway)), 1e-12)
@@ -194,17 +200,17 @@ def _reflect(mesh: Mesh, normals: Array, sun: Array) -> tuple[Array, Array]:
 
 
 def _sunlit(triangles: Array, points: Array, normals: Array, sun: Array) -> NDArray[np.bool_]:
-    """Which of the points (P, 3) on faces with `normals` (P, 3) see the sun, by a z-buffer as the sun sees it.
+    """Return which of the points (P, 3), on faces with `normals` (P, 3), see the sun, from a z-buffer seen by the sun.
 
     The buffer is read at the nearest sample, where a face of slope t towards the sun may differ from the point by
-    t / sqrt(2) samples: anything nearer to the sun than that and a little is another face, which casts a shadow.
+    t / sqrt(2) samples. Anything nearer to the sun than that, plus a margin, is another face and casts a shadow.
     """
     across = np.cross(sun, (0.0, 1.0, 0.0) if abs(sun[1]) < 0.9 else (1.0, 0.0, 0.0))
     across /= np.linalg.norm(across)
     axes = np.stack([across, np.cross(sun, across), sun], axis=-1)
     faces, points = triangles @ axes, points @ axes
     low, high = faces.min(axis=(0, 1)), faces.max(axis=(0, 1))
-    scale = min(1.0, 2 * _SAMPLES / (high - low)[:2].max())  # a mesh seen end-on may be long beside its image
+    scale = min(1.0, 2 * _SAMPLES / (high - low)[:2].max())  # a mesh seen end-on may be much longer than its image
     faces, points = (faces - low) * scale, (points - low) * scale
     side = np.ceil((high - low)[:2] * scale).astype(int) + 1
     depth, _ = _z_buffer(faces, (side[1], side[0]))
@@ -215,7 +221,7 @@ def _sunlit(triangles: Array, points: Array, normals: Array, sun: Array) -> NDAr
 
 
 def _z_buffer(triangles: Array, raster: tuple[int, int]) -> tuple[Array, NDArray[np.int64]]:
-    """Nearness (-inf where nothing is) and index (-1) of the nearest face at every sample of the raster.
+    """Return the nearness and the index of the nearest face at every sample, -inf and -1 where there is none.
 
     `triangles` (F, 3, 3) are (column, row, nearness) in samples, within the raster; samples lie at half-integers.
     """
@@ -224,7 +230,7 @@ def _z_buffer(triangles: Array, raster: tuple[int, int]) -> tuple[Array, NDArray
     slopes = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     faces = np.flatnonzero(np.abs(slopes[:, 2]) > _EDGE_ON * np.linalg.norm(slopes, axis=-1))
     lowest, highest = triangles[..., 2].min(-1), triangles[..., 2].max(-1)
-    # The bounding box bounds the work of a face; batches of bounded work bound the memory.
+    # A face covers at most its bounding box; batches of limited total area limit the memory.
     work = np.cumsum(np.prod(np.ptp(triangles[faces, :, :2], axis=1) + 1, axis=-1))
     for batch in np.split(faces, np.flatnonzero(np.diff(work // _FRAGMENTS)) + 1):
         face, row, column = _fragments(triangles, batch)
@@ -239,7 +245,7 @@ def _z_buffer(triangles: Array, raster: tuple[int, int]) -> tuple[Array, NDArray
 
 
 def _fragments(triangles: Array, faces: NDArray[np.int64]) -> tuple[NDArray[np.int64], ...]:
-    """(face, row, column) of every sample covered by every face: rows of each face, then the span of each row."""
+    """Return (face, row, column) of every sample that each face covers: its rows, then the span of each row."""
     y = triangles[faces, :, 1]
     which, row = _ranges(np.ceil(y.min(-1) - 0.5), np.floor(y.max(-1) - 0.5))
     face = faces[which]
@@ -257,7 +263,7 @@ def _fragments(triangles: Array, faces: NDArray[np.int64]) -> tuple[NDArray[np.i
 
 
 def _ranges(first: Array, last: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """All whole numbers first[i] .. last[i], one after another, and the i they belong to."""
+    """Return the integers from first[i] to last[i] for all i, concatenated, preceded by the i of each."""
     with np.errstate(invalid="ignore"):
         count = np.nan_to_num(np.clip(last - first + 1, 0, None), nan=0, posinf=0).astype(np.int64)
     which = np.repeat(np.arange(len(count)), count)

@@ -1,4 +1,4 @@
-"""A satellite as 3-D geometry: the packaged scene, so that a first run needs no file."""
+"""A satellite as 3-D geometry, the packaged scene, so that a first run needs no file."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class _Material(NamedTuple):
     shininess: float
 
 
-_FOIL = _Material(0.55, 0.5, 12)  # golden insulation, wrinkled: a broad lobe
+_FOIL = _Material(0.55, 0.5, 12)  # golden insulation, whose wrinkles give it a broad lobe
 _SEAM = _Material(0.22, 0.1, 12)
 _WHITE = _Material(0.85, 0.05, 5)  # paint of dish and instruments
 _RADIATOR = _Material(0.75, 0.8, 60)
@@ -27,10 +27,10 @@ _DARK = _Material(0.06, 0.05, 5)
 
 
 def satellite_mesh() -> Mesh:
-    """A communication satellite in metres: bus, two wings of solar cells, dish, booms, nozzle and instruments.
+    """Return a communication satellite in metres: bus, two solar wings, dish, booms, nozzle and instruments.
 
-    The wings stretch along x, the dish opens towards +z and the nozzle towards -y; about 9 m from wing tip to wing
-    tip. Wings and dish are turned a little against the bus so that they catch the sun at different times.
+    The wings stretch along x, about 9 m from tip to tip; the dish opens towards +z and the nozzle towards -y. Wings and
+    dish are turned slightly against the bus so that they catch the sun at different times.
 
     Examples
     --------
@@ -48,7 +48,7 @@ _Part = tuple[Array, _Material]
 
 
 def _bus() -> list[_Part]:
-    """Box of 1.8 x 2.4 x 1.6 m, its sides clad in tiles of foil with seams, a radiator towards -x and +x."""
+    """Return a box of 1.8 x 2.4 x 1.6 m, clad in tiles of foil with seams, with radiators on the -x and +x faces."""
     half = np.array([0.9, 1.2, 0.8])
     parts: list[_Part] = []
     for axis in range(3):
@@ -64,7 +64,7 @@ def _bus() -> list[_Part]:
 
 
 def _wing(side: int) -> list[_Part]:
-    """Yoke and three panels of cells, on the +x (`side` 1) or -x (-1) face, pitched by 25 degrees about x."""
+    """Return a yoke and three panels of cells on the +x (`side` 1) or -x (-1) face, pitched by 25 degrees about x."""
     pitch = np.radians(25.0)
     chord = np.array([0.0, np.cos(pitch), -np.sin(pitch)])
     width, length, gap = 1.8, 1.05, 0.12
@@ -81,7 +81,7 @@ def _wing(side: int) -> list[_Part]:
 
 
 def _dish() -> list[_Part]:
-    """Paraboloid on an arm above the bus, with a feed on three struts."""
+    """Return a paraboloid on an arm above the bus, with a feed on three struts."""
     radius, depth = 1.1, 0.36
     r = np.linspace(0.0, radius, 9)
     turn = _rotation((-35.0, 25.0, 0.0), (0.15, 2.15, 0.3))
@@ -95,7 +95,7 @@ def _dish() -> list[_Part]:
 
 
 def _booms() -> list[_Part]:
-    """A magnetometer boom with a box at its end, and two whip aerials."""
+    """Return a magnetometer boom with a box at its end, and two whip aerials."""
     tip = np.array([-1.6, 3.2, 1.1])
     return [
         _rod(np.array([-0.85, 1.15, 0.7]), tip, 0.04, _METAL),
@@ -106,14 +106,14 @@ def _booms() -> list[_Part]:
 
 
 def _nozzle() -> list[_Part]:
-    """Apogee engine below the bus."""
+    """Return the apogee engine below the bus."""
     turn = _rotation((90.0, 0.0, 0.0), (0.0, -1.2, 0.0))
     bell = np.array([[0.2, 0.0], [0.15, 0.15], [0.30, 0.4], [0.45, 0.75]])
     return [(_revolve(bell, 24) @ turn[:3, :3].T + turn[:3, 3], _METAL)]
 
 
 def _instruments() -> list[_Part]:
-    """Two telescopes, a box of electronics and a sun sensor on the +z face."""
+    """Return two telescopes, a box of electronics and a sun sensor on the +z face."""
     parts: list[_Part] = []
     for x, y, radius, length in ((-0.35, 0.5, 0.3, 0.7), (0.42, 0.72, 0.17, 0.5)):
         turn = _rotation((0.0, 0.0, 0.0), (x, y, 0.8))
@@ -130,9 +130,9 @@ def _instruments() -> list[_Part]:
 def _tiles(
     corner: Array, along: Array, up: Array, cells: tuple[int, int], gap: float, tile: _Material, seam: _Material
 ) -> list[_Part]:
-    """A flat panel from `corner` with edges `along` and `up`, cut into cells with seams of `gap` cells' width.
+    """Return a flat panel from `corner` with edges `along` and `up`, cut into cells with seams of `gap` cells' width.
 
-    Tiles and seams are cut from one plane, never laid over each other: coincident faces would fight for the depth.
+    Tiles and seams are cut from one plane, because overlapping coplanar faces would be ambiguous in the z-buffer.
     """
     lines = [
         np.concatenate([[0.0], *([(k + gap / 2) / n, (k + 1 - gap / 2) / n] for k in range(n)), [1.0]]) for n in cells
@@ -146,7 +146,7 @@ def _tiles(
 
 
 def _revolve(profile: Array, sections: int) -> Array:
-    """Triangles (F, 3, 3) of the profile (radius, height) turned about z."""
+    """Return the triangles (F, 3, 3) of the profile (radius, height) revolved about z."""
     with extra("data"):
         import trimesh
 
@@ -168,7 +168,7 @@ def _box(centre: Any, extents: tuple[float, float, float], material: _Material) 
 
 
 def _rotation(degrees: tuple[float, float, float], origin: tuple[float, float, float]) -> Array:
-    """Homogeneous transform: turned about the axes x, y, z in that order, then moved to `origin`."""
+    """Return the homogeneous transform that turns about the axes x, y, z in that order, then moves to `origin`."""
     with extra("data"):
         import trimesh
 

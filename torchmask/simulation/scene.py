@@ -1,4 +1,4 @@
-"""What the telescope looks at: a packaged satellite, any mesh, or an image, as expected electrons per pixel."""
+"""Scenes for the telescope, in expected electrons per pixel: a packaged satellite, any mesh, or an image."""
 
 from __future__ import annotations
 
@@ -19,29 +19,30 @@ IMAGE_SUFFIXES = (".npz", ".png", ".fits")
 OBLIQUE_VIEW = (25.0, -30.0, 15.0)
 OBLIQUE_SUN = (-0.5, 0.6, 0.7)
 
-_ROUNDING = 1e-9  # of the interpolation weights of an image that is turned
+_ROUNDING = 1e-9  # rounding error of the interpolation weights of a rotated image
 
 
 @dataclass(frozen=True)
 class SceneOptions:
-    """Which target, and how it is seen.
+    """Target of a scene, with its attitude, sunlight and size.
 
-    Raises ValueError if `size` lies outside (0, 1]; the rest is checked by `make_scene`.
+    Raises ValueError if `size` lies outside (0, 1]; `make_scene` checks the rest.
 
     Examples
     --------
     >>> small, turned = SceneOptions(size=0.3), SceneOptions(attitude=(0.0, 90.0, 0.0))
     >>> scene = make_scene((64, 64), n_photons=1e7, options=small)
-    >>> max(int((scene > 0).any(axis).sum()) for axis in (0, 1))  # rows or columns it reaches into: 0.3 x 64
+    >>> max(int((scene > 0).any(axis).sum()) for axis in (0, 1))  # lit rows or columns, 0.3 x 64 rounded up
     20
     """
 
     path: Path | None = None
-    """Mesh (.obj, .stl, .ply, .glb ...) or image (.npz with key image, .png, .fits); None: a packaged satellite."""
+    """Mesh (.obj, .stl, .ply, .glb ...) or image (.npz with key image, .png, .fits); default: the packaged satellite."""
     attitude: tuple[float, float, float] | None = None
-    """Turn about the axes right, up, towards the viewer [degrees]; None: 25 -30 15, images upright, turned in plane."""
+    """Rotation about the axes right, up, towards the viewer [degrees]; 25 -30 15 by default, 0 0 0 for images, which
+    rotate only about the last."""
     sun: tuple[float, float, float] | None = None
-    """Direction of the sun: right, up, towards the viewer, any length; None: -0.5 0.6 0.7; images bring their light."""
+    """Direction of the sun (right, up, towards the viewer), of any length; -0.5 0.6 0.7 by default. Only for meshes."""
     size: float = 0.7
     """Larger side of the target as a fraction of the field."""
 
@@ -58,15 +59,20 @@ def make_scene(
     dtype: torch.dtype | None = None,
     device: torch.device | str | None = None,
 ) -> Tensor:
-    """Expected electrons per pixel and frame of a target on a black sky, before any blur.
+    """Make the scene of a target on a black sky, in expected electrons per pixel and frame before any blur.
 
     Parameters
     ----------
     shape : (int, int)
         Rows and columns of the field (`grid.shape`).
     n_photons : float
-        Sum of the scene: electrons per frame, counting those that blur will carry out of the field.
+        Sum of the scene [electrons per frame], including light that blur will carry out of the field.
     options : SceneOptions, optional
+        Target, attitude, sunlight and size.
+    dtype : torch.dtype, optional
+        Type of the scene, float64 by default.
+    device : torch.device, optional
+        Device of the scene.
 
     Returns
     -------
@@ -76,8 +82,9 @@ def make_scene(
     Raises
     ------
     ValueError
-        If `n_photons` is not finite and positive, or the file is missing, damaged, of an unknown kind, empty, negative
-        or not finite, or no light reaches the viewer, or an image is to be lit or turned out of its plane.
+        If `n_photons` is not finite and positive; the file is missing, damaged or of an unknown kind; the target is
+        empty, negative or not finite; no light reaches the viewer; or `sun`, or a rotation out of its plane, is given
+        for an image.
 
     Examples
     --------
@@ -98,21 +105,21 @@ def make_scene(
 
 
 def load_image(path: str | Path) -> Tensor:
-    """Read an image (rows, columns), float64, of values proportional to light.
+    """Read an image (rows, columns), float64, whose values are proportional to light.
 
-    An .npz file holds it under the key `image`; in a .fits file it is the first two-dimensional array, row 0 as stored;
-    of a .png file red, green and blue are averaged and multiplied by the opacity. No gamma is undone.
+    In an .npz file the image has the key `image`; in a .fits file it is the first two-dimensional array, row 0 as
+    stored; in a .png file red, green and blue are averaged and multiplied by the opacity, without gamma correction.
 
     Raises
     ------
     ValueError
-        If the file is missing, damaged or of another kind, or the image is not two-dimensional, holds values that
-        are negative or not finite, or is black.
+        If the file is missing, damaged or of another kind, or the image is not two-dimensional, has values that are
+        negative or not finite, or is black.
     """
     path = Path(path)
     readers = {".npz": _read_npz, ".png": _read_png, ".fits": _read_fits}
     if path.suffix.lower() not in readers:
-        raise ValueError(f"{path} is of an unknown kind: images end in {', '.join(readers)}")
+        raise ValueError(f"{path} is of an unknown kind: give a file that ends in {', '.join(readers)}")
     if not path.is_file():
         raise ValueError(f"there is no image file {path}")
     image = np.asarray(readers[path.suffix.lower()](path), dtype=np.float64)
@@ -139,7 +146,7 @@ def _read_png(path: Path) -> np.ndarray:
 
     try:
         image = np.asarray(imageio.imread(path.read_bytes(), plugin="pillow", extension=".png"), dtype=np.float64)
-    except Exception as error:  # the readers behind it fail in many ways
+    except Exception as error:  # the underlying readers raise many kinds of exceptions
         raise ValueError(f"{path} cannot be read as a PNG image: {error}") from error
     if image.ndim == 3 and image.shape[-1] in (2, 4):
         image = image[..., :-1] * image[..., -1:]
@@ -156,7 +163,7 @@ def _read_fits(path: Path) -> np.ndarray:
                 unit.data for unit in units if isinstance(unit, fits.PrimaryHDU | fits.ImageHDU | fits.CompImageHDU)
             ]
             images = [array for array in arrays if array is not None and array.ndim == 2]
-    except Exception as error:  # damaged headers fail in many ways
+    except Exception as error:  # damaged headers raise many kinds of exceptions
         raise ValueError(f"{path} cannot be read as FITS: {error}") from error
     if not images:
         raise ValueError(f"{path} holds no two-dimensional image")
@@ -164,15 +171,15 @@ def _read_fits(path: Path) -> np.ndarray:
 
 
 def _pose(image: Tensor, shape: tuple[int, int], options: SceneOptions) -> Tensor:
-    """Turn an image, crop it to what shines, resample it to the wanted fraction of the field, centre it on black."""
+    """Rotate an image, crop it to its lit part, resample it to its fraction of the field, and centre it on black."""
     with extra("data"):
         from kornia.geometry.transform import resize, rotate
 
     about_x, about_y, angle = options.attitude or (0.0, 0.0, 0.0)
     if about_x or about_y or options.sun:
         raise ValueError(
-            f"attitude {options.attitude} and sun {options.sun} do not suit the image {options.path}: it turns in its "
-            "own plane only (0 0 angle) and brings its own light; give a mesh for more"
+            f"attitude {options.attitude} and sun {options.sun} do not suit the image {options.path}: an image rotates "
+            "only in its plane (0 0 angle) and has no sun; give a mesh for more"
         )
     image = image[None, None]
     if angle:

@@ -1,4 +1,4 @@
-"""The wavefronts of one frame after another: in any direction, and in turn while a frame lasts."""
+"""The wavefronts of successive frames, in any direction and at several times within each exposure."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from torchmask.optics.pupil import PupilSamples
 
 Turbulence = TurbulencePhase | LayeredPhase | None
 Wavefront = Callable[[Vector], Iterator[Tensor | None]]
-"""From a direction (x, y) [rad] to the phases (N, P) [rad] in turn while a frame lasts; None is a perfect one."""
+"""Function from a direction (x, y) [rad] to the successive phases (N, P) [rad] of a frame; None is a perfect one."""
 
-STEPS_PER_TAU0 = 8  # of an exposure: two points keep at most 0.3 % too much of their contrast (Kolmogorov)
-_BLOCK = 2**23  # samples of phases held at once
+STEPS_PER_TAU0 = 8  # of an exposure; fringe contrast is then at most 0.3 % too high (Kolmogorov)
+_BLOCK = 2**23  # phase samples held at once
 
 
 def with_layers(turbulence: Turbulence, wavelength: float) -> Turbulence:
-    """Frozen flow as the one layer that it is; anything else as it comes."""
+    """Convert frozen flow to the equivalent single layer; return anything else unchanged."""
     if not isinstance(turbulence, TurbulencePhase) or turbulence.wind is None:
         return turbulence
     layer = Layers.from_fractions(turbulence.r0, wavelength, [0.0], [1.0], [turbulence.wind])
@@ -30,29 +30,29 @@ def with_layers(turbulence: Turbulence, wavelength: float) -> Turbulence:
 
 
 def exposure_delays(turbulence: Turbulence, exposure_time: float) -> list[float]:
-    """The middles [s] of the steps into which an exposure is cut, so short that the phase hardly changes in one.
+    """Return the midpoints [s] of the steps into which an exposure is cut, short enough that the phase hardly changes.
 
-    Raises ValueError for an exposure that lasts under turbulence without wind, or longer than the frames are apart.
+    Raises ValueError if `exposure_time` is positive but the turbulence has no wind, or it exceeds the frame interval.
     """
     if exposure_time == 0 or turbulence is None:
         return [0.0]
     if not isinstance(turbulence, LayeredPhase) or math.isinf(turbulence.layers.tau0(turbulence.wavelength)):
         raise ValueError(
-            f"exposure_time is {exposure_time:g} s, but the turbulence has no wind that moves it meanwhile: give "
-            "layers with winds (LayeredPhase), or wind and frame_interval (TurbulencePhase), or leave exposure_time out"
+            f"exposure_time is {exposure_time:g} s, but the turbulence has no wind: give layers with winds "
+            "(LayeredPhase), or wind and frame_interval (TurbulencePhase), or leave exposure_time out"
         )
     interval = turbulence.frame_interval
     if interval is not None and exposure_time > interval * (1 + 1e-9):
         raise ValueError(
-            f"exposure_time is {exposure_time:g} s, longer than the {interval:g} s from one frame to the next "
-            "(frame_interval)"
+            f"exposure_time is {exposure_time:g} s, longer than the {interval:g} s from one frame to the next: shorten "
+            "it or increase frame_interval"
         )
     steps = math.ceil(STEPS_PER_TAU0 * exposure_time / turbulence.layers.tau0(turbulence.wavelength))
     return [(k + 0.5) / steps * exposure_time for k in range(steps)]
 
 
 def isoplanatic_angle(turbulence: Turbulence) -> float:
-    """theta0 [rad]; infinite for turbulence without height."""
+    """Return theta0 [rad], which is infinite for turbulence without height."""
     return turbulence.layers.theta0(turbulence.wavelength) if isinstance(turbulence, LayeredPhase) else math.inf
 
 
@@ -63,14 +63,14 @@ def wavefronts(
     delays: list[float],
     generator: torch.Generator,
 ) -> Iterator[Wavefront]:
-    """The wavefronts of `n_frames` frames on the samples of a pupil, at `delays` [s] after the start of each."""
+    """Yield the wavefronts of `n_frames` frames on the samples of a pupil, at `delays` [s] after the start of each."""
     if turbulence is None:
         yield from (_steady(None) for _ in range(n_frames))
     elif isinstance(turbulence, LayeredPhase):
         draws = itertools.islice(turbulence.draws(samples, generator), n_frames)
         yield from (_moving(layers, delays) for layers in draws)
     else:
-        # An even number at a time, because independent screens are drawn in pairs.
+        # The block is even, because independent screens are drawn in pairs.
         block = max(2, _BLOCK // samples.weights.numel() // 2 * 2)
         for first in range(0, n_frames, block):
             phases = turbulence(samples, min(block, n_frames - first), generator)
@@ -78,7 +78,7 @@ def wavefronts(
 
 
 def _steady(phase: Tensor | None) -> Wavefront:
-    """The same in all directions, at all times."""
+    """Return a wavefront that is the same in all directions and constant in time."""
     return lambda direction: iter([phase])
 
 
