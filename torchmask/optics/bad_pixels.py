@@ -1,4 +1,4 @@
-"""Dead, hot and saturated pixels: what stands in for them where no weight can leave them out."""
+"""Values for dead, hot and saturated pixels, for methods that cannot give them zero weight."""
 
 from __future__ import annotations
 
@@ -7,20 +7,22 @@ from torch import Tensor
 
 
 def fill_bad_pixels(frames: Tensor, valid: Tensor) -> Tensor:
-    """Replace pixels that are not valid by the mean of their valid neighbours, from the rim of a dead region inwards.
+    """Replace pixels that are not valid by the mean of their valid neighbours, from the rim of a region inwards.
 
-    A region is filled ring by ring: pixels that touch a valid one (8 neighbours) take the mean of those, and count as
-    valid in the next round. What stood in such a pixel does not matter, it may be NaN.
+    A region is filled ring by ring: pixels with valid pixels among their 8 neighbours take the mean of those, and count
+    as valid in the next round.
 
     Parameters
     ----------
     frames : (T, H, W) tensor
+        Images. Pixels that are not valid may hold anything, including NaN.
     valid : (T, H, W) bool tensor
+        Which pixels are valid.
 
     Returns
     -------
     Tensor
-        (T, H, W); 0 in frames without any valid pixel.
+        (T, H, W), with 0 in frames that have no valid pixel.
 
     Examples
     --------
@@ -36,7 +38,7 @@ def fill_bad_pixels(frames: Tensor, valid: Tensor) -> Tensor:
 
 
 def _fill_inwards(frames: Tensor, valid: Tensor) -> Tensor:
-    """The same for frames that are 0 where they are not valid and have at least one pixel that is."""
+    """Fill frames that are 0 where they are not valid and have at least one valid pixel each."""
     neighbours = torch.ones(1, 1, 3, 3, dtype=frames.dtype, device=frames.device)
     while not bool(valid.all()):
         around = torch.nn.functional.conv2d(frames[:, None], neighbours, padding=1)[:, 0]

@@ -1,9 +1,9 @@
-"""Aperture masks that exist or that the literature designed: coordinates, hole sizes and where they come from.
+"""Aperture masks that exist or are published designs: hole coordinates, hole sizes and their sources.
 
-The data lie in `masks.json` beside this file. Centres are (x, y) in the frame of the source, x to the right and y up,
-in metres on the primary mirror; `mirrored` reverses x, because instruments disagree about the side they look from.
-Golay arrays have no size of their own: their unit is the pitch of a hexagonal lattice, on which their coordinates are
-whole multiples of (1/2, sqrt(3)/6) and therefore exact.
+The data are in `masks.json` beside this file. Centres are (x, y) in the frame of the source, x to the right and y up,
+in metres on the primary mirror; `mirrored` reverses x, because sources differ in the side from which they look. Golay
+arrays have no size of their own: their unit is the pitch of a hexagonal lattice, on which their coordinates are integer
+multiples of (1/2, sqrt(3)/6) and therefore exact.
 """
 
 from __future__ import annotations
@@ -30,12 +30,13 @@ class CatalogEntry:
     name : canonical name, see `names`
     unit : "m", "lattice" (the pitch of a hexagonal lattice) or "outer radius"
     centers : (x, y) of each hole, in `unit`
-    shape : of the holes
-    hole_diameter : of a disc, or flat to flat [m]; None where no source gives it
-    pupil_diameter : of the telescope or its stop [m]; None for arrays without a size of their own
-    central_obstruction : diameter of the pupil's obstruction [m]; None where not given
-    source, hole_source : where centres and hole diameter come from
-    note : what a user must know
+    shape : shape of the holes
+    hole_diameter : diameter of a hole, flat to flat for hexagons [m]; None if no source gives it
+    pupil_diameter : diameter of the telescope or of its stop [m]; None for arrays without a size of their own
+    central_obstruction : diameter of the pupil's central obstruction [m]; None if not given
+    source : source of the centres
+    hole_source : source of the hole diameter
+    note : remarks for the user
     """
 
     name: str
@@ -56,12 +57,12 @@ class CatalogEntry:
 
     @property
     def as_built(self) -> bool:
-        """Whether positions and hole diameter are both known in metres."""
+        """Whether positions and hole diameter are known in metres."""
         return self.hole_diameter is not None and self.pupil_diameter is not None
 
 
 def names() -> list[str]:
-    """Canonical names of all masks of the catalogue.
+    """Return the canonical names of all masks of the catalogue.
 
     Examples
     --------
@@ -72,12 +73,12 @@ def names() -> list[str]:
 
 
 def entry(name: str) -> CatalogEntry:
-    """The entry called `name`; case, spaces and punctuation do not matter ("Golay-6" is "golay6").
+    """Return the entry called `name`, ignoring case, spaces and punctuation ("Golay-6" is "golay6").
 
     Raises
     ------
     ValueError
-        If no mask has this name; the message lists those that exist.
+        If no mask has this name; the message lists the known ones.
 
     Examples
     --------
@@ -97,7 +98,7 @@ def entry(name: str) -> CatalogEntry:
 def layout(
     name: str, mask_diameter: float | None = None, fill_factor: float | None = None, mirrored: bool = False
 ) -> dict[str, Any]:
-    """Arguments of `SparseAperture` for a mask of the catalogue: see `SparseAperture.from_catalog`."""
+    """Return the arguments of `SparseAperture` for a mask of the catalogue; see `SparseAperture.from_catalog`."""
     mask = entry(name)
     for label, value in (("mask_diameter", mask_diameter), ("fill_factor", fill_factor)):
         if value is not None and not (math.isfinite(value) and value > 0):
@@ -129,9 +130,9 @@ def layout(
 
 
 def smallest_enclosing_circle(points: ArrayLike) -> tuple[NDArray[np.float64], float]:
-    """Centre (2,) and radius of the smallest circle around `points` (N, 2), exact up to rounding.
+    """Return centre (2,) and radius of the smallest circle around `points` (N, 2), exact up to rounding.
 
-    Incremental construction: a point outside the circle of those before it lies on the circle that includes it
+    The construction is incremental: a point outside the circle of those before it lies on the circle that includes it
     (E. Welzl, LNCS 555, 359, 1991).
 
     Examples
@@ -162,7 +163,7 @@ def smallest_enclosing_circle(points: ArrayLike) -> tuple[NDArray[np.float64], f
 
 
 def _circumcenter(p: NDArray[np.float64], q: NDArray[np.float64], r: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Point at equal distances from three points that are not in line."""
+    """Return the point at equal distances from three points that are not collinear."""
     a, b = q - p, r - p
     return p + np.linalg.solve(2 * np.stack([a, b]), [a @ a, b @ b])
 
@@ -184,7 +185,7 @@ def _plain(name: str) -> str:
 
 @cache
 def _lookup() -> dict[str, str]:
-    """Canonical name of every spelling."""
+    """Return the canonical name for every known spelling."""
     known = {_plain(name): name for name in _entries()}
     for name, record in _data()["masks"].items():
         known.update({_plain(alias): name for alias in record.get("aliases", [])})
@@ -225,7 +226,7 @@ def _read(name: str, record: dict[str, Any]) -> CatalogEntry:
 
 
 def _expand(source: str) -> str:
-    """Write out the short names of sources."""
+    """Replace the short names of sources by full references."""
     table = _data()["sources"]
     keys = "|".join(sorted(table, key=len, reverse=True))
     return re.sub(rf"(?<![\w-])({keys})(?![\w-])", lambda match: table[match[1]], source)

@@ -1,4 +1,4 @@
-"""Linear systems that are known by their action only."""
+"""Solution of linear systems that are known only by their action on a vector."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ Operator = Callable[[Tensor], Tensor]
 
 
 def conjugate_gradients(hessian: Operator, right: Tensor, precondition: Operator, n_iterations: int) -> Tensor:
-    """Solve hessian(x) = right for every entry of the first axis; what is zero in all of `right` stays so.
+    """Solve hessian(x) = right for every entry of the first axis by preconditioned conjugate gradients.
 
-    Preconditioned conjugate gradients (Hestenes & Stiefel, J. Res. Natl. Bur. Stand. 49, 409, 1952), for positive
-    definite operators that act on entries independently.
+    `hessian` is a positive definite operator that acts on the entries independently. Entries of `right` that are zero
+    give solutions that are zero. Source: Hestenes & Stiefel, J. Res. Natl. Bur. Stand. 49, 409, 1952.
     """
     axes, tiny = tuple(range(1, right.ndim)), torch.finfo(right.dtype).tiny
 
@@ -26,7 +26,7 @@ def conjugate_gradients(hessian: Operator, right: Tensor, precondition: Operator
     size = inner(residual, scaled)
     for _ in range(n_iterations):
         curved = hessian(direction)
-        step = size / inner(direction, curved).clamp(min=tiny)  # all may be zero, or solved already
+        step = size / inner(direction, curved).clamp(min=tiny)  # the curvature is 0 where an entry is 0 or solved
         x, residual = x + step * direction, residual - step * curved
         scaled = precondition(residual)
         size, before = inner(residual, scaled), size

@@ -1,4 +1,4 @@
-"""From a scene and point-spread functions to what a detector reads."""
+"""Image formation from a scene and point-spread functions, and the noise of the detector."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ NOISES = ("poisson", "gaussian")
 
 
 def image_formation(scene: Tensor, psfs: Tensor) -> Tensor:
-    """Blur a scene by linear convolution: light that leaves the field is lost, none comes back on the other side.
+    """Blur a scene by linear convolution, so that light that leaves the field is lost.
 
     Parameters
     ----------
     scene : (..., H, W) tensor
-        Nothing shines outside the field.
+        Light of the scene, zero outside the field.
     psfs : (..., rows, columns) tensor
-        Unfolded, on the scene's pixels, with their origin at [0, 0] (FFT order), as `psf_from_samples` gives them for
-        a field at least twice as wide as the scene's. Leading axes broadcast against those of `scene`.
+        Unfolded PSFs on the scene's pixels, with their origin at [0, 0] (FFT order), as `psf_from_samples` returns
+        them for a field at least twice as wide as the scene's. Leading axes broadcast against those of `scene`.
 
     Returns
     -------
     Tensor
-        (..., H, W), the scene's field. Negative values are rounding errors of the FFT, not clipped, so that the
-        function stays linear. Differentiable in both arguments.
+        (..., H, W), the blurred scene, differentiable in both arguments. Negative values are rounding errors of the
+        FFT, which are not clipped so that the function stays linear.
 
     Raises
     ------
     ValueError
-        If a PSF has fewer than 2 H - 1 rows or 2 W - 1 columns: it could not reach from one border to the other.
+        If a PSF has fewer than 2 H - 1 rows or 2 W - 1 columns, so that it cannot reach from one border to the other.
 
     Examples
     --------
@@ -45,11 +45,11 @@ def image_formation(scene: Tensor, psfs: Tensor) -> Tensor:
 
 
 def image_formation_adjoint(frames: Tensor, psfs: Tensor) -> Tensor:
-    """The adjoint of `image_formation` in the scene: <image_formation(o, h), y> = <o, image_formation_adjoint(y, h)>.
+    """Apply the adjoint of `image_formation` with respect to the scene.
 
-    `frames` (..., H, W) are correlated with the same `psfs` (..., rows, columns). An axis along which a scene was
-    broadcast, such as that of the frames, is left for the caller to sum. Differentiable in both; raises ValueError
-    likewise.
+    That is, <image_formation(o, h), y> = <o, image_formation_adjoint(y, h)>: `frames` (..., H, W) are correlated with
+    the same `psfs` (..., rows, columns). If the scene was broadcast along an axis, such as that of the frames, the
+    caller must sum over it. Differentiable in both arguments; raises ValueError as `image_formation` does.
 
     Examples
     --------
@@ -65,7 +65,7 @@ def image_formation_adjoint(frames: Tensor, psfs: Tensor) -> Tensor:
 
 
 def _wide_raster(psfs: Tensor, image: Tensor) -> tuple[int, int]:
-    """Rows and columns of the PSFs: so wide that what wraps around falls outside the image."""
+    """Return rows and columns of the PSFs, after checking that no wrapped light falls inside the image."""
     rows, columns = psfs.shape[-2:]
     height, width = image.shape[-2:]
     if rows < 2 * height - 1 or columns < 2 * width - 1:
@@ -77,16 +77,16 @@ def _wide_raster(psfs: Tensor, image: Tensor) -> tuple[int, int]:
 
 
 class Detector(nn.Module):
-    """Noise of the light and of the read-out, independent from pixel to pixel.
+    """Photon noise and read-out noise of a detector, independent from pixel to pixel.
 
     Parameters
     ----------
     readout_noise : float
-        Electrons rms per pixel and frame: Gaussian, of zero mean.
+        Standard deviation of the Gaussian read-out noise [electrons per pixel and frame].
     noise : {"poisson", "gaussian"}
-        Of the light. "poisson" counts photons, as a detector does. Its frames carry no gradient, because a count is a
-        step function of the light. "gaussian" adds normal noise of the same variance as count and read-out together,
-        `expected + readout_noise**2`, and differentiates: train through this one.
+        Model of the photon noise. "poisson" counts photons, as a detector does; its frames carry no gradient, because
+        a count is a step function of the light. "gaussian" adds normal noise of the same total variance,
+        `expected + readout_noise**2`, and is differentiable, so use it for training.
 
     Raises
     ------
@@ -95,12 +95,11 @@ class Detector(nn.Module):
 
     Notes
     -----
-    A Gaussian frame is y = m + s e with m the expected light, s^2 = m + readout_noise^2 and e a standard normal number
-    that is drawn whatever m is (Kingma & Welling, Auto-Encoding Variational Bayes, 2014, section 2.4). So
-    dy/dm = 1 + e / (2 s), with the growth of the noise included. The second term is at most |e| / (2 readout_noise);
-    without read-out noise it grows without bound towards the dark, and is left out where s^2 is no more than the
-    rounding of the FFTs that formed m: a dark pixel has the gradient 1 of its mean. Gaussian pixels may be negative,
-    and stand in poorly for counts of less than about ten photons.
+    A Gaussian frame is y = m + s e, with m the expected light, s^2 = m + readout_noise^2 and e a standard normal number
+    drawn independently of m (Kingma & Welling, Auto-Encoding Variational Bayes, 2014, section 2.4). Hence
+    dy/dm = 1 + e / (2 s), which includes the growth of the noise. The second term is at most |e| / (2 readout_noise).
+    Without read-out noise it diverges as m goes to 0, so it is dropped where s^2 is within the rounding error of the
+    FFTs that formed m. Gaussian pixels may be negative, and are a poor model below about ten photons.
 
     Examples
     --------
@@ -125,15 +124,15 @@ class Detector(nn.Module):
     def forward(self, expected: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Draw frames (..., H, W) [electrons] whose mean is `expected` (..., H, W) [electrons].
 
-        `generator` may live on the CPU whatever the device of `expected`, for the same noise everywhere.
+        A `generator` on the CPU works for any device of `expected`, and gives the same noise on all of them.
 
-        Raises ValueError if a value is not finite, or negative beyond the rounding of the FFTs that formed it.
+        Raises ValueError if a value is not finite, or is negative beyond the rounding error of the FFTs that formed it.
         """
         if not bool(torch.isfinite(expected).all()):
             raise ValueError("expected holds values that are not finite: electrons per pixel are needed")
         rounding = 32 * torch.finfo(expected.dtype).eps * torch.linalg.vector_norm(expected.detach())
         if bool((expected < -rounding).any()):
-            raise ValueError("expected holds negative light beyond rounding errors: no pixel may be negative")
+            raise ValueError("expected holds negative light beyond rounding errors: clip it at 0")
         device = expected.device if generator is None else generator.device
         normal = torch.randn(expected.shape, generator=generator, dtype=expected.dtype, device=device)
         if self.noise == "gaussian":
@@ -147,6 +146,6 @@ class Detector(nn.Module):
 
 
 def _root(variance: Tensor, rounding: Tensor) -> Tensor:
-    """Square root, without its gradient where that would divide by no more than rounding errors."""
+    """Return the square root, without gradient where the variance is within rounding errors."""
     known = variance > rounding
     return torch.where(known, torch.where(known, variance, 1).sqrt(), variance.detach().sqrt())

@@ -1,4 +1,4 @@
-"""How a mask lies in the pupil: turned, magnified, sheared or mirrored against what its drawing says."""
+"""The geometry of a mask in the pupil: rotation, magnification, shear and mirroring relative to its drawing."""
 
 from __future__ import annotations
 
@@ -13,16 +13,19 @@ from torchmask.optics.aperture import SparseAperture
 
 @dataclass(frozen=True)
 class MaskGeometry:
-    """The affine map from the pupil coordinates of a mask as told to those where it lies.
+    """The linear map from the nominal pupil coordinates of a mask to the real ones.
 
-    matrix = turn by `rotation` x symmetric stretch [[magnification_x, shear], [shear, magnification_y]] x (reverse x if
-    `mirrored`), on columns (x, y). Every real matrix is of this form.
+    On column vectors (x, y) it first reverses x if `mirrored`, then applies the symmetric stretch
+    [[magnification_x, shear], [shear, magnification_y]], then rotates by `rotation`. Every invertible real matrix has
+    this form.
 
-    rotation : from x to y [rad]
-    magnification_x, magnification_y, shear : of the stretch, 1, 1 and 0 for a mask as told
-    mirrored : whether x is reversed first
+    rotation : angle from x to y [rad]
+    magnification_x : first diagonal element of the stretch
+    magnification_y : second diagonal element of the stretch
+    shear : off-diagonal element of the stretch
+    mirrored : whether x is reversed
 
-    Raises ValueError unless the stretch enlarges or shrinks, and nothing more: its eigenvalues must be positive.
+    Raises ValueError unless all numbers are finite and both eigenvalues of the stretch are positive.
 
     Examples
     --------
@@ -49,7 +52,7 @@ class MaskGeometry:
 
     @classmethod
     def from_matrix(cls, matrix: Tensor) -> MaskGeometry:
-        """The geometry of a matrix (2, 2), by its polar decomposition. Raises ValueError if it is singular."""
+        """Return the geometry of a matrix (2, 2), by its polar decomposition. Raises ValueError if it is singular."""
         matrix = matrix.detach().double().cpu()
         mirrored = bool(torch.linalg.det(matrix) < 0)
         rotation, stretch = turn_and_stretch(matrix * matrix.new_tensor([-1.0 if mirrored else 1.0, 1.0]))
@@ -57,12 +60,12 @@ class MaskGeometry:
 
     @property
     def magnification(self) -> float:
-        """Of areas, its square root: by which holes grow."""
+        """Factor by which holes grow: the square root of the magnification of areas."""
         return math.sqrt(self.magnification_x * self.magnification_y - self.shear**2)
 
     @property
     def matrix(self) -> Tensor:
-        """(2, 2) float64, on columns (x, y)."""
+        """Matrix (2, 2), float64, that acts on column vectors (x, y)."""
         cosine, sine = math.cos(self.rotation), math.sin(self.rotation)
         like = {"dtype": torch.float64, "device": "cpu"}
         turn = torch.tensor([[cosine, -sine], [sine, cosine]], **like)
@@ -70,7 +73,7 @@ class MaskGeometry:
         return turn @ stretch * torch.tensor([-1.0 if self.mirrored else 1.0, 1.0], **like)
 
     def apply(self, aperture: SparseAperture) -> SparseAperture:
-        """The mask where it lies. Centres follow the whole map; holes are turned, mirrored and magnified evenly."""
+        """Return the real mask. Centres follow the whole map; holes are rotated, mirrored and magnified uniformly."""
         shape = aperture.shape.mirrored() if self.mirrored else aperture.shape
         return aperture.replace(
             aperture.centers @ self.matrix.to(aperture.centers).T,
@@ -88,9 +91,9 @@ class MaskGeometry:
 
 
 def turn_and_stretch(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """Angle () and stretch (3,), xx, yy and xy, of a matrix (2, 2) of positive determinant; differentiable.
+    """Return the rotation angle () and the stretch (3,), xx, yy and xy, of a matrix M (2, 2) of positive determinant.
 
-    With R(a)^T M symmetric, tan a = (M_yx - M_xy) / (M_xx + M_yy).
+    R(a)^T M is symmetric for tan a = (M_yx - M_xy) / (M_xx + M_yy). Differentiable.
     """
     angle = torch.atan2(matrix[1, 0] - matrix[0, 1], matrix[0, 0] + matrix[1, 1])
     cosine, sine = angle.cos(), angle.sin()

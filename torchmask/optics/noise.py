@@ -1,4 +1,4 @@
-"""How strong the noise of a stack of frames is, told by the frames themselves."""
+"""Estimation of the noise variance of a stack of frames from the frames themselves."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.conjugate import conjugate_gradients
 
-_ITERATIONS = 30  # of the search for what dead pixels would hold
+_ITERATIONS = 30  # conjugate-gradient iterations that find values for dead pixels
 
 
 def noise_variance(frames: Tensor, grid: Grid, aperture: Aperture, valid: Tensor | None = None) -> float | None:
-    """Mean noise variance of a pixel [electrons^2], from the frequencies that the aperture cannot transmit.
+    """Estimate the mean noise variance of a pixel [electrons^2] from frequencies that the aperture cannot transmit.
 
     White noise has the same power at all frequencies, and beyond the cut-off there is nothing else. The median over
-    frequencies (of the power averaged over T frames, a gamma variable) leaves out the cross of a bright border.
-    None if fewer than eight frequencies lie beyond the cut-off.
+    frequencies (of the power averaged over T frames, which is gamma distributed) ignores the cross that a bright border
+    makes. Returns None if fewer than eight frequencies lie beyond the cut-off.
 
-    Pixels that are not `valid` (T, H, W) take the values that leave the least power there. That takes some of the
-    noise with it: as much as of white noise with the same holes.
+    Pixels that are not `valid` (T, H, W) take the values that minimise the power there. That also removes some noise
+    power, which is calibrated on simulated white noise with the same pixels missing.
     """
     nu_y, nu_x = grid.frequencies(frames.dtype, frames.device)
     beyond = torch.hypot(nu_y, nu_x) > grid.cutoff(aperture.extent)
@@ -43,7 +43,7 @@ def _median_power(frames: Tensor, beyond: Tensor) -> float:
 
 
 def _least_power(frames: Tensor, valid: Tensor, beyond: Tensor) -> Tensor:
-    """Frames whose pixels that are not valid make the power at the frequencies `beyond` (H, W) least."""
+    """Return frames whose pixels that are not valid minimise the power at the frequencies `beyond` (H, W)."""
     half = beyond[:, : beyond.shape[1] // 2 + 1]
 
     def gradient(x: Tensor) -> Tensor:

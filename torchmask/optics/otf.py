@@ -1,4 +1,4 @@
-"""Optical transfer functions: of sampled pupils, and in closed form of sub-apertures without aberrations."""
+"""Optical transfer functions of sampled pupils, and of unaberrated sub-apertures in closed form."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from torchmask.optics.pupil import Aperture
 
 
 class OTF(PSF):
-    """Optical transfer functions, complex, in FFT order with value 1 at zero frequency: the DFT of `PSF`.
+    """Optical transfer functions of an aperture on a grid: the DFT of its `PSF`, 1 at zero frequency.
 
-    Same arguments and errors as `PSF`; `forward(phase)` returns (..., H, W), frequencies in cycles/pixel as in
-    `grid.frequencies`.
+    Arguments and errors are those of `PSF`. `forward(phase)` returns a complex tensor (..., H, W) in FFT order, at the
+    frequencies of `grid.frequencies`.
 
     Examples
     --------
@@ -30,11 +30,11 @@ class OTF(PSF):
 
 
 def analytic_otf(aperture: Aperture, grid: Grid, pistons: Tensor | None = None) -> Tensor:
-    """OTF of sub-apertures with a piston each, in closed form: the sum of the overlaps of all pairs.
+    """Return the closed-form OTF of sub-apertures with one piston each: the sum of the overlaps of all pairs.
 
-    `pistons` (..., [frame,] N) [rad], or None for a perfect wavefront: where there are more axes than the centres
-    (..., N, 2) have, the last one before N is the frame. Returns complex (..., [frame,] H, W) in FFT order, wrapped on
-    the frequency torus as a sampled PSF is. Source: DESIGN, section 2; the autocorrelation theorem.
+    `pistons` (..., [frame,] N) [rad] is None for a perfect wavefront; with as many axes as the centres (..., N, 2), the
+    one before N is the frame. The result, complex (..., [frame,] H, W) in FFT order, wraps around the frequency torus
+    as that of a sampled PSF does. It follows from the autocorrelation theorem.
     """
     aperture.require_sampling(grid)
     centers = aperture.centers

@@ -1,7 +1,7 @@
-"""Which holes of a mask overlap, and by how much.
+"""Detection of overlapping holes in a mask.
 
-A mask with overlapping holes can be made, because some real ones are like that. What simulates or draws a mask asks
-here: where holes overlap, the models count the light twice, and a plate has one hole where the drawing shows two.
+Masks with overlapping holes are allowed, because some real ones have them. Code that simulates or draws a mask checks
+for them here: the models count the light in an overlap twice, and a plate has one hole where the drawing shows two.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from torch import Tensor
 
 from torchmask.optics.aperture import SparseAperture
 
-_SHOWN = 3  # pairs in a message
+_SHOWN = 3  # largest number of pairs in a message
 
 
 class Overlap(NamedTuple):
-    """Two holes that overlap, counted from 0, and by how much [m]."""
+    """Two overlapping holes, numbered from 0, and the depth of their overlap [m]."""
 
     first: int
     second: int
@@ -26,10 +26,10 @@ class Overlap(NamedTuple):
 
 
 def pair_clearances(aperture: SparseAperture) -> Tensor:
-    """Material between the holes of each pair (..., N(N-1)/2) [m], negative where they overlap.
+    """Return the gap between the holes of each pair (..., N(N-1)/2) [m], negative where they overlap.
 
-    Pairs are those of `torch.triu_indices(N, N, 1)`. For holes with corners it is measured along the normal of a side,
-    which is exact for sides that face each other, right in its sign, and never more than the true distance.
+    Pairs are in the order of `torch.triu_indices(N, N, 1)`. For polygons the gap is measured along the normal of a
+    side: it is exact for sides that face each other, always has the right sign, and never exceeds the true distance.
     """
     n = aperture.n_subapertures
     first, second = torch.triu_indices(n, n, 1).to(aperture.centers.device)
@@ -38,10 +38,10 @@ def pair_clearances(aperture: SparseAperture) -> Tensor:
 
 
 def find_overlaps(aperture: SparseAperture, tolerance: float = 1e-6) -> list[Overlap]:
-    """The pairs of holes that overlap by more than `tolerance`, a fraction of the mask diameter; the deepest first.
+    """Return the pairs of holes that overlap by more than `tolerance` times the mask diameter, the deepest first.
 
-    The default is what rounding leaves of touching holes in files and in float32. Of a population, the pairs of all its
-    masks.
+    The default tolerance allows for the rounding of touching holes in files and in float32. For a population, the pairs
+    of all its masks are returned together.
     """
     n = aperture.n_subapertures
     first, second = torch.triu_indices(n, n, 1).tolist()
@@ -55,7 +55,7 @@ def find_overlaps(aperture: SparseAperture, tolerance: float = 1e-6) -> list[Ove
 
 
 def check_overlaps(aperture: SparseAperture, tolerance: float = 1e-6) -> None:
-    """Raise ValueError where `find_overlaps` finds some: the message says which holes, and by how much.
+    """Raise ValueError if holes overlap (see `find_overlaps`); the message says which ones, and by how much.
 
     Examples
     --------
@@ -70,7 +70,7 @@ def check_overlaps(aperture: SparseAperture, tolerance: float = 1e-6) -> None:
 
 
 def describe_overlaps(aperture: SparseAperture, pairs: list[Overlap]) -> str:
-    """The overlaps in one line, the deepest first."""
+    """Describe the overlaps in one line, the deepest first."""
     count = "1 pair of holes overlaps" if len(pairs) == 1 else f"{len(pairs)} pairs of holes overlap"
     shown = ", ".join(f"{first} and {second} by {depth:.3g} m" for first, second, depth in pairs[:_SHOWN])
     more = f", and {len(pairs) - _SHOWN} more pairs" if len(pairs) > _SHOWN else ""

@@ -1,4 +1,4 @@
-"""How large N equal discs in a larger disc can be, and random masks of discs that fit."""
+"""Packing of equal discs in a larger disc, its limits, and random packings."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
-# Diameter of the enclosing disc over that of N = 1, 2, ... equal discs packed in it, the smallest known: R. L. Graham,
+# Smallest known diameter of the disc that encloses N = 1, 2, ... equal discs, in units of their diameter: R. L. Graham,
 # B. D. Lubachevsky, K. J. Nurmela, P. R. J. Ostergard, Discrete Mathematics 181, 139 (1998); E. Specht, packomania.com.
 # Proven optimal up to 14 and for 19.
 _RATIOS = (
@@ -35,27 +35,28 @@ _RATIOS = (
     5.1223207369915291,
 )
 _ATTEMPTS = 60
-_ROUNDING = 1e-12  # of the mask diameter
+_ROUNDING = 1e-12  # in units of the mask diameter
 
 
 def largest_fill_factor(n_subapertures: int) -> float:
-    """The largest N d^2 / D^2 of N discs of diameter d inside one of diameter D.
+    """Return the largest N d^2 / D^2 for N discs of diameter d inside one of diameter D.
 
-    Up to N = 20 the best packing known; beyond, an upper bound that no packing reaches (N. Oler, Acta Mathematica 105,
-    19 (1961): at most 2/sqrt(3) area + perimeter/2 + 1 points at distances of at least 1 lie in a convex figure).
+    Up to N = 20 it is that of the best packing known; beyond, an upper bound that no packing reaches (N. Oler, Acta
+    Mathematica 105, 19 (1961): a convex figure holds at most 2/sqrt(3) area + perimeter/2 + 1 points at mutual
+    distances of at least 1).
     """
     n = n_subapertures
     if n <= len(_RATIOS):
         return n / _RATIOS[n - 1] ** 2
-    area = 2 * math.pi / math.sqrt(3)  # radius of the centres' disc in hole diameters: area r^2 + pi r + 1 = N
+    area = 2 * math.pi / math.sqrt(3)  # area r^2 + pi r + 1 = N, r the radius of the centres' disc in hole diameters
     radius = (math.sqrt(math.pi**2 + 4 * area * (n - 1)) - math.pi) / (2 * area)
     return n / (1 + 2 * radius) ** 2
 
 
 def largest_number(ratio: float) -> int:
-    """The largest N of equal discs that may fit into a disc `ratio` times as wide: no more do, fewer perhaps.
+    """Return an upper limit on the number of equal discs that fit into a disc `ratio` times as wide.
 
-    Up to 20 as in the best packing known; beyond, the bound of Oler, whose density tends to pi / sqrt(12).
+    Up to 20 it is that of the best packings known; beyond, the bound of Oler, whose density tends to pi / sqrt(12).
     """
     known = sum(ratio >= needed * (1 - _ROUNDING) for needed in _RATIOS)
     if known < len(_RATIOS):
@@ -65,7 +66,10 @@ def largest_number(ratio: float) -> int:
 
 
 def certain_number(ratio: float) -> int:
-    """A number of equal discs that do fit into a disc `ratio` times as wide: the best packing known, or a lattice."""
+    """Return a number of equal discs that certainly fit into a disc `ratio` times as wide.
+
+    It is that of the best packing known, or of a hexagonal lattice if that is more.
+    """
     known = sum(ratio >= needed for needed in _RATIOS)
     if known < len(_RATIOS):
         return known
@@ -76,12 +80,12 @@ def certain_number(ratio: float) -> int:
 
 
 def hole_diameter(n_subapertures: int, mask_diameter: float, fill_factor: float) -> float:
-    """Diameter d [m] of N holes in a disc of diameter D with N d^2 / D^2 = `fill_factor`.
+    """Return the diameter d [m] of N holes in a disc of diameter D with N d^2 / D^2 = `fill_factor`.
 
     Raises
     ------
     ValueError
-        For numbers out of range and for holes that cannot be packed: says the largest fill factor that can.
+        If a number is out of range or the holes cannot be packed; the message gives the largest fill factor.
     """
     if n_subapertures != int(n_subapertures) or n_subapertures < 1:
         raise ValueError(f"n_subapertures is {n_subapertures}: it must be a whole number of at least 1")
@@ -100,9 +104,9 @@ def hole_diameter(n_subapertures: int, mask_diameter: float, fill_factor: float)
 def random_packing(
     n_subapertures: int, mask_diameter: float, fill_factor: float, generator: torch.Generator | None = None
 ) -> Tensor:
-    """Centres (N, 2) [m], float64, of randomly placed holes that lie in the mask disc and do not overlap.
+    """Return centres (N, 2) [m], float64, of randomly placed holes that lie in the mask disc and do not overlap.
 
-    Holes fall uniformly into the disc and push each other apart until they fit. Raises ValueError if they cannot.
+    Holes are drawn uniformly in the disc and pushed apart until they fit. Raises ValueError if they do not.
     """
     reach = hole_diameter(n_subapertures, 1.0, fill_factor)
     best = 0.0
@@ -124,14 +128,14 @@ def random_packing(
 
 
 def _largest_diameter(centers: np.ndarray) -> float:
-    """Of discs at these centres that neither overlap nor leave the disc of diameter 1."""
+    """Return the largest diameter of discs at these centres that neither overlap nor leave the disc of diameter 1."""
     to_rim = 1 - 2 * np.linalg.norm(centers, axis=-1).max()
     first, second = np.triu_indices(len(centers), 1)
     return float(min(to_rim, np.linalg.norm(centers[first] - centers[second], axis=-1).min(initial=np.inf)))
 
 
 def _push_apart(centers: np.ndarray, diameter: float) -> np.ndarray:
-    """Minimise the sum of the squared overlaps of the discs, which are taken a little larger to end clear."""
+    """Minimise the sum of the squared overlaps of discs that are enlarged slightly, so that the real ones end clear."""
     diameter = diameter * (1 + 1e-6)
     first, second = np.triu_indices(len(centers), 1)
 
@@ -148,12 +152,12 @@ def _push_apart(centers: np.ndarray, diameter: float) -> np.ndarray:
         np.add.at(gradient, second, 2 * push)
         return float((overlap**2).sum() + (beyond**2).sum()), gradient.ravel()
 
-    # The energy is a square: 1e-16 leaves overlaps of 1e-8, less than what the discs were enlarged by.
+    # An energy of 1e-16, a square, leaves overlaps of 1e-8, less than the enlargement of the discs.
     return minimize(energy, centers.ravel(), jac=True, method="L-BFGS-B", tol=1e-18).x.reshape(-1, 2)
 
 
 def _inflate(centers: np.ndarray) -> np.ndarray:
-    """Move the centres to the locally largest equal discs that fit (sequential quadratic programming)."""
+    """Move the centres so that the equal discs that fit are locally largest (sequential quadratic programming)."""
     n = len(centers)
     first, second = np.triu_indices(n, 1)
     size = _largest_diameter(centers)

@@ -1,4 +1,4 @@
-"""The response of a detector's pixels, which blurs every image alike."""
+"""The response of a detector's pixels, which blurs every image in the same way."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from torch import Tensor
 
 
 class PixelResponse(Protocol):
-    """What a pixel does to each spatial frequency."""
+    """Response of a pixel to each spatial frequency."""
 
     def transfer(self, nu_y: Tensor, nu_x: Tensor) -> Tensor:
-        """The factor (H, W) on frequencies (H, 1) and (1, W) [cycles/pixel]: 1 at zero."""
+        """Return the transfer function (H, W), 1 at zero, at frequencies (H, 1) and (1, W) [cycles/pixel]."""
         ...
 
 
 @dataclass(frozen=True)
 class SquarePixel:
-    """Pixels that are sensitive in a square and collect what falls on it: a product of two sincs.
+    """Pixels that are uniformly sensitive within a square, whose transfer function is a product of two sincs.
 
-    fill_factor : the part of the area of the pitch that is sensitive
+    fill_factor : sensitive fraction of the pixel's area
 
     Raises ValueError unless `fill_factor` lies in (0, 1].
 
@@ -37,22 +37,22 @@ class SquarePixel:
 
     def __post_init__(self) -> None:
         if not 0 < self.fill_factor <= 1:
-            raise ValueError(f"fill_factor is {self.fill_factor}: it is a part of the pitch's area, above 0, at most 1")
+            raise ValueError(f"fill_factor is {self.fill_factor}: it must be a fraction, above 0 and at most 1")
 
     def transfer(self, nu_y: Tensor, nu_x: Tensor) -> Tensor:
-        """sinc(w nu_y) sinc(w nu_x), w the side of the square in pitches."""
+        """Return sinc(w nu_y) sinc(w nu_x), with w the side of the square in pixels."""
         width = math.sqrt(self.fill_factor)
         return torch.sinc(width * nu_y) * torch.sinc(width * nu_x)
 
 
 @dataclass(frozen=True, eq=False)
 class MappedPixel:
-    """Pixels whose response within and around the pitch is known as a map.
+    """Pixels whose response is given by a map that may extend beyond one pixel.
 
-    sensitivity : (rows, columns) of any scale, centred on the pixel, not negative
-    samples : of the map along one pitch
+    sensitivity : (rows, columns), a map centred on the pixel, not negative, in any unit
+    samples : number of samples of the map per pixel along each axis
 
-    Raises ValueError if the map is not two-dimensional, holds no sensitivity or negative or not finite values, or
+    Raises ValueError if the map is not two-dimensional, is zero everywhere, or has negative or non-finite values, or if
     `samples` is below 1.
 
     Examples
@@ -70,14 +70,14 @@ class MappedPixel:
         if self.sensitivity.ndim != 2 or self.samples < 1:
             raise ValueError(
                 f"sensitivity has shape {tuple(self.sensitivity.shape)} and samples is {self.samples}: a map (rows, "
-                "columns) with at least 1 sample to the pitch is needed"
+                "columns) with at least 1 sample per pixel is needed"
             )
         total = float(self.sensitivity.sum())
         if not (0 < total < math.inf and float(self.sensitivity.min()) >= 0):
             raise ValueError("sensitivity must be finite, nowhere negative and somewhere positive")
 
     def transfer(self, nu_y: Tensor, nu_x: Tensor) -> Tensor:
-        """The Fourier transform of the map, complex unless it is symmetric."""
+        """Return the normalised Fourier transform of the map, complex (H, W)."""
         weights = (self.sensitivity / self.sensitivity.sum()).to(nu_y)
         by_y, by_x = (
             torch.exp(-2j * math.pi * nu.reshape(-1, 1) * self._places(size).to(nu))
@@ -86,5 +86,5 @@ class MappedPixel:
         return by_y @ weights.to(by_y) @ by_x.T
 
     def _places(self, size: int) -> Tensor:
-        """Of the samples along one axis [pitches]."""
+        """Return the positions of the samples along one axis [pixels]."""
         return (torch.arange(size) - (size - 1) / 2) / self.samples

@@ -1,4 +1,4 @@
-"""Holes with straight sides: convex polygons that are symmetric about their centre, hexagons and squares first."""
+"""Holes with straight sides: convex, point-symmetric polygons such as hexagons and squares."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from torchmask.optics.shape_base import (
 
 @dataclass(frozen=True)
 class Polygon(Shape):
-    """A convex polygon that is symmetric about its centre: what some strips around the centre have in common.
+    """A convex, point-symmetric polygon: the intersection of strips around its centre.
 
-    A subclass says what its strips are, and inherits all the rest. It is to be symmetric about the normal of its first
-    side too, or to say what its mirror image is.
+    A subclass defines its strips and inherits everything else. If it is not symmetric about the normal of its first
+    side, it must also define `mirrored`.
 
     Parameters
     ----------
@@ -51,8 +51,10 @@ class Polygon(Shape):
 
     @abstractmethod
     def strips(self) -> Sequence[tuple[float, float]]:
-        """For each of S strips the angle of its normal from the first one's, 0 and ascending to less than pi [rad], and
-        its width in diameters. Each strip leaves two sides."""
+        """Return for each of S strips the angle of its normal from the first one's [rad] and its width in diameters.
+
+        Angles ascend from 0 to less than pi. Each strip contributes two sides.
+        """
 
     @property
     def plural(self) -> str:
@@ -66,32 +68,32 @@ class Polygon(Shape):
 
     @property
     def askew(self) -> float:
-        # The middle of the widest gap between the normals is to lie along y.
+        # The result puts the middle of the widest gap between the normals along y.
         angles = [angle for angle, _ in self.strips()]
         gap, first = max((after - angle, angle) for angle, after in zip(angles, [*angles[1:], math.pi], strict=True))
         return math.pi / 2 - self.orientation - first - gap / 2
 
     def _normals(self) -> list[tuple[float, float]]:
-        """Outward normals of the 2 S sides, counterclockwise from the first."""
+        """Return the outward normals of the 2 S sides, counterclockwise from the first."""
         angles = [self.orientation + angle for angle, _ in self.strips()]
         half = [(_snapped(math.cos(angle)), _snapped(math.sin(angle))) for angle in angles]
         return half + [(-x, -y) for x, y in half]
 
     def _distances(self, diameter: float) -> list[float]:
-        """Distances of the 2 S sides from the centre [m]."""
+        """Return the distances of the 2 S sides from the centre [m]."""
         return 2 * [width * (diameter / 2) for _, width in self.strips()]
 
     def _corners(self, diameter: float) -> list[tuple[float, float]]:
-        """The 2 S corners [m], counterclockwise; the first two are the ends of the first side."""
+        """Return the 2 S corners [m], counterclockwise; the first two are the ends of the first side."""
         sides = list(zip(self._normals(), self._distances(diameter), strict=True))
         corners = []
         for ((a, b), before), ((c, d), distance) in zip([sides[-1], *sides[:-1]], sides, strict=True):
-            sine = a * d - b * c  # of the angle between the two normals (a, b) and (c, d)
+            sine = a * d - b * c  # sine of the angle between the two normals (a, b) and (c, d)
             corners.append(((before * d - distance * b) / sine, (distance * a - before * c) / sine))
         return corners
 
     def _sides(self, diameter: float) -> tuple[Array, Array]:
-        """Midpoints (2 S, 2) and lengths (2 S,) of the sides [m], the first one first."""
+        """Return midpoints (2 S, 2) and lengths (2 S,) of the sides [m], in order from the first."""
         corners = np.array(self._corners(diameter))
         ends = np.roll(corners, -1, axis=0)
         return (corners + ends) / 2, np.linalg.norm(ends - corners, axis=-1)
@@ -109,7 +111,7 @@ class Polygon(Shape):
 
     @classmethod
     def from_outline(cls, outline: tuple[Contour, ...], tolerance: float) -> tuple[Self, float] | None:
-        # A shape with more to measure than its orientation measures that itself.
+        # A shape with parameters other than its orientation must override this method.
         if len(outline) != 1 or not isinstance(outline[0], Corners) or [f.name for f in fields(cls)] != ["orientation"]:
             return None
         points, strips = outline[0].points, cls().strips()
@@ -127,14 +129,14 @@ class Polygon(Shape):
         return half_plane_coverage(inwards, normals, cell).prod(-1)
 
     def otf(self, shift: Tensor, diameter: float) -> Tensor:
-        # Two shifted copies meet in a polygon with the same normals, centred between them: narrower strips.
+        # Two shifted copies overlap in a polygon with the same normals but narrower strips, centred between them.
         angles, widths = zip(*self.strips(), strict=True)
         across = (shift[..., None, :] / diameter * shift.new_tensor(self._normals()[: len(widths)])).sum(-1)
         half_widths = ((shift.new_tensor(widths) - across.abs()) / 2).clamp(min=0)
         return _StripArea.apply(half_widths, angles) / self.area(1.0)  # type: ignore[no-any-return]
 
     def quadrature(self, degree: int, diameter: float) -> tuple[Tensor, Tensor]:
-        """A product of Gauss nodes on each of the triangles between the centre and a side."""
+        """Return a product of Gauss rules on each of the triangles between the centre and a side."""
         nodes, weights = np.polynomial.legendre.leggauss(degree // 2 + 2)
         nodes, weights = (nodes + 1) / 2, weights / 2  # on [0, 1]
         corner = np.array(self._corners(diameter))
@@ -159,7 +161,7 @@ class Polygon(Shape):
 
     def separation(self, difference: Tensor) -> Tensor:
         across = difference @ difference.new_tensor(self._normals()).T / difference.new_tensor(self._distances(2.0))
-        # `max`, not `amax`: of equal ones it takes one, so that the gradient of coincident holes is not zero
+        # `max`, not `amax`: among equal values it takes one, so that the gradient of coincident holes is not zero
         return across.max(-1).values
 
     def clearance(self, centers: Tensor, diameter: float, disc_diameter: float) -> Tensor:
@@ -167,7 +169,7 @@ class Polygon(Shape):
         return disc_diameter / 2 - torch.linalg.vector_norm(corners, dim=-1).amax(-1)
 
     def center_radius(self, diameter: float, disc_diameter: float) -> float:
-        # A hole that shows a side to the rim reaches farthest.
+        # A hole whose side faces the rim has its centre farthest out.
         middle, length = self._sides(diameter)
         rim = np.sqrt(np.clip(disc_diameter**2 / 4 - length**2 / 4, 0, None))
         return float(np.linalg.norm(rim[:, None] * np.array(self._normals()) - middle, axis=-1).max())
@@ -184,7 +186,7 @@ class Polygon(Shape):
 
 @dataclass(frozen=True)
 class Hexagon(Polygon):
-    """A regular hexagon, as of the segments of a large mirror.
+    """A regular hexagon, such as a segment of a large mirror.
 
     Examples
     --------
@@ -203,11 +205,11 @@ class Hexagon(Polygon):
 
 @dataclass(frozen=True)
 class Square(Polygon):
-    """A square, as of the mirrors of a micromirror array.
+    """A square, such as a mirror of a micromirror array.
 
     Examples
     --------
-    >>> round(float(Square().otf(torch.tensor([0.25, 0.5]), 1.0)), 12)  # of two triangles, 3/4 and 1/2
+    >>> round(float(Square().otf(torch.tensor([0.25, 0.5]), 1.0)), 12)  # product of two triangle functions, 3/4 and 1/2
     0.375
     """
 
@@ -218,15 +220,15 @@ class Square(Polygon):
 
 
 def _snapped(cosine: float) -> float:
-    """0 for what only rounding keeps from it: a side along an axis lies along it exactly, also in its gradients."""
+    """Round a cosine that should be 0 to exactly 0, so that sides along an axis, and their gradients, are exact."""
     return 0.0 if abs(cosine) < 1e-15 else cosine
 
 
 class _StripArea(torch.autograd.Function):
-    """Area that strips around one centre have in common, of `half_widths` (..., S) and with normals at `angles` (S,).
+    """Area of the intersection of concentric strips with `half_widths` (..., S) and normals at `angles` (S,).
 
-    It is the sum of half-width times side length, and grows with a half-width by its two sides: autograd would have to
-    choose where three of them meet in a corner.
+    It is the sum of half-width times side length over the strips, and its derivative by a half-width is the length of
+    the strip's two sides. Autograd would have no unique gradient where three sides meet in a corner.
     """
 
     generate_vmap_rule = True
@@ -247,7 +249,7 @@ class _StripArea(torch.autograd.Function):
 
     @staticmethod
     def _side(half_widths: Tensor, angles: Sequence[float]) -> Tensor:
-        """Length (..., S) of the two sides that each strip leaves: the other strips cut its edge on either end."""
+        """Return the length (..., S) of each of the two sides of a strip, between the edges of the other strips."""
         others = [[k for k in range(len(angles)) if k != own] for own in range(len(angles))]  # S times S - 1
         turns = [[(angles[k] - angle) % math.pi for k in row] for row, angle in zip(others, angles, strict=True)]
         cosine, sine = (
@@ -259,9 +261,7 @@ class _StripArea(torch.autograd.Function):
 
 
 def _hexagon_patches(x: Tensor, y: Tensor, differentiate: bool, normals: Tensor) -> tuple[Tensor, Pullback]:
-    """`Patches` of a regular hexagon.
-
-    `normals` (3, 2) are the unit normals of its sides, 60 degrees apart.
+    """Compute the `Patches` of a regular hexagon whose sides have the unit normals `normals` (3, 2), 60 degrees apart.
 
     The overlap of two hexagons is a hexagon of half-widths w_k = (1 - |n_k . shift|) / 2 along the normals n_k of the
     sides. Of the three |n_k . shift| the largest is the sum of the others, M = p + m, p >= m: its area is then

@@ -1,7 +1,7 @@
-"""What every aperture is, and its open part as samples of a raster that an FFT takes to the image.
+"""The base class of apertures, and the sampling of their open area on an FFT raster.
 
-Each sub-aperture is sampled by its own small patch of the raster. A sample carries the fraction of its cell that is
-open, so the field follows a hole that moves by less than a sample, and autograd follows it too.
+Each sub-aperture is sampled by its own small patch of the raster. A sample holds the open fraction of its cell, so the
+field changes smoothly and differentiably when a hole moves by less than a sample.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from torchmask.optics.shape_base import Shape
 
 
 class PupilSamples(NamedTuple):
-    """The open part of a pupil as samples of an FFT raster, P per sub-aperture.
+    """The open area of a pupil, sampled on an FFT raster with P samples per sub-aperture.
 
     offsets : (..., N, P, 2) position (x, y) relative to the centre of the sub-aperture [m]
     weights : (..., N, P) open fraction of the sample's cell
-    index : (..., N, P) position in the flattened raster, in FFT order
-    raster : (rows, columns) of the raster
-    step : (dy, dx) of the raster [m]
+    index : (..., N, P) index in the flattened raster, in FFT order
+    raster : (rows, columns), size of the raster
+    step : (dy, dx), spacing of the samples [m]
     """
 
     offsets: Tensor
@@ -35,10 +35,10 @@ class PupilSamples(NamedTuple):
 
 
 class Aperture(nn.Module):
-    """What every aperture offers: N equal sub-apertures at `centers` (..., N, 2) [m], (x, y).
+    """Base class of all apertures: N equal sub-apertures at `centers` (..., N, 2) [m], (x, y).
 
-    `shape` is the form of a sub-aperture and `subaperture_diameter` its size, flat to flat for hexagons;
-    `mask_diameter` is the disc that holds them all [m].
+    `shape` is the shape of a sub-aperture and `subaperture_diameter` its size [m], flat to flat for hexagons;
+    `mask_diameter` is the diameter of the disc that holds them all [m].
     """
 
     centers: Tensor
@@ -53,12 +53,12 @@ class Aperture(nn.Module):
 
     @property
     def is_full(self) -> bool:
-        """Whether it is a full pupil, a single opening, and no mask: it has no pairs of holes, thus no fringes."""
+        """Whether it is a full pupil, that is a single opening, which has no pairs of holes and makes no fringes."""
         return self.n_subapertures == 1
 
     @property
     def area(self) -> float:
-        """Collecting area [m^2], overlaps counted twice."""
+        """Collecting area [m^2], with overlaps counted twice."""
         return self.n_subapertures * self.shape.area(self.subaperture_diameter)
 
     @property
@@ -70,7 +70,7 @@ class Aperture(nn.Module):
     def extent(self) -> float:
         """Largest separation of two points of the aperture, outer edge to outer edge [m].
 
-        For hexagons an upper bound: their corners are taken to lie on the longest baseline. A full pupil of this
+        For hexagons it is an upper bound, as if their corners lay on the longest baseline. A full pupil of this
         diameter reaches the same spatial frequencies.
         """
         centers = self.centers.detach()
@@ -79,11 +79,11 @@ class Aperture(nn.Module):
 
     @property
     def reach(self) -> float:
-        """Distance of the outermost edge from the origin, corners again taken to point outwards [m]."""
+        """Distance of the outermost edge from the origin [m]; an upper bound for hexagons, as for `extent`."""
         return float(torch.linalg.vector_norm(self.centers.detach(), dim=-1).max()) + self.outer_diameter / 2
 
     def still(self) -> Self:
-        """A copy that stays where it is while this one moves or trains."""
+        """Return a copy that does not change when this aperture moves or trains."""
         centers = self.centers.detach().clone()
         if isinstance(self.centers, nn.Parameter):
             centers = nn.Parameter(centers, requires_grad=False)
@@ -92,7 +92,7 @@ class Aperture(nn.Module):
     def samples(self, grid: Grid, oversampling: int = 1) -> PupilSamples:
         """Sample the aperture on the pupil raster of a field `oversampling` times as wide as `grid`.
 
-        The raster step is grid.period / (oversampling * n_pixels). Differentiable in `centers`.
+        The samples are grid.period / (oversampling * n_pixels) apart. Differentiable in `centers`.
 
         Raises
         ------
@@ -104,16 +104,16 @@ class Aperture(nn.Module):
         return sample_holes(self.centers, self.shape, self.subaperture_diameter, grid, oversampling)
 
     def require_sampling(self, grid: Grid) -> None:
-        """Raise ValueError if the grid aliases the image. Under `torch.func.vmap`, where no value can be seen, nothing
-        is checked."""
+        """Raise ValueError if the grid aliases the image. Nothing is checked under `torch.func.vmap`, which hides
+        values."""
         if can_be_read(self.centers):
             grid.require_sampling(self.extent)
 
 
 def sample_holes(centers: Tensor, shape: Shape, diameter: float, grid: Grid, oversampling: int) -> PupilSamples:
-    """The samples of sub-apertures of one shape and diameter [m] at `centers` (..., N, 2) [m], as `Aperture.samples`.
+    """Sample sub-apertures of one shape and diameter [m] at `centers` (..., N, 2) [m] as `Aperture.samples` does.
 
-    Whether the image is aliased is not looked at.
+    Aliasing of the image is not checked.
     """
     if oversampling != int(oversampling) or oversampling < 1:
         raise ValueError(f"oversampling is {oversampling}: it must be a whole number of at least 1")
@@ -140,7 +140,7 @@ def sample_holes(centers: Tensor, shape: Shape, diameter: float, grid: Grid, ove
 
 
 def can_be_read(tensor: Tensor) -> bool:
-    """Whether Python may look at the values of a tensor: not under `torch.func.vmap`."""
+    """Return whether Python can read the values of a tensor, which it cannot under `torch.func.vmap`."""
     try:
         bool(tensor.detach().sum() == 0)
     except RuntimeError:

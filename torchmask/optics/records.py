@@ -1,4 +1,4 @@
-"""Apertures as the names and numbers that files hold, from version 0.1 on."""
+"""Conversion of apertures to and from the names and numbers in files, from version 0.1 on."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torchmask.optics.shapes import named_shape
 
 
 def aperture_record(aperture: Aperture) -> dict[str, Any]:
-    """What a file must hold of an aperture: the name of its shape, numbers in SI units, and the centres as a tensor."""
+    """Return an aperture as values for a file: the name of its shape, numbers in SI units, and a tensor of centres."""
     return {
         "shape": aperture.shape.name,
         **aperture.shape.parameters,
@@ -22,12 +22,12 @@ def aperture_record(aperture: Aperture) -> dict[str, Any]:
 
 
 def read_mask(record: Mapping[str, Any]) -> SparseAperture:
-    """The mask that an `aperture_record` describes; without a shape its holes are discs, and other keys are ignored.
+    """Return the mask that an `aperture_record` describes. Its holes are discs by default; other keys are ignored.
 
     Raises
     ------
     ValueError, LookupError
-        If the record describes no mask.
+        If the record does not describe a mask.
     """
     shape = named_shape(str(record.get("shape", "disc")), record)
     hole, mask = float(record["subaperture_diameter"]), float(record["mask_diameter"])
@@ -35,15 +35,15 @@ def read_mask(record: Mapping[str, Any]) -> SparseAperture:
 
 
 def read_aperture(record: Mapping[str, Any]) -> Aperture:
-    """The mask or full pupil that an `aperture_record` describes.
+    """Return the mask or full pupil that an `aperture_record` describes.
 
-    A single round hole at the origin is a full pupil of its own diameter, whatever mask_diameter says. Version 0.1 kept
-    its obstruction apart from the shape.
+    A single round hole at the origin is a full pupil of its own diameter, whatever mask_diameter says. In files of
+    version 0.1 the obstruction is not part of the shape.
 
     Raises
     ------
     ValueError, LookupError
-        If the record describes no aperture.
+        If the record does not describe an aperture.
     """
     mask = read_mask(record)
     if not (mask.is_full and mask.shape.is_round) or bool(mask.centers.any()):

@@ -1,4 +1,4 @@
-"""Round holes: discs, and discs with a round obstruction in the middle."""
+"""Round holes: discs and annuli."""
 
 from __future__ import annotations
 
@@ -61,8 +61,8 @@ class Disc(Shape):
         return (cls(), 2 * outline[0].radius) if len(outline) == 1 and isinstance(outline[0], Circle) else None
 
     def coverage(self, offsets: Tensor, cell: Tensor, diameter: float) -> Tensor:
-        # A sample on the centre has no direction: any will do, and this one keeps the gradient finite. So has one so
-        # near that the square of its distance is lost in underflow.
+        # A sample at the centre, or so near that its squared distance underflows, has no direction. Any will do; this
+        # one keeps the gradient finite.
         central = (offsets.abs() < math.sqrt(torch.finfo(offsets.dtype).tiny)).all(-1, keepdim=True)
         direction = torch.where(central, offsets.new_tensor([1.0, 0.0]), offsets)
         length = torch.linalg.vector_norm(direction, dim=-1, keepdim=True)
@@ -98,9 +98,9 @@ class Disc(Shape):
 
 @dataclass(frozen=True)
 class Annulus(Disc):
-    """A disc with a round obstruction in the middle, as of a telescope's secondary mirror.
+    """A disc with a round central obstruction, such as a telescope's secondary mirror.
 
-    Its outer edge is that of a disc, and so are gaps and what is inside what.
+    Gaps between holes and distances to the rim are those of the disc.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ class Annulus(Disc):
     Raises
     ------
     ValueError
-        For any other `obstruction`.
+        If `obstruction` is out of range.
     """
 
     name: ClassVar[str] = "annulus"
@@ -121,8 +121,8 @@ class Annulus(Disc):
     def __post_init__(self) -> None:
         if not 0 < self.obstruction < 1:
             raise ValueError(
-                f"obstruction is {self.obstruction}: it is the fraction of the diameter that is blocked, above 0 and "
-                "below 1; without one it is a Disc"
+                f"obstruction is {self.obstruction}: it must be a fraction of the diameter, above 0 and below 1; for "
+                "none, take a Disc"
             )
 
     @property
@@ -150,8 +150,8 @@ class Annulus(Disc):
         return super().coverage(offsets, cell, diameter) - super().coverage(offsets, cell, self.obstruction * diameter)
 
     def otf(self, shift: Tensor, diameter: float) -> Tensor:
-        # Two discs less what either of them shares with the other's obstruction (E. L. O'Neill, J. Opt. Soc. Am. 46,
-        # 285, 1956); the obstructions share what has then been taken off twice.
+        # The overlap of two discs, less that of each disc with the other's obstruction, plus that of the obstructions,
+        # which has been subtracted twice (E. L. O'Neill, J. Opt. Soc. Am. 46, 285, 1956).
         distance, inner = 2 * _distance(shift) / diameter, self.obstruction
         overlap = (
             _CircleOverlap.apply(distance, 1.0, 1.0)
@@ -171,9 +171,9 @@ class Annulus(Disc):
 
 
 def disc_otf(x: Tensor) -> Tensor:
-    """OTF of a clear disc at `x` >= 0 times its cut-off: (2/pi)(acos x - x sqrt(1 - x^2)), 0 beyond 1.
+    """Return the OTF of a clear disc at `x` >= 0 times its cut-off: (2/pi)(acos x - x sqrt(1 - x^2)), 0 beyond 1.
 
-    Any shape; same shape, dtype and device out. The derivative is -(4/pi) sqrt(1 - x^2) (Goodman, Introduction to
+    The result has the shape, dtype and device of `x`. The derivative is -(4/pi) sqrt(1 - x^2) (Goodman, Introduction to
     Fourier Optics, section 6.3).
     """
     return _CircleOverlap.apply(2 * x, 1.0, 1.0) / math.pi  # type: ignore[no-any-return]
@@ -182,8 +182,8 @@ def disc_otf(x: Tensor) -> Tensor:
 class _CircleOverlap(torch.autograd.Function):
     """Area common to two discs of radii `one` >= `other` whose centres are `distance` >= 0 apart.
 
-    It shrinks by the length of the common chord, which is its derivative: autograd would find NaN where the circles
-    touch or are concentric.
+    Its derivative is minus the length of the common chord; autograd would give NaN where the circles touch or are
+    concentric.
     """
 
     generate_vmap_rule = True
@@ -208,20 +208,20 @@ class _CircleOverlap(torch.autograd.Function):
 
     @staticmethod
     def _half_angle(distance: Tensor, radius: float, rest: float) -> tuple[Tensor, Tensor]:
-        """Cosine and sine of half the angle under which the circle of `radius` sees the common chord."""
+        """Return cosine and sine of half the angle that the common chord subtends at the centre of one circle."""
         distance = distance.clamp(min=1e-18)
         cosine = ((distance**2 + (radius**2 - rest**2)) / (2 * radius * distance)).clamp(-1, 1)
         return cosine, torch.sqrt((1 - cosine) * (1 + cosine))
 
 
 def _distance(shift: Tensor) -> Tensor:
-    """Length along the last axis, with gradient 0 at zero."""
+    """Return the length along the last axis, with gradient 0 at zero."""
     squared = (shift**2).sum(-1)
     return torch.where(squared > 0, squared, 1).sqrt() * (squared > 0)
 
 
 def _ring_quadrature(degree: int, diameter: float, obstruction: float) -> tuple[Tensor, Tensor]:
-    """Gauss nodes in the squared radius times uniform angles."""
+    """Return a product of Gauss nodes in the squared radius and uniform angles."""
     nodes, weights = np.polynomial.legendre.leggauss(degree // 2 + 2)
     nodes, weights = (nodes + 1) / 2, weights / 2  # on [0, 1]
     inner = obstruction**2
@@ -233,7 +233,7 @@ def _ring_quadrature(degree: int, diameter: float, obstruction: float) -> tuple[
 
 
 def _disc_series(degree: int) -> list[float]:
-    """Coefficients of S in OTF = v^(3/2) S(v), v = 1 - x, x in [0, 1] the distance in units of the cut-off.
+    """Return the coefficients of S in OTF = v^(3/2) S(v), v = 1 - x, x in [0, 1] the distance in units of the cut-off.
 
     OTF = (4/pi) integral_x^1 sqrt(1 - t^2) dt; expanding sqrt(1 - w/2) under the integral, w = 1 - t, gives the
     power series 4 sqrt(2)/pi sum_k binom(1/2, k) (-1/2)^k v^k / (k + 3/2), which is economised on [0, 1].
@@ -245,23 +245,23 @@ def _disc_series(degree: int) -> list[float]:
     return Chebyshev.interpolate(Polynomial(terms), degree, domain=[0, 1]).convert(kind=Polynomial).coef.tolist()
 
 
-# OTF^2 has relative errors of 3e-13 and 5e-8 (float32) even at the edge, where the textbook form loses its
-# digits: acos x - x sqrt(1 - x^2) is a small difference there.
+# With them OTF^2 has relative errors of 3e-13 and 5e-8 (float32) even at the edge, where the textbook form,
+# acos x - x sqrt(1 - x^2), cancels.
 _DISC_SERIES = {torch.float64: _disc_series(12), torch.float32: _disc_series(6)}
 
 
 def disc_constants(dtype: torch.dtype, device: torch.device) -> list[Tensor]:
-    """The coefficients of S and then 1, as the scalar tensors that addcmul takes."""
+    """Return the coefficients of S, followed by 1, as the scalar tensors that addcmul takes."""
     return list(torch.tensor([*_DISC_SERIES[dtype], 1.0], dtype=dtype, device=device).unbind())
 
 
 def disc_patches(x: Tensor, y: Tensor, differentiate: bool, constants: list[Tensor]) -> tuple[Tensor, Pullback]:
-    """`Patches` of a disc with the `disc_constants`."""
-    # All arrays in one allocation: the heap keeps one block for the next call where it would return several.
+    """Compute the `Patches` of a disc with the `disc_constants`."""
+    # One allocation for all arrays, because the heap reuses a single block but would release several.
     work = x.new_empty(4 if differentiate else 3, *x.shape[:-2], y.shape[-2], x.shape[-1])
     v, inverse, a = work[0], work[1], work[2]
     *series, one = constants
-    tiny = torch.finfo(x.dtype).tiny * 1e3  # gives distance 0 a finite inverse, which x = y = 0 then multiplies
+    tiny = torch.finfo(x.dtype).tiny * 1e3  # keeps the inverse of distance 0 finite; x = y = 0 then multiplies it
     torch.add(x * x, y * y + tiny, out=v)
     torch.rsqrt(v, out=inverse)  # twice as fast as sqrt
     torch.addcmul(one, v, inverse, value=-1, out=v)

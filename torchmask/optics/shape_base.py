@@ -1,8 +1,8 @@
-"""What a hole shape must know, and what follows from it.
+"""The base class of hole shapes, and helpers for its subclasses.
 
-A `Shape` is the form of a hole about its centre, with what belongs to the form (the orientation of a hexagon) and
-without its size: the size, `diameter` [m], goes with every call. Everything in the library that depends on the form
-of a hole asks its shape, so that one class adds a new form to all of it.
+A `Shape` describes the outline of a hole about its centre, such as a hexagon and its orientation, but not its size: the
+size, `diameter` [m], is an argument of every method. All code that depends on the shape of a hole uses this interface,
+so a new shape takes only one class.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Pullback = Callable[[Tensor], Tensor]
 
 
 class Circle(NamedTuple):
-    """An edge around the centre of a hole, of `radius` [m]."""
+    """A circular edge of `radius` [m] around the centre of a hole."""
 
     radius: float
 
@@ -39,10 +39,11 @@ Contour = Circle | Corners
 
 
 class Patches(Protocol):
-    """OTF^2 at the pixels x (..., 1, K) by y (..., K, 1), in units of the hole's diameter: (..., K, K).
+    """Function that returns OTF^2 (..., K, K) at x (..., 1, K) and y (..., K, 1), in units of the hole's diameter.
 
-    The pullback that comes with it takes the derivatives of a loss by the patches, (..., K, K), to those by the common
-    shift of each patch's (x, y), (..., 2). It may be called once, and only if `differentiate`.
+    It also returns a pullback, which converts the gradient of a loss with respect to the patches, (..., K, K), into
+    that with respect to a common shift (x, y) of each patch, (..., 2). The pullback may be called once, and only if
+    `differentiate` is true.
     """
 
     def __call__(self, x: Tensor, y: Tensor, differentiate: bool) -> tuple[Tensor, Pullback]: ...
@@ -50,24 +51,24 @@ class Patches(Protocol):
 
 @dataclass(frozen=True)
 class Shape(ABC):
-    """The form of a hole about its centre; lengths are in metres, and `diameter` says how large it is.
+    """The shape of a hole about its centre. Lengths are in metres, and `diameter` is the size of the hole.
 
-    A shape of your own is a frozen dataclass whose fields are numbers, with a `name` (under which files know it) and
-    the abstract methods; a polygon needs one of them (`torchmask.optics.polygons.Polygon`). Methods that take tensors
-    follow their dtype, device and gradient, and take any leading axes.
+    To add a shape, write a frozen dataclass whose fields are numbers, with a `name` (used in files) and the abstract
+    methods; a subclass of `torchmask.optics.polygons.Polygon` needs only one of them. Methods that take tensors accept
+    any leading axes, keep dtype and device, and are differentiable.
     """
 
     name: ClassVar[str]
-    is_round: ClassVar[bool] = False  # a turn about the centre changes nothing
-    has_noll_modes: ClassVar[bool] = False  # Noll's polynomials are orthonormal over the open area as they are
+    is_round: ClassVar[bool] = False  # whether rotation leaves the shape unchanged
+    has_noll_modes: ClassVar[bool] = False  # whether Noll's polynomials are orthonormal over the open area
     known: ClassVar[dict[str, type[Shape]]] = {}
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
         if "name" in vars(cls):
             other = Shape.known.get(cls.name, cls)
-            if other.__qualname__ != cls.__qualname__:  # a class may be defined once more, as in a notebook
-                raise ValueError(f"{other.__qualname__} is called {cls.name!r} already: files must tell shapes apart")
+            if other.__qualname__ != cls.__qualname__:  # a notebook may define the same class again
+                raise ValueError(f"{other.__qualname__} is called {cls.name!r} already: choose another name")
             Shape.known[cls.name] = cls
 
     def __str__(self) -> str:
@@ -75,98 +76,109 @@ class Shape(ABC):
 
     @property
     def plural(self) -> str:
-        """Several of them in words, with what their diameter measures where that is no diameter."""
+        """Plural of the name, with how the diameter is measured where that is not obvious."""
         return f"{self.name}s"
 
     @property
     def parameters(self) -> dict[str, float]:
-        """What besides the name a file must hold: the fields of the dataclass."""
+        """Fields of the dataclass, which files hold besides the name."""
         return asdict(self)
 
     @property
     def fineness(self) -> float:
-        """Size of the finest structure over that of the hole, at most 1: modes vary on this scale."""
+        """Size of the finest structure, on which modes vary, as a fraction of the diameter."""
         return 1.0
 
     @property
     def askew(self) -> float:
-        """An angle [rad] by which the shape may be turned so that no side lies along x."""
+        """Angle [rad] by which to turn the shape so that no side lies along x."""
         return 0.0
 
     @abstractmethod
     def turned(self, angle: float) -> Self:
-        """The shape turned by `angle` [rad], counterclockwise."""
+        """Return the shape turned by `angle` [rad], counterclockwise."""
 
     @abstractmethod
     def mirrored(self) -> Self:
-        """The shape with x reversed."""
+        """Return the shape with x reversed."""
 
     @abstractmethod
     def area(self, diameter: float) -> float:
-        """Open area [m^2]."""
+        """Return the open area [m^2]."""
 
     @abstractmethod
     def outer_diameter(self, diameter: float) -> float:
-        """Diameter of the circle around the centre that just holds the hole [m]."""
+        """Return the diameter of the smallest circle around the centre that contains the hole [m]."""
 
     @abstractmethod
     def outline(self, diameter: float) -> tuple[Contour, ...]:
-        """The outer edge, and then the edges of what is blocked within it."""
+        """Return the outer edge, followed by the edges of any obstructions within it."""
 
     @classmethod
     def from_outline(cls, outline: tuple[Contour, ...], tolerance: float) -> tuple[Self, float] | None:
-        """The shape and its diameter of which this is the outline, corner by corner; None if there is none.
+        """Return the shape and its diameter [m] for this outline, or None if it is that of another shape.
 
-        Shapes that are to be read from drawings override it.
+        Every corner must agree to `tolerance` [m]. Override it in shapes that are to be read from drawings.
         """
         return None
 
     @abstractmethod
     def coverage(self, offsets: Tensor, cell: Tensor, diameter: float) -> Tensor:
-        """Open fraction (...) of the rectangular cells of size `cell` (2,) [m] at `offsets` (..., 2) [m]."""
+        """Return the open fraction (...) of rectangular cells of size `cell` (2,) [m] at `offsets` (..., 2) [m]."""
 
     @abstractmethod
     def otf(self, shift: Tensor, diameter: float) -> Tensor:
-        """Overlap (...) of the hole with itself displaced by `shift` (..., 2) [m]: 1 at zero, with gradient 0."""
+        """Return the overlap (...) of the hole with itself displaced by `shift` (..., 2) [m], over the open area.
+
+        It is 1 at zero shift, with gradient 0.
+        """
 
     @abstractmethod
     def quadrature(self, degree: int, diameter: float) -> tuple[Tensor, Tensor]:
-        """Points (Q, 2) [m] and weights (Q,) of the mean over the open area, exact for polynomials up to `degree`.
+        """Return points (Q, 2) [m] and weights (Q,) for means over the open area, float64 on the CPU.
 
-        float64, on the CPU.
+        The mean is exact for polynomials up to `degree`.
         """
 
     @abstractmethod
     def amplitude(self, frequency: Array, diameter: float) -> Array:
-        """Fourier transform over the open area, 1 at 0, at `frequency` (..., 2) [1/m], an angle on the sky over the
-        wavelength."""
+        """Return the Fourier transform of the open area, 1 at 0, at `frequency` (..., 2) [1/m].
+
+        A frequency is an angle on the sky divided by the wavelength.
+        """
 
     @abstractmethod
     def separation(self, difference: Tensor) -> Tensor:
-        """The diameter (...) [m] at which two holes whose centres differ by `difference` (..., 2) [m] touch.
+        """Return the diameter (...) [m] at which two holes with centres `difference` (..., 2) [m] apart touch.
 
-        Less the diameter it is the gap between the holes: exact where sides face each other, and elsewhere never more
-        than the true one, as long as the diameter is the width of the hole at its narrowest.
+        Subtracting the actual diameter gives the gap between the holes. It is exact where sides face each other and
+        elsewhere never exceeds the true gap, provided the diameter is the smallest width of the hole.
         """
 
     @abstractmethod
     def clearance(self, centers: Tensor, diameter: float, disc_diameter: float) -> Tensor:
-        """Signed distance (...) [m] of holes at `centers` (..., 2) from the rim of a disc around the origin."""
+        """Return the distance (...) [m] of holes at `centers` (..., 2) [m] from the rim of a disc around the origin.
+
+        It is negative for holes that cross the rim.
+        """
 
     @abstractmethod
     def center_radius(self, diameter: float, disc_diameter: float) -> float:
-        """Radius [m] beyond which no centre can lie if the hole is to be inside a disc around the origin."""
+        """Return the largest distance [m] of a centre from the origin with the hole inside a disc around the origin."""
 
     @abstractmethod
     def chords(self, height: Array, diameter: float) -> tuple[Array, Array]:
-        """Where a horizontal line `height` [m] above the centre enters and leaves what the outer edge holds.
+        """Return x [m] where a horizontal line `height` [m] above the centre enters and leaves the outer edge.
 
-        Both are 0 where it does not meet it. The frequencies that two equal holes share fill the same form at twice
-        the diameter, so chords, clearance and outline describe them as well.
+        Both are 0 if the line misses it. The support of the overlap of two equal holes has the same shape and twice the
+        diameter, so chords, clearance and outline apply to it too.
         """
 
     def patches(self, dtype: torch.dtype, device: torch.device) -> Patches:
-        """OTF^2 with its derivative, for `AsymptoticMSE`: by autograd, unless a shape knows a faster way."""
+        """Return a function for OTF^2 and its derivative, used by `AsymptoticMSE`.
+
+        It uses autograd unless a shape overrides it with a faster one.
+        """
         return partial(_squared_otf, self)
 
 
@@ -182,25 +194,25 @@ def _squared_otf(shape: Shape, x: Tensor, y: Tensor, differentiate: bool) -> tup
 
 
 def no_pullback(grad: Tensor) -> Tensor:
-    """What stands for a pullback where none was asked for."""
-    raise RuntimeError("the patches were made without what their derivatives need")
+    """Raise RuntimeError; returned as the pullback of patches that are not to be differentiated."""
+    raise RuntimeError("the patches were made without derivatives: call with differentiate=True")
 
 
 def safe_length(vector: Tensor) -> Tensor:
-    """Length along the last axis; at zero, where any direction would do, the gradient is along the first axis."""
+    """Return the length along the last axis, with a gradient along the first component at zero length."""
     zero = (vector == 0).all(-1)
     x, y = vector.unbind(-1)
     return torch.where(zero, x, torch.hypot(torch.where(zero, 1.0, x), y))
 
 
 def half_plane_coverage(distance: Tensor, normal: Tensor, cell: Tensor) -> Tensor:
-    """Fraction of a rectangular cell inside a half-plane whose edge lies `distance` beyond the cell's centre.
+    """Return the fraction of a rectangular cell inside a half-plane whose edge lies `distance` beyond its centre.
 
-    The exact integral of a box in the direction of `normal`: the sum of two uniform variables of widths a and b
-    is below `distance`. Edges are straight on the scale of a cell.
+    It is exact: the probability that the sum of two uniform variables, whose widths a and b are those of the cell along
+    `normal`, is below `distance`. Edges are taken as straight on the scale of a cell.
     """
     width = normal.abs() * cell
-    # A ratio of 1e-4 between the two widths stands for an edge along the cell's side: it avoids 0/0.
+    # For an edge parallel to a side of the cell, a small width instead of 0 avoids 0/0.
     width = torch.maximum(width, 1e-4 * width.amax(-1, keepdim=True))
     a, b = width.unbind(-1)
     half_sum, half_difference = (a + b) / 2, (a - b) / 2

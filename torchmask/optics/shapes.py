@@ -1,6 +1,6 @@
-"""The shapes that a hole may have, and how files and drawings name them.
+"""The known shapes of holes, found by their name in a file or by their outline in a drawing.
 
-A shape of one's own, a subclass of `Shape` or `Polygon` with a name, is known from its definition on.
+A new subclass of `Shape` or `Polygon` that has a name is known as soon as it is defined.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ __all__ = [
 
 
 def named_shape(name: str, parameters: Mapping[str, Any]) -> Shape:
-    """The shape called `name`, with those of `parameters` that it has; the others are for other shapes.
+    """Return the shape called `name` with its parameters from `parameters`, whose other entries are ignored.
 
     Raises
     ------
     ValueError
-        If no shape has this name, or a parameter is missing or of no use.
+        If no shape has this name, or a parameter is missing or invalid.
 
     Examples
     --------
@@ -53,16 +53,16 @@ def named_shape(name: str, parameters: Mapping[str, Any]) -> Shape:
 
 
 def outlined_shape(outline: tuple[Contour, ...], tolerance: float) -> tuple[Shape, float]:
-    """The known shape, and its diameter [m], that has this outline about its centre, up to `tolerance` [m].
+    """Return the known shape and its diameter [m] that match an outline about the centre, up to `tolerance` [m].
 
     Raises
     ------
     ValueError
-        If it is the outline of no known shape.
+        If no known shape has this outline.
     """
     for kind in Shape.known.values():
         found = kind.from_outline(outline, tolerance)
         if found is not None:
             return found
     parts = " and ".join("a circle" if isinstance(c, Circle) else f"{len(c.points)} corners" for c in outline)
-    raise ValueError(f"a hole whose outline is {parts} is none of the known shapes: {', '.join(Shape.known)}")
+    raise ValueError(f"a hole with an outline of {parts} is none of the known shapes: {', '.join(Shape.known)}")

@@ -1,8 +1,8 @@
-"""Zernike modes of a sub-aperture and the phase they make.
+"""Zernike modes of a sub-aperture, and the phase that is a sum of them.
 
-Modes are numbered as by Noll (J. Opt. Soc. Am. 66, 207, 1976), from 1 (piston), and have unit mean square over the
-open area. On a clear disc they are Noll's polynomials; on a hexagon or an obstructed disc the same polynomials made
-orthonormal over that area, in Noll order (Mahajan & Dai, J. Opt. Soc. Am. A 24, 2994, 2007).
+Modes have Noll's numbers (J. Opt. Soc. Am. 66, 207, 1976), from 1 (piston), and unit rms over the open area. On a clear
+disc they are Noll's polynomials; on other shapes, the same polynomials orthonormalised over the open area in Noll order
+(Mahajan & Dai, J. Opt. Soc. Am. A 24, 2994, 2007).
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from torch import Tensor, nn
 from torchmask.grid import Grid
 from torchmask.optics.pupil import Aperture, PupilSamples, can_be_read
 
-_INDEPENDENT = 1e-9  # rms of a mode, of unit rms over the disc, that the modes before it do not explain
+_INDEPENDENT = 1e-9  # smallest rms of the part of a mode that is orthogonal to the modes before it
 
 
 def noll(j: int) -> tuple[int, int]:
-    """Radial order n and signed azimuthal order m of Noll mode `j` >= 1: cosine for m > 0, sine for m < 0.
+    """Return radial order n and azimuthal order m of Noll mode `j` >= 1: cosine for m > 0, sine for m < 0.
 
     >>> noll(1), noll(2), noll(3), noll(11)
     ((0, 0), (1, 1), (1, -1), (4, 0))
@@ -33,11 +33,11 @@ def noll(j: int) -> tuple[int, int]:
 
 
 def zernike(points: Tensor, n_modes: int) -> Tensor:
-    """Noll modes 1 to `n_modes` at `points` (..., 2), (x, y) in units of the radius: (..., J), unit rms over the disc.
+    """Return Noll modes 1 to `n_modes` (..., J), of unit rms over the disc, at `points` (..., 2).
 
-    Polynomials in x and y: smooth everywhere, the centre included, and continued as they are beyond the disc. The
-    radial part is r^m P_k^(0, m)(2 r^2 - 1) by the three-term recurrence of Jacobi polynomials, which keeps its
-    accuracy at high orders, in float32 too.
+    Points are (x, y) in units of the radius. Modes are polynomials in x and y, so they are smooth everywhere and
+    continue beyond the disc. The radial part is r^m P_k^(0, m)(2 r^2 - 1), by the three-term recurrence of Jacobi
+    polynomials, which is accurate at high orders, even in float32.
 
     Raises ValueError if `n_modes` is not a whole number of at least 1.
 
@@ -64,7 +64,7 @@ def zernike(points: Tensor, n_modes: int) -> Tensor:
 
 
 def _jacobi(q: Tensor, m: int, degree: int) -> list[Tensor]:
-    """Jacobi polynomials P_k^(0, m)(q), k = 0 to `degree`."""
+    """Return the Jacobi polynomials P_k^(0, m)(q), k = 0 to `degree`."""
     p = [torch.ones_like(q), ((m + 2) * q - m) / 2]
     for k in range(2, degree + 1):
         a = 2 * k + m
@@ -74,9 +74,10 @@ def _jacobi(q: Tensor, m: int, degree: int) -> list[Tensor]:
 
 
 def aperture_modes(aperture: Aperture, points: Tensor, n_modes: int) -> Tensor:
-    """Modes of one sub-aperture at `points` (..., 2) [m] from its centre: (..., J), unit rms over its open area.
+    """Return the modes (..., J) of one sub-aperture, of unit rms over its open area, at `points` (..., 2) [m].
 
-    Raises ValueError if `n_modes` is not a whole number of at least 1, or a ring is too thin to tell so many apart.
+    Points are relative to the centre. Raises ValueError if `n_modes` is not a whole number of at least 1, or if the
+    shape, such as a thin ring, is too narrow to tell so many modes apart.
     """
     shape, radius = aperture.shape, aperture.outer_diameter / 2
     modes = zernike(points / radius, n_modes)
@@ -86,33 +87,33 @@ def aperture_modes(aperture: Aperture, points: Tensor, n_modes: int) -> Tensor:
     triangle = torch.linalg.qr(weights.sqrt()[:, None] * zernike(nodes / radius, n_modes)).R
     diagonal = triangle.diagonal()
     if float(diagonal.abs().min()) < _INDEPENDENT:
-        raise ValueError(f"{n_modes} modes are not independent on so thin a shape, {shape!r}: fewer modes are needed")
+        raise ValueError(f"{n_modes} modes are not independent on {shape!r}, which is too thin: lower n_modes")
     combine = torch.linalg.inv(triangle * diagonal.sign()[:, None])
     return modes @ combine.to(modes)
 
 
 def zernike_basis(samples: PupilSamples, aperture: Aperture, n_modes: int) -> Tensor:
-    """Modes of every sub-aperture on its pupil samples: (..., N, P, J).
+    """Return the modes of every sub-aperture on its pupil samples, (..., N, P, J).
 
-    Differentiable in the centres through `samples.offsets`. Samples on the rim may lie a little outside, where the
-    polynomials go on smoothly.
-
-    Raises ValueError if `n_modes` is not a whole number of at least 1.
+    They are differentiable in the centres through `samples.offsets`. Samples on the rim may lie slightly outside, where
+    the polynomials continue smoothly. Raises ValueError if `n_modes` is not a whole number of at least 1.
     """
     return aperture_modes(aperture, samples.offsets, n_modes)
 
 
 class ZernikePhase(nn.Module):
-    """Phase of Zernike modes on the pupil samples that `PSF` takes.
+    """Phase that is a sum of Zernike modes, on the pupil samples that `PSF` takes.
 
     Parameters
     ----------
     aperture : Aperture
+        Mask or full pupil.
     grid : Grid
+        Pixels and wavelength of the image.
     n_modes : int
-        Modes per sub-aperture, Noll 1 (piston) to `n_modes`.
+        Number of modes per sub-aperture, from Noll mode 1 (piston).
     oversampling : int
-        As for `PSF`.
+        Oversampling of the pupil, the same as that of the `PSF`.
 
     Raises
     ------
@@ -121,9 +122,9 @@ class ZernikePhase(nn.Module):
 
     Notes
     -----
-    `forward(coefficients)` takes (..., [frame,] N, J) in rad rms and returns the phase (..., [frame,] N, P) [rad]:
-    where there are more axes than the centres (..., N, 2) have, the last one before N is the frame. The basis is kept
-    while the centres stay where they were, and evaluated anew, differentiably, when they train or have moved.
+    `forward(coefficients)` takes (..., [frame,] N, J) [rad rms] and returns the phase (..., [frame,] N, P) [rad]. If
+    coefficients have an axis more than the centres (..., N, 2), the one before N is the frame. The basis is cached and
+    evaluated again, differentiably, if the centres require a gradient or have moved.
 
     Examples
     --------

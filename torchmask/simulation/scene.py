@@ -37,7 +37,7 @@ class SceneOptions:
     """
 
     path: Path | None = None
-    """Mesh (.obj, .stl, .ply, .glb ...) or image (.npz with key image, .png, .fits); default: the packaged satellite."""
+    """Mesh (.obj, .stl, .ply, .glb ...) or image (.npz with key image, .png, .fits); default: packaged satellite."""
     attitude: tuple[float, float, float] | None = None
     """Rotation about the axes right, up, towards the viewer [degrees]; 25 -30 15 by default, 0 0 0 for images, which
     rotate only about the last."""
