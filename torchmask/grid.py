@@ -1,8 +1,8 @@
-"""The one place where metres, radians and wavelengths become arrays.
+"""The image grid and its Fourier plane: the relation between pixels, angles, frequencies and lengths in the pupil.
 
-An image has pixels of `pixel_scale` radians. Its DFT frequencies nu are in cycles/pixel, and a pupil-plane
-vector x (metres) corresponds to the frequency nu = x * pixel_scale / wavelength. One cycle per pixel is
-therefore `wavelength / pixel_scale` metres in the pupil: the period of the frequency torus.
+An image has pixels of `pixel_scale` radians. Its DFT frequencies nu are in cycles/pixel, and a pupil-plane vector x
+(metres) corresponds to the frequency nu = x * pixel_scale / wavelength. One cycle per pixel is therefore
+`wavelength / pixel_scale` metres in the pupil, which is the period of the frequency torus.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from torch import Tensor
 
 ARCSEC = math.pi / 180 / 3600  # rad
 MAS = ARCSEC / 1000  # rad, a thousandth of an arcsecond
-_ROUNDING = 1e-9  # relative slack, so that a grid made for exactly Nyquist is accepted as such
+_ROUNDING = 1e-9  # relative tolerance, so that a grid made for exactly Nyquist is accepted
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Grid:
     pixel_scale : float
         Angle on the sky of one pixel [rad].
     wavelength : float
-        [m].
+        Wavelength of the light [m].
 
     Raises
     ------
@@ -62,49 +62,49 @@ class Grid:
     def nyquist(
         cls, diameter: float, wavelength: float, n_pixels: int | tuple[int, int], oversampling: float = 1.0
     ) -> Grid:
-        """The grid that samples the diffraction limit of `diameter` [m] at `oversampling` times Nyquist.
+        """Return the grid that samples the image of an aperture of `diameter` [m] at `oversampling` times Nyquist.
 
-        At `oversampling=1` the pixel is wavelength / (2 diameter), the largest without aliasing.
+        At `oversampling=1` a pixel is wavelength / (2 diameter), the largest without aliasing.
         """
         if not (math.isfinite(diameter) and diameter > 0):
             raise ValueError(f"diameter is {diameter}: it must be finite and positive, in m")
         if not (math.isfinite(oversampling) and oversampling >= 1):
-            raise ValueError(f"oversampling is {oversampling}: below 1 the image is aliased")
+            raise ValueError(f"oversampling is {oversampling}: it must be at least 1, or the image is aliased")
         return cls(n_pixels, wavelength / (2 * diameter * oversampling), wavelength)
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(rows, columns)."""
+        """Size of the image, (rows, columns)."""
         rows, columns = (self.n_pixels, self.n_pixels) if isinstance(self.n_pixels, int) else self.n_pixels
         return rows, columns
 
     @property
     def period(self) -> float:
-        """Pupil-plane length of one cycle per pixel [m]."""
+        """Length in the pupil that corresponds to one cycle per pixel [m]."""
         return self.wavelength / self.pixel_scale
 
     def cutoff(self, diameter: float) -> float:
-        """Highest spatial frequency an aperture of `diameter` [m] transmits [cycles/pixel]."""
+        """Return the highest spatial frequency that an aperture of `diameter` [m] transmits [cycles/pixel]."""
         return diameter / self.period
 
     def frequencies(
         self, dtype: torch.dtype | None = None, device: torch.device | str | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Frequencies (nu_y (H, 1), nu_x (1, W)) in FFT order, cycles/pixel, in [-1/2, 1/2)."""
+        """Return the frequencies nu_y (H, 1) and nu_x (1, W) in FFT order, in [-1/2, 1/2) cycles/pixel."""
         height, width = self.shape
         nu_y = torch.fft.fftfreq(height, dtype=dtype, device=device)
         nu_x = torch.fft.fftfreq(width, dtype=dtype, device=device)
         return nu_y[:, None], nu_x[None, :]
 
     def describe(self, diameter: float, subaperture_diameter: float | None = None) -> str:
-        """What an aperture becomes on this grid, as a table (Markdown): angles, pupil samples, Nyquist, what aliases.
+        """Describe how this grid samples an aperture, as a Markdown table of angles, pupil samples and aliasing.
 
         Parameters
         ----------
         diameter : float
-            Of the aperture, outer edge to outer edge (`aperture.extent`) [m].
+            Diameter of the aperture, outer edge to outer edge (`aperture.extent`) [m].
         subaperture_diameter : float, optional
-            Of one hole [m].
+            Diameter of one hole [m].
 
         Raises
         ------
@@ -172,7 +172,7 @@ class Grid:
     def require_sampling(self, diameter: float) -> None:
         """Raise ValueError unless the image of an aperture of `diameter` [m] is sampled without aliasing."""
         if self._aliases(diameter):
-            # rounded down, so that the printed value is accepted
+            # Rounded down, so that the printed value is accepted.
             needed = self.wavelength / (2 * diameter) * (1 - 5e-5)
             raise ValueError(
                 f"pixel_scale {self.pixel_scale:.4g} rad ({self.pixel_scale / ARCSEC:.4g} arcsec) undersamples an "

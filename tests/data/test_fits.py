@@ -59,7 +59,7 @@ def test_damaged_files_are_refused_in_one_line(tmp_path, write_fits, fits_cube):
     }
     for name, content in files.items():
         (tmp_path / name).write_bytes(content)
-        with pytest.raises(ValueError, match=r"is no FITS file, or is damaged") as caught:
+        with pytest.raises(ValueError, match=r"is not a FITS file, or is damaged") as caught:
             read_fits(tmp_path / name)
         assert name in str(caught.value)
         assert "\n" not in str(caught.value)

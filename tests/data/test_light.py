@@ -56,8 +56,8 @@ def test_a_closed_shutter_is_seen_with_or_without_a_bias(sky, bias):
     assert kept == [0, 1, 3, 4, 5, 6, 8, 9, 10, 11]
     if bias:
         assert said == [
-            "frames [2, 7] show nothing of what the others show, as with a closed shutter: they are left out, and what "
-            "follows counts the 10 that are left"
+            "frames [2, 7] show nothing of what the others show, as with a closed shutter: they are left out, and the "
+            "10 that remain are then numbered from 0"
         ]
 
 
@@ -98,7 +98,10 @@ def test_a_cloud_is_told_and_its_frame_stays(share):
     frames[4] = 20 + share * (frames[4] - 20)
     kept, said = usable(frames)
     assert kept == list(range(12))
-    assert said == ["frames [4] have less than half the light of the others, as through a cloud; skip leaves them out"]
+    assert said == [
+        "frames [4] have less than half the light of the others, as through a cloud: name them in skip to leave them "
+        "out"
+    ]
 
 
 def test_light_leaves_out_what_is_constant_and_its_noise_is_that_of_the_border():

@@ -1,6 +1,6 @@
-"""From raw images to frames: dark, flat, bad pixels, the target's place, the best frames, drift.
+"""Steps from raw images to frames: dark and flat correction, bad pixels, finding the target, frame selection, drift.
 
-All functions take and return NumPy arrays, frames (T, H, W) and `valid` (T, H, W), True where a pixel can be trusted.
+All functions take and return NumPy arrays: frames (T, H, W), and `valid` (T, H, W), True where a pixel is trustworthy.
 """
 
 from __future__ import annotations
@@ -23,25 +23,34 @@ def calibrate(
     flat: np.ndarray | None = None,
     bad_pixels: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(values - dark) / flat, the flat divided by its median over good pixels.
+    """Correct raw images: (values - dark) / flat, with the flat divided by its median over good pixels.
 
     Parameters
     ----------
-    values, valid : (T, H, W)
-    dark, flat : (H, W), optional
-        In the units of `values`; any scale.
-    bad_pixels : (H, W), optional
-        Not 0 where a pixel is bad.
+    values : (T, H, W) array
+        Raw images.
+    valid : (T, H, W) array
+        Which pixels are valid.
+    dark : (H, W) array, optional
+        Dark image in the units of `values`.
+    flat : (H, W) array, optional
+        Flat field, of any scale.
+    bad_pixels : (H, W) array, optional
+        Bad-pixel map, not 0 where a pixel is bad.
 
     Returns
     -------
-    values, valid, sensitivity
-        `values` is 0 where it is not finite; `sensitivity` (H, W) is what values were divided by.
+    values : (T, H, W) array
+        Corrected images, with 0 in place of values that are not finite.
+    valid : (T, H, W) array
+        Which pixels are valid in the images, the dark, the flat and the bad-pixel map.
+    sensitivity : (H, W) array
+        Normalised flat, by which the images were divided.
 
     Raises
     ------
     ValueError
-        If a shape differs from that of the frames, or the flat is nowhere positive.
+        If a shape differs from that of the images, or the flat is positive on no good pixel.
     """
     for name, image in (("dark", dark), ("flat", flat), ("bad_pixels", bad_pixels)):
         if image is not None and image.shape != values.shape[1:]:
@@ -55,14 +64,14 @@ def calibrate(
         lit = np.isfinite(flat) & (flat > 0)
         good &= lit
         if not good.any():
-            raise ValueError("flat is positive on no good pixel")
+            raise ValueError("flat is positive on no good pixel: check flat and bad_pixels")
         sensitivity = np.where(lit, flat, 1.0) / np.median(flat[good])
         values = values / sensitivity
     return np.where(np.isfinite(values), values, 0.0), valid & good, sensitivity
 
 
 def find_target(frames: np.ndarray, valid: np.ndarray, blur: float) -> tuple[int, int]:
-    """(row, column) where the mean frame, blurred by a Gaussian of `blur` pixels rms, is brightest."""
+    """Return (row, column) where the mean frame, blurred by a Gaussian of `blur` pixels rms, is brightest."""
     from scipy.ndimage import gaussian_filter
 
     mean = gaussian_filter(_filled(frames, valid).mean(0), blur, mode="nearest")
@@ -71,13 +80,13 @@ def find_target(frames: np.ndarray, valid: np.ndarray, blur: float) -> tuple[int
 
 
 def crop_corner(shape: tuple[int, int], target: tuple[int, int], size: int) -> tuple[int, int]:
-    """First (row, column) of a field of `size` x `size` with `target` on its pixel [size // 2, size // 2].
+    """Return the first (row, column) of a `size` x `size` field with `target` on its pixel [size // 2, size // 2].
 
-    Raises ValueError if the field reaches beyond the image; the message says the largest that does not.
+    Raises ValueError if the field reaches beyond the image; the message gives the largest size that fits.
     """
     corner = (target[0] - size // 2, target[1] - size // 2)
     if min(corner) < 0 or corner[0] + size > shape[0] or corner[1] + size > shape[1]:
-        # `before` pixels lie on one side, `after` on the other, the target's own counted there
+        # Number of pixels before the target, and from the target on, in the tighter direction.
         before = min(target)
         after = min(shape[0] - target[0], shape[1] - target[1])
         largest = min(2 * before + 1, 2 * after)
@@ -89,20 +98,23 @@ def crop_corner(shape: tuple[int, int], target: tuple[int, int], size: int) -> t
 
 
 def frame_flux(frames: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Sum of the valid pixels of each frame, (T,)."""
+    """Return the sum (T,) of the valid pixels of each frame."""
     return np.where(valid, frames, 0.0).sum((1, 2))
 
 
 def frame_sharpness(frames: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Sum of squares over square of sum of the valid pixels of each frame, (T,) (S1 of Muller & Buffington 1974)."""
+    """Return the sharpness (T,) of each frame, S1 of Muller & Buffington (1974).
+
+    It is the sum of the squares of the valid pixels divided by the square of their sum.
+    """
     lit = np.where(valid, frames, 0.0)
     return (lit**2).sum((1, 2)) / lit.sum((1, 2)) ** 2
 
 
 def best_frames(frames: np.ndarray, valid: np.ndarray, keep: float, keep_by: str = "sharpness") -> np.ndarray:
-    """Indices, in their order in time, of the fraction `keep` of frames with the highest flux or sharpness.
+    """Return the indices, in ascending order, of the fraction `keep` of frames with the highest flux or sharpness.
 
-    At least one is kept. Raises ValueError if `keep` is not in (0, 1] or `keep_by` is not known.
+    At least one frame is kept. Raises ValueError if `keep` is not in (0, 1] or `keep_by` is unknown.
     """
     if keep_by not in SELECTIONS:
         raise ValueError(f"keep_by is {keep_by!r}: it must be {' or '.join(SELECTIONS)}")
@@ -114,24 +126,27 @@ def best_frames(frames: np.ndarray, valid: np.ndarray, keep: float, keep_by: str
 
 
 def frame_drift(frames: np.ndarray, valid: np.ndarray | None = None, upsampling: int = 100) -> np.ndarray:
-    """How far each frame has moved from the first, (T, 2) in pixels, (x, y), by cross-correlation.
+    """Return the shift (x, y) of each frame from the first, (T, 2) [pixels], by cross-correlation.
 
     Parameters
     ----------
-    frames, valid : (T, H, W)
+    frames : (T, H, W) array
+        Images.
+    valid : (T, H, W) array, optional
+        Which pixels are valid.
     upsampling : int
-        The answer is a multiple of 1 / upsampling pixels (Guizar-Sicairos et al. 2008, as in scikit-image).
+        Resolution: shifts are multiples of 1 / upsampling pixels (Guizar-Sicairos et al. 2008, by scikit-image).
 
     Notes
     -----
-    The correlation is periodic: what enters and leaves the field biases it, so the target should lie within.
+    The correlation is periodic, so light that enters or leaves the field biases it: keep the target inside.
     """
     with extra("data"):
         from skimage.registration import phase_cross_correlation
 
     frames = np.asarray(frames, dtype=float)
     filled = frames if valid is None else _filled(frames, valid)
-    # Whitening, the default, would raise the noise beyond the mask's cut-off.
+    # scikit-image's default, whitening, would amplify the noise beyond the mask's cut-off.
     plain: dict[str, Any] = {"normalization": None, "upsample_factor": upsampling}
     shifts = [phase_cross_correlation(filled[0], frame, **plain)[0] for frame in filled]
     return -np.array(shifts)[:, ::-1] + 0.0  # no negative zeros

@@ -1,4 +1,4 @@
-"""FITS files: one file in, as arrays and a header; one restored image out."""
+"""Reading of a FITS file as arrays and a header."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ from torchmask.io import extra
 class FITSImages:
     """The images of one file, in its own units.
 
-    path : where they come from
+    path : path of the file
     values : (T, H, W) float64
-    errors : (T, H, W) or None, from an ERR extension
-    valid : (T, H, W) bool: finite, not marked as bad in an extension, and below what the file's integers can hold
-    header : the cards that hold a value: the image's, and where it has none, those of the primary header
+    errors : (T, H, W) standard deviations from an ERR extension, or None
+    valid : (T, H, W) bool, True for values that are finite, not marked as bad in an extension, and below the largest
+        value of the file's integers
+    header : cards that hold a value, those of the image before those of the primary header
     is_cube : whether the file itself has a time axis
     """
 
@@ -36,15 +37,15 @@ class FITSImages:
 def read_fits(path: str | Path) -> FITSImages:
     """Read an image (H, W) or a cube (T, H, W): the SCI extension, or else the first image in the file.
 
-    A pixel is not valid where a value or error is not finite, or where an extension BADPIX, BPM or DQ is not 0: of DQ
-    for JWST the lowest bit, DO_NOT_USE (the others tell what was done to a pixel that is good), for others any bit.
-    Nor is it where integers of 8 or 16 bits are at their largest value, at which a converter stops.
+    A pixel is not valid if its value or error is not finite, or if it is not 0 in an extension BADPIX, BPM or DQ. In DQ
+    of JWST only the lowest bit, DO_NOT_USE, counts, because the others describe corrections of good pixels. In images
+    of 8- or 16-bit integers, pixels at the largest value are saturated and not valid.
 
     Raises
     ------
     ValueError
-        If the file is missing, is no FITS, is truncated or fails its checksum, holds no image of 2 or 3 axes or
-        several that could be meant, or its extensions disagree in shape.
+        If the file is missing, not FITS, truncated or fails its checksum, has no image of 2 or 3 axes or several SCI
+        extensions, or if the shapes of its extensions disagree.
     """
     with extra("data"):
         from astropy.io import fits
@@ -63,18 +64,18 @@ def read_fits(path: str | Path) -> FITSImages:
         raise ValueError(f"{path} {error}") from None
     except (OSError, TypeError, ValueError, LookupError, EOFError, MemoryError, zlib.error, VerifyError) as error:
         raise _damaged(path, error) from error
-    for warning in caught:  # all that astropy says of a truncated file or a wrong checksum
+    for warning in caught:  # for a truncated file or a wrong checksum astropy only warns
         if issubclass(warning.category, AstropyUserWarning) and not issubclass(warning.category, VerifyWarning):
             raise _damaged(path, warning.message)
     return images
 
 
 def _damaged(path: Path, why: Any) -> ValueError:
-    return ValueError(f"{path} is no FITS file, or is damaged: {' '.join(str(why).split())}")
+    return ValueError(f"{path} is not a FITS file, or is damaged: {' '.join(str(why).split())}")
 
 
 class _Refused(Exception):
-    """A sound FITS file that does not hold what is needed."""
+    """The FITS file is intact but does not contain what is needed."""
 
 
 def _images(path: Path, hdus: Any) -> FITSImages:
@@ -113,7 +114,7 @@ def _images(path: Path, hdus: Any) -> FITSImages:
 
 
 def _cards(header: Any) -> dict[str, bool | int | float | str]:
-    """The cards with a value; those that cannot be read are passed over, they may not be needed."""
+    """Return the cards with a value; unreadable ones are skipped, as they may not be needed."""
     with extra("data"):
         from astropy.io.fits.verify import VerifyError
 
@@ -129,12 +130,12 @@ def _cards(header: Any) -> dict[str, bool | int | float | str]:
 
 
 def _extension(hdus: Any, name: str, shape: tuple[int, ...]) -> np.ndarray | None:
-    """The data of a companion extension, one image for all frames if it is flat; None if there is none."""
+    """Return the data of a companion extension, repeated for all frames if it is one image; None if it is missing."""
     if name not in hdus:
         return None
     data = hdus[name].data if hdus[name].is_image else None
     if data is None:
-        raise _Refused(f"has {name} that is no image")
+        raise _Refused(f"has an extension {name} that is not an image")
     if data.shape not in (shape, shape[-2:]):
-        raise _Refused(f"has {name} of shape {data.shape}, and images of shape {shape}: they must agree")
+        raise _Refused(f"has an extension {name} of shape {data.shape} and images of shape {shape}: they must agree")
     return np.broadcast_to(data, shape)

@@ -1,6 +1,6 @@
-"""What the cards of a FITS header mean: pixel scale, wavelength, time, gain, read-out noise and units.
+"""Interpretation of FITS headers: pixel scale, wavelength, exposure time, gain, read-out noise and units.
 
-An option that the caller gives always wins over the header; where both are missing, the error names both.
+An option given by the caller takes precedence over the header; if both are missing, the error names both.
 """
 
 from __future__ import annotations
@@ -21,29 +21,29 @@ _ABOUT += ("TIME-OBS", "MJD-OBS", "MJD-AVG", "OBSERVER")
 
 
 def missing(path: Any, keywords: str, option: str) -> ValueError:
-    """The error for a number that neither the header nor the caller supplies."""
+    """Return the error for a number that neither the header nor the caller supplies."""
     return ValueError(f"{path} has no {keywords}: give {option}")
 
 
 def number(header: Any, names: tuple[str, ...], path: Any) -> float | None:
-    """The first of these cards that is there, as a positive number.
+    """Return the first of these cards that is present, as a number of at least 0; None if there is none.
 
-    Raises ValueError if it is there and is none.
+    Raises ValueError if the card is not such a number.
     """
     for name in names:
         value = header.get(name)
         if value is None:
             continue
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value < 0:
-            raise ValueError(f"{path}: {name} is {value!r}, which is no positive number")
+            raise ValueError(f"{path}: {name} is {value!r}, which is not a positive number")
         return float(value)
     return None
 
 
 def pixel_scale(header: Any, path: Any, given: float | None) -> float:
-    """Angle of a pixel [rad]: PIXELSCL or PIXSCALE [arcsec], else the root of the area of a pixel by the WCS.
+    """Return the pixel scale [rad]: PIXELSCL or PIXSCALE [arcsec], else the square root of a pixel's area by the WCS.
 
-    Raises ValueError if nothing tells it, or if pixels are oblong by more than 2 %.
+    Raises ValueError if the header gives none, or if pixels differ from squares by more than 2 %.
     """
     if given is not None:
         return given
@@ -60,16 +60,16 @@ def pixel_scale(header: Any, path: Any, given: float | None) -> float:
 
 
 def wavelength(header: Any, path: Any, given: float | None, fallback: float | None = None) -> float:
-    """Wavelength [m]: WAVELEN or WAVELNTH, else the FILTER of a known INSTRUME (`FILTERS`), else `fallback`.
+    """Return the wavelength [m]: WAVELEN or WAVELNTH, else that of a known INSTRUME and FILTER, else `fallback`.
 
-    Raises ValueError if nothing tells it, or the card can not be in metres.
+    Raises ValueError if there is none of these, or the card cannot be in metres. See `FILTERS` for the known filters.
     """
     if given is not None:
         return given
     value = number(header, ("WAVELEN", "WAVELNTH"), path)
     if value is not None:
         if not 1e-8 < value < 1e-2:
-            raise ValueError(f"{path}: WAVELEN is {value:g}, which is no wavelength in metres: give wavelength [m]")
+            raise ValueError(f"{path}: WAVELEN is {value:g}, which is not a wavelength in metres: give wavelength [m]")
         return value
     band = filter_of_header(header)
     if band is not None:
@@ -83,14 +83,17 @@ def wavelength(header: Any, path: Any, given: float | None, fallback: float | No
 
 
 def exposure_seconds(header: Any, path: Any, is_cube: bool, given: float | None) -> float | None:
-    """Exposure time of a frame [s]: XPOSURE, EXPTIME or EFFEXPTM; EFFINTTM, of one integration, for a cube."""
+    """Return the exposure time of a frame [s]: EFFINTTM (of one integration) for a cube, XPOSURE, EXPTIME, EFFEXPTM."""
     if given is not None:
         return given
     return number(header, ("EFFINTTM",) * is_cube + ("XPOSURE", "EXPTIME", "EFFEXPTM"), path)
 
 
 def saturation(header: Any, path: Any, electrons_per_unit: float, given: float | None) -> float | None:
-    """From which value in the file on a pixel is full: SATURATE or FULLWELL [electrons], the lower; None if unknown."""
+    """Return the value in the file at which a pixel saturates: the lower of SATURATE and FULLWELL [electrons].
+
+    None if the header has neither.
+    """
     if given is not None:
         return given
     level, well = number(header, ("SATURATE",), path), number(header, ("FULLWELL",), path)
@@ -99,7 +102,7 @@ def saturation(header: Any, path: Any, electrons_per_unit: float, given: float |
 
 
 def closed_shutter(header: Any) -> str | None:
-    """What the header says if no light fell on the detector: a dark, a bias, a shutter that is closed; else None."""
+    """Return the header's statement that no light fell on the detector (dark, bias, closed shutter), or None."""
     for name in ("IMAGETYP", "OBSTYPE", "IMAGE_TYPE", "EXP_TYPE", "ESO DPR TYPE"):
         words = re.split(r"[^a-z]+", str(header.get(name, "")).lower())
         if {"dark", "bias", "zero"} & set(words):
@@ -112,12 +115,12 @@ def closed_shutter(header: Any) -> str | None:
 def electrons_per_unit(
     header: Any, path: Any, is_cube: bool, unit: str | None, gain: float | None, exposure_time: float | None
 ) -> float:
-    """Electrons in a frame for one unit of the file.
+    """Return the number of electrons in a frame for one unit of the file.
 
-    `unit` or BUNIT: electrons or photons; adu, DN or counts (times GAIN [electrons]); any of them per second (times
-    the exposure time of a frame [s]); MJy/sr (through JWST's PHOTMJSR). Without either: adu if a gain is known.
+    `unit`, or else BUNIT, may be electrons or photons; adu, DN or counts (times the gain); any of these per second
+    (times the exposure time of a frame); or MJy/sr (by JWST's PHOTMJSR). Without either it is adu if a gain is known.
 
-    Raises ValueError if the unit is not known, nothing tells it, or what its conversion needs is missing.
+    Raises ValueError if the unit is missing or unknown, or a number for its conversion is missing.
     """
     with extra("data"):
         from astropy import units
@@ -174,17 +177,18 @@ def _parse_unit(text: str, path: Any) -> Any:
 
 def _unknown_unit(text: str, path: Any) -> ValueError:
     return ValueError(
-        f"{path}: BUNIT is {text!r}; known are electron, photon, adu, DN, count, each also per s, and MJy/sr: give unit"
+        f"{path}: unit {text!r} is unknown: give unit as electron, photon, adu, DN or count, any of them per s, or "
+        "MJy/sr"
     )
 
 
 def kept_cards(header: Any) -> dict[str, Any]:
-    """The cards that go with an observation: sky coordinates, target, telescope, filter and date."""
+    """Return the cards to keep with an observation: sky coordinates, target, telescope, filter and date."""
     return celestial_cards(header) | {name: header[name] for name in _ABOUT if name in header}
 
 
 def shift_cards(cards: dict[str, Any], x: int, y: int) -> dict[str, Any]:
-    """The cards of an image that begins at pixel (x, y), counted from 0, of the old one."""
+    """Return the cards for an image that begins at pixel (x, y), counted from 0, of the original one."""
     moved = dict(cards)
     for name, offset in (("CRPIX1", x), ("CRPIX2", y)):
         if name in cards:

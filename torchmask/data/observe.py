@@ -1,4 +1,4 @@
-"""An observation from FITS files: read, checked, calibrated, cropped, selected and put into electrons."""
+"""Reading an observation from FITS files: checks, calibration, cropping, selection and conversion to electrons."""
 
 from __future__ import annotations
 
@@ -44,53 +44,61 @@ def read_observation(
     keep: float | None = None,
     keep_by: str = "sharpness",
 ) -> Observation:
-    """Read a telescope's exposures: a cube (T, H, W), an image, or a list of such files, in that order.
+    """Read a telescope's exposures from FITS files: cubes (T, H, W) or images, in the order given.
 
-    An option left at None is taken from the header; what is given wins over it. Needs astropy (extra `data`).
+    Options that are not given are read from the header; those that are take precedence. Needs astropy (extra `data`).
 
     Parameters
     ----------
     paths : path or sequence of paths
         FITS files of one filter, pixel scale and orientation. The SCI extension is read, or else the first image;
         ERR becomes `errors`; DQ, BADPIX or BPM mark pixels that are not valid. Files whose header says dark, bias or
-        closed shutter are left out, with a warning, and so are frames that hold no light.
+        closed shutter are left out with a warning, and so are frames that hold no light.
     aperture : Aperture
-        That they were taken through, in metres on the pupil, x and y along the image's columns and rows.
+        Aperture through which the exposures were taken, in metres on the pupil, with x and y along the columns and
+        rows of the image.
     wavelength : float, optional
-        [m]. Header: WAVELEN, or the FILTER of a known instrument.
+        Wavelength [m]. Header: WAVELEN, or the FILTER of a known instrument.
     design_wavelength : float, optional
-        That the mask was made for [m]: it counts where the header tells none.
+        Wavelength for which the mask was designed [m], used if there is no other.
     pixel_scale : float, optional
-        [rad]. Header: PIXELSCL [arcsec], or CD, PC or CDELT.
+        Angle of a pixel [rad]. Header: PIXELSCL [arcsec], or CD, PC or CDELT.
     unit : str, optional
         Unit of the pixels, such as "adu", "electron / s" or "250 electron". Header: BUNIT; without it the pixels
         are in adu, and a gain is needed.
     gain : float, optional
-        Electrons per adu (DN, count). Header: EGAIN, GAIN.
+        Gain [electrons per adu, DN or count]. Header: EGAIN, GAIN.
     exposure_time : float, optional
-        Of one frame [s], for units per second. Header: XPOSURE, EXPTIME; EFFINTTM for cubes of JWST.
+        Exposure time of one frame [s], for units per second. Header: XPOSURE, EXPTIME; EFFINTTM for cubes of JWST.
     readout_noise : float, optional
-        [electrons rms]. Header: RDNOISE, READNOIS. It may remain unknown.
+        Read-out noise [electrons rms]. Header: RDNOISE, READNOIS. It may remain unknown.
     saturation : float, optional
-        Value of a pixel in the file, in its unit, from which on the pixel is full and not valid. Header: SATURATE, or
+        Value in the file, in its unit, at and above which a pixel is saturated and not valid. Header: SATURATE, or
         FULLWELL [electrons].
-    dark, flat, bad_pixels : path or (H, W) array, optional
-        In the units of the file; of any scale; not 0 where bad. Of a cube the median is used.
+    dark : path or (H, W) array, optional
+        Dark image in the units of the file. Of a cube the median is used, as for `flat` and `bad_pixels`.
+    flat : path or (H, W) array, optional
+        Flat field, of any scale.
+    bad_pixels : path or (H, W) array, optional
+        Bad-pixel map, not 0 where a pixel is bad.
     crop : int, optional
-        Side of the field that is cut out around the target, which comes to pixel [crop // 2, crop // 2]: the same
-        in all frames of a file, found afresh in every file. The sky coordinates move with it.
+        Side [pixels] of the field to cut out with the target on its pixel [crop // 2, crop // 2]. It is the same for
+        all frames of a file but may differ between files. The sky coordinates are adjusted.
     target : (row, column), optional
-        Pixel of the target in every file, counted from 0. None: where the mean frame is brightest.
+        Pixel of the target in every file, counted from 0; by default, where the mean frame is brightest.
     skip : sequence of int
         Frames to leave out, counted from 0 through all files.
     keep : float, optional
-        Fraction of the frames to keep: those of highest `keep_by`, "sharpness" or "flux".
+        Fraction of the frames to keep, those with the highest `keep_by`.
+    keep_by : {"sharpness", "flux"}
+        Quantity by which `keep` selects frames.
 
     Raises
     ------
     ValueError
-        If a file is missing or damaged, a keyword that is needed is missing (the message names it and the option
-        that stands for it), the files mix filters, pixel scales, shapes or orientations, or an option is wrong.
+        If a file is missing or damaged; a keyword that is needed is missing (the message names it and the option to
+        give instead); the files mix filters, wavelengths, pixel scales, shapes or orientations; or an option is out of
+        range.
 
     Examples
     --------
@@ -107,7 +115,7 @@ def read_observation(
     positive = (wavelength, design_wavelength, pixel_scale, gain, exposure_time, saturation)
     _check_options(positive, readout_noise, crop, keep, keep_by)
     if target is not None and crop is None:
-        raise ValueError(f"target is {target}, the middle of the field to cut out: give crop [pixels] too")
+        raise ValueError(f"target is {target}, but there is no field to cut out around it: give crop [pixels] too")
     files = [read_fits(path) for path in ([paths] if isinstance(paths, str | Path) else list(paths))]
     if not files:
         raise ValueError("paths is empty: give at least one FITS file")
@@ -151,32 +159,32 @@ def read_observation(
 
 
 def _without_darks(files: Sequence[FITSImages]) -> list[FITSImages]:
-    """The files that were taken with an open shutter. Warns of others; raises ValueError if there are only those."""
+    """Return the files taken with an open shutter. Warns about others; raises ValueError if there are only those."""
     closed = {file.path: keywords.closed_shutter(file.header) for file in files}
     told = "; ".join(f"{path}: {why}" for path, why in closed.items() if why)
     opened = [file for file in files if not closed[file.path]]
     if not opened:
         raise ValueError(f"no file holds light ({told}): give exposures of the target")
     if told:
-        warnings.warn(f"files without light are left out ({told}); dark subtracts one", stacklevel=3)
+        warnings.warn(f"files without light are left out ({told}); to subtract a dark, give dark", stacklevel=3)
     return opened
 
 
 def _below(file: FITSImages, full: float | None) -> FITSImages:
-    """The same with pixels of the value `full` or more, in the unit of the file, marked as not valid."""
+    """Mark pixels of the value `full` or more, in the unit of the file, as not valid, with a warning."""
     spoilt = np.zeros_like(file.valid) if full is None else file.valid & (file.values >= full)
     if not spoilt.any():
         return file
     warnings.warn(
         f"{file.path}: {spoilt.sum()} pixels in {spoilt.any((1, 2)).sum()} frames are saturated ({full:.5g} or more) "
-        "and carry no weight",
+        "and ignored",
         stacklevel=3,
     )
     return replace(file, valid=file.valid & ~spoilt)
 
 
 def _mean_exposure(files: Sequence[FITSImages], times: Sequence[float | None]) -> dict[str, float]:
-    """XPOSURE, the mean exposure time of a frame [s], if all files tell theirs."""
+    """Return XPOSURE, the mean exposure time of a frame [s], if that of every file is known."""
     known = [(time, len(file.values)) for time, file in zip(times, files, strict=True) if time is not None]
     if len(known) < len(files):
         return {}
@@ -223,12 +231,12 @@ def _check_alike(files: Sequence[FITSImages], wavelengths: Sequence[float], scal
             if not alike:
                 raise ValueError(
                     f"the files mix {what}: {files[0].path} has {format_value(values[0])} and {file.path} "
-                    f"{format_value(value)}; give those of one kind"
+                    f"{format_value(value)}; read them separately"
                 )
 
 
 def _check_rotation(files: Sequence[FITSImages], size: int) -> None:
-    """Raise ValueError if files are turned or mirrored against the first by more than half a pixel at a corner."""
+    """Raise ValueError if a file is rotated or mirrored relative to the first by more than half a pixel at a corner."""
     matrices = [pixel_matrix(file.header) for file in files]
     first = matrices[0]
     for file, matrix in zip(files, matrices, strict=True):
@@ -238,12 +246,12 @@ def _check_rotation(files: Sequence[FITSImages], size: int) -> None:
         if moved > 0.5:
             raise ValueError(
                 f"the files mix orientations: the corner of {file.path} lies {moved:.1f} pixels from that of "
-                f"{files[0].path} on the sky; restore those of one orientation together"
+                f"{files[0].path} on the sky; read files of different orientations separately"
             )
 
 
 def _image(source: Any, name: str) -> np.ndarray | None:
-    """A calibration image (H, W) from an array, a tensor or a FITS file; the median of a cube."""
+    """Return a calibration image (H, W) from an array, a tensor or a FITS file; the median of a cube."""
     if source is None:
         return None
     if isinstance(source, str | Path):
@@ -260,7 +268,7 @@ def _image(source: Any, name: str) -> np.ndarray | None:
 def _stack(
     file: FITSImages, factor: float, images: Sequence[np.ndarray | None], crop: int | None, target: Any, blur: float
 ) -> tuple[tuple[np.ndarray, np.ndarray | None, np.ndarray], dict[str, Any]]:
-    """The frames [electrons], errors and valid pixels of one file, and the cards that go with them."""
+    """Return the frames [electrons], errors and valid pixels of one file, and the cards to keep with them."""
     try:
         values, valid, sensitivity = calibrate(file.values, file.valid, *images)
         errors = None if file.errors is None else np.nan_to_num(file.errors / sensitivity) * factor
@@ -278,6 +286,6 @@ def _stack(
 
 
 def _joined(parts: Sequence[np.ndarray | None]) -> np.ndarray | None:
-    """All frames one after another; None if a file lacks them."""
+    """Return the arrays of all files concatenated; None if one file lacks them."""
     there = [part for part in parts if part is not None]
     return np.concatenate(there) if len(there) == len(parts) else None

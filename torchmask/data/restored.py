@@ -1,4 +1,4 @@
-"""A restored image as a FITS file."""
+"""Writing a restored image to a FITS file."""
 
 from __future__ import annotations
 
@@ -21,26 +21,29 @@ def save_restored(
     Parameters
     ----------
     path : str or Path
-        Ends in .fits. The file appears whole or not at all, and never replaces another.
+        Name of the file, which must end in .fits. The file is written completely or not at all, and never replaces
+        another.
     result : RestorationResult
+        Restored object with its statistics.
     observation : Observation
-        Its header's cards (sky coordinates, target, telescope, filter) go with the image, which lies on the frames'
-        pixels. A shift that is common to all frames cannot be told from one of the object, so the coordinates are as
-        good as the frames' mean tilt.
+        Observation from which the object was restored. The cards of its header (sky coordinates, target, telescope,
+        filter) are copied. A shift common to all frames cannot be distinguished from one of the object, so the
+        coordinates are only as accurate as the mean tilt of the frames.
     history : str or sequence of str
-        What was done, one HISTORY card (or several, if it is long) each.
+        What was done, as HISTORY cards.
 
     Raises
     ------
     ValueError
-        If the object does not lie on the frames' pixels, the file exists, its folder does not, or its name is wrong.
+        If the object and the frames differ in shape, the file exists, its folder does not exist, or its name does not
+        end in .fits.
 
     Notes
     -----
-    The image is in electrons per pixel and frame (BUNIT). CHISQ is the mean over the frames of the mean square residual
-    in units of the noise, CHISQMAX that of the worst frame; CONVERGD says whether the restoration came to rest,
-    EXPLAIND whether object and aberrations explain the frames: CHISQRED is at most CHISQLIM then.
-    Standard deviations, if the restoration was asked for them, are an extension ERR.
+    The image is in electrons per pixel and frame (BUNIT). CHISQ is the mean square residual in units of the noise,
+    averaged over frames, and CHISQMAX that of the worst frame. CONVERGD says whether the restoration converged, and
+    EXPLAIND whether object and aberrations explain the frames, that is whether CHISQRED is at most CHISQLIM. If the
+    restoration computed standard deviations, they are in an extension ERR.
 
     Examples
     --------
@@ -59,11 +62,11 @@ def save_restored(
         from astropy.io import fits
 
     if Path(path).suffix != ".fits":
-        raise ValueError(f"{path} does not end in .fits")
+        raise ValueError(f"{path} does not end in .fits: give a name that does")
     if tuple(result.object.shape) != observation.grid.shape:
         raise ValueError(
             f"the object has shape {tuple(result.object.shape)} and the frames {observation.grid.shape}: give the "
-            "observation that it was restored from"
+            "observation from which it was restored"
         )
     hdu = fits.PrimaryHDU(as_array(result.object).astype("float64"))
     hdus = fits.HDUList([hdu])
@@ -96,7 +99,7 @@ def save_restored(
             "NLOST": (len(verdict.frames), "frames that are not explained"),
         }
     for name, (value, comment) in cards.items():
-        if not isinstance(value, float) or math.isfinite(value):  # FITS knows no NaN in a card
+        if not isinstance(value, float) or math.isfinite(value):  # FITS cards cannot hold NaN
             hdu.header[name] = (value, comment)
     lines = [history] if isinstance(history, str) else list(history)
     for line in ["restored by torchmask.MyopicDeconvolution", *lines]:
@@ -107,7 +110,7 @@ def save_restored(
             if name in hdu.header and name not in errors.header:
                 errors.header[name] = (hdu.header[name], hdu.header.comments[name])
         hdus.append(errors)
-    content = BytesIO()  # astropy does not know the mode that atomic_write opens files in
+    content = BytesIO()  # astropy rejects the mode in which atomic_write opens files
     hdus.writeto(content, checksum=True)
     with atomic_write(path) as file:
         file.write(content.getvalue())

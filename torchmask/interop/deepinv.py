@@ -1,6 +1,6 @@
-"""torchmask's exposures as a physics of deepinv, and deepinv's priors in a restoration of torchmask.
+"""torchmask's exposures as deepinv physics, and deepinv's priors in torchmask's restoration.
 
-Needs the extra `deepinv`; nothing else in torchmask imports this module.
+Needs the extra `deepinv`. Nothing else in torchmask imports this module.
 """
 
 from __future__ import annotations
@@ -18,19 +18,20 @@ from torchmask.restoration.priors import ObjectPrior
 
 
 class StackPhysics(LinearPhysics):
-    """A stack of short exposures with known point-spread functions: y = noise(A x), A x = the T blurred images.
+    """A stack of short exposures with known point-spread functions: y = noise(A x), with A x the T blurred images.
 
     Parameters
     ----------
     psfs : (T, rows, columns) or (B, T, rows, columns) tensor
-        Unfolded, with their origin at [0, 0] (FFT order), at least 2 H - 1 by 2 W - 1 for images of H x W: what
-        `psf_from_samples` gives for a field twice as wide. A buffer; its dtype and device are those of the images.
+        Unfolded PSFs with their origin at [0, 0] (FFT order), at least 2 H - 1 by 2 W - 1 for images of H x W, as
+        `psf_from_samples` returns them for a field twice as wide. They become a buffer; images must have the same dtype
+        and device.
     unit : float
-        Electrons per pixel that count as 1, in images and frames: deepinv's denoisers expect images up to about 1.
+        Electrons per pixel that correspond to 1 in images and frames. deepinv's denoisers expect images up to about 1.
     readout_noise : float
-        Electrons rms per pixel and frame.
+        Read-out noise [electrons rms per pixel and frame].
     generator : torch.Generator, optional
-        Of the noise.
+        Source of the random noise.
 
     Raises
     ------
@@ -40,7 +41,7 @@ class StackPhysics(LinearPhysics):
 
     Notes
     -----
-    Images are (B, 1, H, W), frames (B, T, H, W): the exposures stand where deepinv has channels. The convolution is
+    Images are (B, 1, H, W) and frames (B, T, H, W), with the exposures in deepinv's channel axis. The convolution is
     linear, as in `image_formation`: light that leaves the field is lost. For non-negative PSFs of unit sum the norm of
     A is at most sqrt(T). The noise is `PoissonGaussianNoise(gain=1 / unit, sigma=readout_noise / unit)`; negative
     rounding errors of the FFTs are clipped.
@@ -78,14 +79,14 @@ class StackPhysics(LinearPhysics):
     def from_observation(
         cls, observation: Observation, unit: float | None = None, generator: torch.Generator | None = None
     ) -> tuple[StackPhysics, Tensor]:
-        """The physics of a simulated observation with its true PSFs, and its frames (1, T, H, W) in `unit`.
+        """Return the physics of a simulated observation with its true PSFs, and its frames (1, T, H, W) in `unit`.
 
-        Light beyond the stored PSFs is taken for lost, and read-out noise that nobody knows for none. `unit` is by
-        default the 99.9th percentile of the mean frame, which a restored object exceeds a few times over. Raises
-        ValueError if the observation knows no PSFs.
+        Light beyond the stored PSFs is treated as lost, and unknown read-out noise as zero. By default `unit` is the
+        99.9th percentile of the mean frame, which the peak of a restored object exceeds a few times. Raises ValueError
+        if the observation has no PSFs.
         """
         if observation.psfs is None:
-            raise ValueError("the observation holds no psfs: make a StackPhysics of restored or calibrated ones")
+            raise ValueError("the observation has no psfs: create a StackPhysics from restored or calibrated ones")
         height, width = observation.grid.shape
         psfs = observation.frames.new_zeros(len(observation.frames), 2 * height, 2 * width)
         psfs[..., :height, :width] = observation.psfs
@@ -96,17 +97,17 @@ class StackPhysics(LinearPhysics):
         return physics, physics.measured(observation.frames)
 
     def measured(self, frames: Tensor) -> Tensor:
-        """Frames (T, H, W) or (B, T, H, W) [electrons] as this physics measures them, (B, T, H, W)."""
+        """Convert frames (T, H, W) or (B, T, H, W) [electrons] to measurements (B, T, H, W) of this physics."""
         return (frames if frames.ndim == 4 else frames[None]).to(self.psfs) / self.unit
 
     def A(self, x: Tensor, **kwargs: object) -> Tensor:
-        """The expected frames (B, T, H, W) of images (B, 1, H, W)."""
+        """Return the expected frames (B, T, H, W) of images (B, 1, H, W)."""
         if x.ndim != 4 or x.shape[1] != 1:
             raise ValueError(f"the image has shape {tuple(x.shape)}: it must be (batch, 1, rows, columns)")
         return image_formation(x, self.psfs)
 
     def A_adjoint(self, y: Tensor, **kwargs: object) -> Tensor:
-        """The adjoint of `A`: images (B, 1, H, W) of frames (B, T, H, W)."""
+        """Apply the adjoint of `A` to frames (B, T, H, W); returns images (B, 1, H, W)."""
         n_frames = self.psfs.shape[-3]
         if y.ndim != 4 or y.shape[1] != n_frames:
             raise ValueError(f"the stack has shape {tuple(y.shape)}: it must be (batch, {n_frames}, rows, columns)")
@@ -114,15 +115,16 @@ class StackPhysics(LinearPhysics):
 
 
 class DeepinvPrior(ObjectPrior):
-    """A prior of deepinv as that on the object of a `MyopicDeconvolution`: weight * prior(image / unit).
+    """A deepinv prior on the object of a `MyopicDeconvolution`: weight * prior(image / unit).
 
     Parameters
     ----------
     prior : deepinv.optim.Prior
-        An explicit one, which has a value: of `TVPrior` and the like, not of plug-and-play denoisers.
+        An explicit prior, which has a value, such as `TVPrior`; plug-and-play denoisers have none.
     weight : float
+        Weight of the prior.
     unit : float
-        What counts as 1 for the prior, in mean pixels of the stack.
+        Pixel value that corresponds to 1 in the prior, in units of the mean pixel of the stack.
 
     Raises
     ------
@@ -138,7 +140,7 @@ class DeepinvPrior(ObjectPrior):
     def __init__(self, prior: Prior, weight: float = 1.0, unit: float = 1.0) -> None:
         super().__init__()
         if not prior.explicit_prior:
-            raise ValueError(f"{type(prior).__name__} has no value to minimise: give an explicit prior, as TVPrior is")
+            raise ValueError(f"{type(prior).__name__} has no value to minimise: give an explicit prior such as TVPrior")
         for name, value in (("weight", weight), ("unit", unit)):
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{name} is {value}: it must be finite and positive")
@@ -150,7 +152,7 @@ class DeepinvPrior(ObjectPrior):
         return self.weight * self.prior(image[None, None] / self.unit).sum()
 
     def value_and_gradient(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """By deepinv's own gradient, which knows what to do where the penalty has a kink."""
+        """Return value and gradient, by deepinv's own gradient, which handles kinks of the penalty."""
         with torch.no_grad():
             value = self(image)
         slope = self.prior.grad(image.detach()[None, None] / self.unit)[0, 0]

@@ -1,8 +1,8 @@
 """Figures: masks, frequency coverage, transfer functions, images and curves.
 
-Every function returns a matplotlib Figure that belongs to no pyplot state, so it works without a display and leaves
-nothing open. Images keep the order of their array, row 0 at the top; planes of the pupil and of frequencies have y
-upwards, as drawings of masks do. PSFs and OTFs come in FFT order: only this module moves their origin to the middle.
+Every function returns a matplotlib Figure that is independent of pyplot, so it works without a display and leaves
+nothing open. Images have row 0 at the top; pupil and frequency planes have y upwards, as drawings of masks do. PSFs and
+OTFs are given in FFT order; this module moves their origin to the middle.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
 
 def stretch(image: Any, percentile: float = 99.5, gamma: float = 0.5) -> np.ndarray:
-    """Map an image to [0, 1] for display: 0 stays 0, `percentile` becomes 1, the power `gamma` lifts the faint parts.
+    """Map an image to [0, 1] for display: 0 stays 0, `percentile` becomes 1, and the power `gamma` lifts faint parts.
 
-    Values below 0 and NaN are shown as 0, infinite ones as 1. An image that is nowhere positive becomes 0 everywhere.
+    Negative values and NaN become 0, infinite ones 1. An image that is nowhere positive becomes 0 everywhere.
 
     Examples
     --------
@@ -39,7 +39,7 @@ def stretch(image: Any, percentile: float = 99.5, gamma: float = 0.5) -> np.ndar
 
 
 def peak(values: np.ndarray, percentile: float = 99.5) -> float:
-    """The value shown as white: `percentile`, or the largest where fewer pixels than that shine."""
+    """Return the value to show as white: `percentile`, or the largest value if that is not positive."""
     finite = values[np.isfinite(values)]
     if not finite.size:
         return 0.0
@@ -48,7 +48,7 @@ def peak(values: np.ndarray, percentile: float = 99.5) -> float:
 
 
 def _on_grid(name: str, values: Any, grid: Grid) -> np.ndarray:
-    """Arrays (..., H, W) of a grid, with leading axes flattened to one."""
+    """Return `values` (..., H, W) as an array with its leading axes flattened to one, after checking its shape."""
     array = as_array(values)
     if array.shape[-2:] != grid.shape or 0 in array.shape:
         raise ValueError(f"{name} has shape {array.shape}: it must end in that of the grid, {grid.shape}")
@@ -57,7 +57,7 @@ def _on_grid(name: str, values: Any, grid: Grid) -> np.ndarray:
 
 @drawing.styled
 def mask_figure(aperture: Aperture, title: str | None = None) -> Figure:
-    """The holes of one aperture, to scale, inside the disc they are cut from. Axes in metres (or mm).
+    """Draw the holes of one aperture to scale inside the disc of the mask. Axes are in metres or millimetres.
 
     Raises ValueError for a population of masks.
     """
@@ -81,11 +81,11 @@ def mask_figure(aperture: Aperture, title: str | None = None) -> Figure:
 
 @drawing.styled
 def uv_coverage_figure(aperture: Aperture, grid: Grid | None = None, title: str | None = None) -> Figure:
-    """The spatial frequencies an aperture transmits: the form of a hole, twice as large, around the baseline of each
-    pair of holes.
+    """Draw the spatial frequencies that an aperture transmits.
 
-    Darker where pairs overlap. Axes are baselines in metres; with a `grid` also frequencies in cycles/pixel, and the
-    square that the grid samples, beyond which frequencies wrap around. Raises ValueError for a population of masks.
+    Each pair of holes covers the shape of a hole, twice as large, around its baseline; overlaps are darker. Axes are
+    baselines in metres or millimetres. With a `grid` they are also frequencies in cycles/pixel, and a square shows what
+    the grid samples, beyond which frequencies wrap around. Raises ValueError for a population of masks.
     """
     from matplotlib.patches import Circle, Rectangle
 
@@ -119,14 +119,15 @@ def uv_coverage_figure(aperture: Aperture, grid: Grid | None = None, title: str 
 
 @drawing.styled
 def mtf_figure(otfs: Mapping[str, Any], grid: Grid) -> Figure:
-    """Modulation transfer functions: each in two dimensions, and the radial means of all.
+    """Draw modulation transfer functions, each in two dimensions, and the radial means of all.
 
     Parameters
     ----------
     otfs : mapping of name to (..., H, W) tensor or array
-        Optical transfer functions in FFT order. Of several frames the mean modulus is shown, and the band between the
+        Optical transfer functions in FFT order. For several frames, the mean modulus is shown, with a band between the
         10th and the 90th percentile of the frames' radial means.
     grid : Grid
+        Pixels and wavelength of the images.
 
     Raises
     ------
@@ -160,7 +161,7 @@ def mtf_figure(otfs: Mapping[str, Any], grid: Grid) -> Figure:
 
 @drawing.styled
 def psf_figure(psfs: Mapping[str, Any], grid: Grid) -> Figure:
-    """Point-spread functions (H, W), given in FFT order, each as a fraction of its peak, on four decades.
+    """Draw point-spread functions (H, W), given in FFT order, as fractions of their peaks over four decades.
 
     Raises ValueError if one does not have the shape of the grid, or there is none.
     """
@@ -180,10 +181,10 @@ def psf_figure(psfs: Mapping[str, Any], grid: Grid) -> Figure:
 def frames_figure(
     frames: Any, count: int = 4, pixel_scale: float | None = None, unit: str = "electrons", sky: Any | None = None
 ) -> Figure:
-    """The first `count` of a stack (T, H, W) of exposures and the mean of all, on one scale [`unit` per pixel].
+    """Draw the first `count` exposures of a stack (T, H, W) and the mean of all, on one scale [`unit` per pixel].
 
-    `pixel_scale` [rad] labels the axes with angles instead of pixels, `sky` (2, 2), as `Observation.sky_matrix`, adds
-    north and east. Raises ValueError for another shape.
+    With `pixel_scale` [rad] the axes show angles instead of pixels. With `sky` (2, 2), such as
+    `Observation.sky_matrix`, arrows show north and east. Raises ValueError if `frames` has another shape.
     """
     stack = as_array(frames).astype(float)
     if stack.ndim != 3 or 0 in stack.shape:
@@ -204,12 +205,11 @@ def frames_figure(
 
 @drawing.styled
 def history_figure(curves: Mapping[str, Any], label: str, x_label: str = "iteration") -> Figure:
-    """What is being minimised against the iteration, one curve per stage or run; `label` names it.
+    """Draw the quantity `label` that is minimised against the iteration, with one curve per stage or run.
 
-    A curve is a row of values (n,), one for each iteration, or of points (n, 2) that say where they lie along the axis.
-
-    The vertical axis is logarithmic where all values are positive and span more than a factor of 5. Values that are
-    not finite leave gaps. Raises ValueError if there is no curve.
+    A curve is an array of values (n,), one for each iteration, or of points (n, 2), (iteration, value). The vertical
+    axis is logarithmic if all values are positive and span more than a factor of 5. Values that are not finite leave
+    gaps. Raises ValueError if there is no curve.
     """
     from matplotlib.ticker import MaxNLocator
 
@@ -231,7 +231,7 @@ def history_figure(curves: Mapping[str, Any], label: str, x_label: str = "iterat
 
 
 def _points(curve: Any) -> np.ndarray:
-    """(n, 2) of values (n,) counted from 1, or of points as they are."""
+    """Return points (n, 2): those of a curve (n, 2) unchanged, those of values (n,) numbered from 1."""
     values = as_array(curve).astype(float)
     if values.ndim == 2 and values.shape[1] == 2:
         return values
@@ -242,22 +242,24 @@ def _points(curve: Any) -> np.ndarray:
 def comparison_figure(
     truth: Any, results: Mapping[str, tuple[Any, Any]], cutoff: float, pixel_scale: float | None = None
 ) -> Figure:
-    """The truth, its diffraction limit, and for each instrument one exposure and the restoration, with their scores.
+    """Draw the truth, its diffraction limit, and for each instrument an exposure and the restoration with their scores.
 
     Parameters
     ----------
     truth : (H, W) tensor or array
+        True object.
     results : mapping of name to (frame (H, W), restoration (H, W))
+        An exposure and the restoration of each instrument.
     cutoff : float
-        Of the scores and of the diffraction limit [cycles/pixel].
+        Cut-off frequency of the scores and of the diffraction limit [cycles/pixel].
     pixel_scale : float, optional
-        [rad]; adds a scale bar.
+        Angle of a pixel [rad], to draw a scale bar.
 
     Notes
     -----
-    All images share one grey scale, that of the diffraction-limited truth up to its 99.5th percentile, with a square
-    root to show faint parts. Restorations are registered and scaled as for their score (`torchmask.metrics.align`);
-    frames are as they came, with the flux of the truth. Errors as in `torchmask.metrics.relative_error`.
+    All images share one grey scale, from 0 to the 99.5th percentile of the diffraction-limited truth, with a
+    square-root stretch. Restorations are registered and scaled as for their score (`torchmask.metrics.align`); frames
+    are only scaled to the flux of the truth. Scores and errors raised are those of `torchmask.metrics.relative_error`.
     """
     images = _comparison_images(truth, drawing.not_empty(results), cutoff)
     n = len(results)

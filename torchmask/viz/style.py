@@ -1,4 +1,4 @@
-"""The common look of the figures in `viz`: style, units, axes and patches."""
+"""The common style of the figures in `viz`, and helpers for units, axes and patches."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 P = ParamSpec("P")
 T = TypeVar("T")
 
-# Okabe and Ito's colours: told apart by colour-blind readers.
+# Okabe and Ito's colours, which colour-blind readers can distinguish.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 INK, FAINT, PALE = "#222222", "#8A8A8A", "#EFEFEF"
 _STYLE: dict[Any, Any] = {
@@ -51,7 +51,7 @@ _STYLE: dict[Any, Any] = {
 
 
 def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
-    """Draw with this module's style, without changing that of the caller."""
+    """Decorate a function so that it draws in this module's style, without changing the caller's."""
 
     @functools.wraps(draw)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> Figure:
@@ -65,7 +65,7 @@ def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure of `width` x `height` inches, known to no pyplot."""
+    """Return an empty figure of `width` x `height` inches, independent of pyplot."""
     with extra("experiments"):
         from matplotlib.figure import Figure
 
@@ -73,35 +73,38 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def row_of_axes(widths: Sequence[float], height: float) -> tuple[Figure, list[Axes]]:
-    """Axes side by side in `height` inches, of which labels take about 0.6; `widths` are relative to the rest."""
+    """Return a figure of `height` inches with axes side by side.
+
+    `widths` are in units of the height of the axes, which is `height` less 0.6 inches for labels.
+    """
     figure = new_figure((height - 0.6) * sum(widths) + 1.3, height)
     return figure, list(figure.subplots(1, len(widths), squeeze=False, width_ratios=list(widths))[0])
 
 
 def colors() -> Iterator[str]:
-    """The colours of successive curves, for ever."""
+    """Yield the colours of successive curves, in an endless cycle."""
     return itertools.cycle(COLORS)
 
 
 def not_empty(things: Mapping[str, T]) -> Mapping[str, T]:
-    """Raise ValueError if there is nothing to draw."""
+    """Return `things`, or raise ValueError if there is nothing to draw."""
     if not things:
-        raise ValueError("there is nothing to draw: the mapping from names is empty")
+        raise ValueError("there is nothing to draw: the mapping is empty, give at least one name and its array")
     return things
 
 
 def length_unit(length: float) -> tuple[str, float]:
-    """Metres or millimetres for `length` [m], and how many of them make a metre."""
+    """Return the unit suited to `length` [m], m or mm, and its number per metre."""
     return ("m", 1.0) if length >= 0.1 else ("mm", 1e3)
 
 
 def angle_unit(angle: float) -> tuple[str, float]:
-    """Arcseconds or milliarcseconds for `angle` [rad], and how many of them make a radian."""
+    """Return the unit suited to `angle` [rad], arcsec or mas, and its number per radian."""
     return ("arcsec", 1 / ARCSEC) if angle >= 0.5 * ARCSEC else ("mas", 1 / MAS)
 
 
 def round_below(value: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten that is not above `value` > 0."""
+    """Return the largest 1, 2 or 5 times a power of ten that does not exceed `value` > 0."""
     power = 10.0 ** math.floor(math.log10(value))
     return max(step for step in (power, 2 * power, 5 * power) if step <= value * (1 + 1e-9))
 
@@ -109,7 +112,10 @@ def round_below(value: float) -> float:
 def sky_extent(
     shape: tuple[int, int], pixel_scale: float | None, centred: bool = False
 ) -> tuple[str, tuple[float, float, float, float]]:
-    """Unit and extent of an image with row 0 at the top, pixel [0, 0] or (after fftshift) the middle one at zero."""
+    """Return unit and extent of an image with row 0 at the top.
+
+    The origin is pixel [0, 0], or the middle pixel (after fftshift) if `centred`.
+    """
     rows, columns = shape
     unit, step = ("pixels", 1.0)
     if pixel_scale is not None:
@@ -121,27 +127,27 @@ def sky_extent(
 
 
 def frequency_extent(grid: Grid) -> tuple[float, float, float, float]:
-    """Extent of an fftshifted Fourier plane with y upwards [cycles/pixel]."""
+    """Return the extent of an fftshifted Fourier plane with y upwards [cycles/pixel]."""
     rows, columns = grid.shape
     left, bottom = (-columns // 2 + columns % 2 - 0.5) / columns, (-rows // 2 + rows % 2 - 0.5) / rows
     return left, left + 1, bottom, bottom + 1
 
 
 def one_mask(aperture: Aperture) -> np.ndarray:
-    """Centres (N, 2) of an aperture [m]; ValueError for a population."""
+    """Return the centres (N, 2) of one aperture [m]; raises ValueError for a population."""
     centers = aperture.centers.numpy(force=True)
     if centers.ndim != 2:
-        raise ValueError(f"centers has shape {centers.shape}: one mask, (n_subapertures, 2), is drawn at a time")
+        raise ValueError(f"centers has shape {centers.shape}: give one mask, (n_subapertures, 2), at a time")
     return centers
 
 
 def hole(aperture: Aperture, center: np.ndarray, scale: float, **style: Any) -> Patch:
-    """What the outer edge of a sub-aperture holds, `scale` times as large, around `center` (x, y), already scaled."""
+    """Return a patch for a sub-aperture, enlarged by `scale`, around `center` (x, y), which is already scaled."""
     return edge(aperture.shape.outline(aperture.subaperture_diameter * scale)[0], center, **style)
 
 
 def edge(contour: Contour, center: np.ndarray, **style: Any) -> Patch:
-    """What one edge of a hole holds, around `center` (x, y) in the unit of the contour."""
+    """Return a patch for the area within one edge of a hole, around `center` (x, y) in the unit of the contour."""
     with extra("experiments"):
         from matplotlib import patches
 
@@ -151,33 +157,33 @@ def edge(contour: Contour, center: np.ndarray, **style: Any) -> Patch:
 
 
 def plane_axes(ax: Axes, half: float, x_label: str, y_label: str) -> None:
-    """A square plane around the origin, y upwards, with the same ticks on both axes."""
+    """Make the axes a square plane around the origin, y upwards, with the same ticks on both axes."""
     ax.set(xlim=(-half, half), ylim=(-half, half), aspect="equal", xlabel=x_label, ylabel=y_label)
     ax.set_yticks(ax.get_xticks())
     ax.set(xlim=(-half, half), ylim=(-half, half))
 
 
 def image_axes(ax: Axes, title: str, x_label: str, y_label: str) -> None:
-    """Title and labels of an image; without a label on y (a neighbour has it) there are no tick labels either."""
+    """Set title and labels of an image; without a y label, because a neighbour has it, y has no tick labels either."""
     ax.set(title=title, xlabel=x_label, ylabel=y_label)
     ax.locator_params(nbins=5)
     ax.tick_params(labelleft=bool(y_label))
 
 
 def second_scale(ax: Axes, factor: float, label: str) -> None:
-    """A second horizontal axis on top: `factor` times the first."""
+    """Add a second horizontal axis on top, with `factor` times the values of the first."""
     top = ax.secondary_xaxis("top", functions=(lambda x: np.multiply(x, factor), lambda x: np.divide(x, factor)))
     top.set_xlabel(label)
 
 
 def colorbar(figure: Figure, axes: list[Axes], label: str = "", **options: Any) -> None:
-    """A slim bar to the right of `axes` for the colours of their images, which share one scale."""
+    """Add a slim colour bar to the right of `axes`, whose images share one scale."""
     bar = figure.colorbar(axes[0].images[0], ax=axes, shrink=0.9, pad=0.015, aspect=28, label=label, **options)
     bar.outline.set_visible(False)  # type: ignore[operator]
 
 
 def light_norm(peak: float) -> PowerNorm:
-    """From 0 to `peak` under a square root, which lifts the faint parts."""
+    """Return a square-root normalisation from 0 to `peak`, which lifts the faint parts."""
     with extra("experiments"):
         from matplotlib.colors import PowerNorm
 
@@ -185,21 +191,21 @@ def light_norm(peak: float) -> PowerNorm:
 
 
 def light_bar(figure: Figure, axes: list[Axes], unit: str = "electrons") -> None:
-    """A bar for images that `light_norm` maps; it names the unit and the stretch."""
+    """Add a colour bar for images with `light_norm` that names the unit and the stretch."""
     peak = axes[0].images[0].get_clim()[1]
-    even = (0, 0.05, 0.2, 0.5, 1)  # nearly so, under the square root
+    even = (0, 0.05, 0.2, 0.5, 1)  # almost evenly spaced under the square root
     label = f"{unit}, square-root stretch" if unit else "square-root stretch"
     colorbar(figure, axes, label, ticks=[round_below(peak) * part for part in even], format="%g")
 
 
 def compass(ax: Axes, matrix: Any) -> None:
-    """Arrows to north and east in the lower right corner of an image that was shown with `sky_extent`.
+    """Draw arrows to north and east in the lower right corner of an image with a `sky_extent`.
 
-    `matrix` (2, 2) leads from pixels (x, y) to (east, north), as `Observation.sky_matrix`.
+    `matrix` (2, 2) converts pixels (x, y) to (east, north), as `Observation.sky_matrix` does.
     """
     left, right, bottom, top = ax.images[0].get_extent()
     side = min(abs(right - left), abs(bottom - top))
-    towards = np.linalg.inv(np.asarray(matrix, dtype=float)).T  # rows: a step to east, to north, in pixels
+    towards = np.linalg.inv(np.asarray(matrix, dtype=float)).T  # rows are steps to east and to north, in pixels
     middle = np.array([right - 0.2 * side, bottom - 0.2 * side])
     for name, step in zip(("E", "N"), towards / np.linalg.norm(towards, axis=1, keepdims=True), strict=True):
         (x, y), (tip_x, tip_y) = middle, middle + 0.11 * side * step
@@ -210,7 +216,7 @@ def compass(ax: Axes, matrix: Any) -> None:
 
 
 def scale_bar(ax: Axes, columns: int, pixel_scale: float) -> None:
-    """A white bar with its angle, about a quarter of the image wide, in the lower left corner."""
+    """Draw a white scale bar with its angle, at most a third of the image wide, in the lower left corner."""
     unit, scale = angle_unit(pixel_scale * columns / 4)
     angle = round_below(pixel_scale * columns / 3 * scale)
     length = angle / scale / pixel_scale / columns
@@ -219,7 +225,7 @@ def scale_bar(ax: Axes, columns: int, pixel_scale: float) -> None:
 
 
 def radial_mean(plane: np.ndarray) -> np.ndarray:
-    """Mean of a Fourier plane in FFT order over rings one frequency step wide, from 0 to 1/2 cycles/pixel."""
+    """Return the mean of a Fourier plane in FFT order over rings one step wide, from 0 to 1/2 cycles/pixel."""
     rows, columns = plane.shape
     nu = np.hypot(np.fft.fftfreq(rows)[:, None], np.fft.fftfreq(columns))
     ring = np.rint(nu * min(plane.shape)).astype(int).ravel()
