@@ -120,7 +120,7 @@ def test_skip_counts_from_0_and_names_what_is_not_there():
     frames = observe()
     assert usable(frames, (0, 11, 11))[0] == list(range(1, 11))
     for skip, message in (
-        ((12,), "skip names frame 12, but the stack has 12, counted"),
+        ((12,), "skip names frame 12, but the stack has 12 frames, counted"),
         ((-1,), "skip names frame -1"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -114,7 +114,7 @@ def test_saturated_pixels_carry_no_weight_and_are_counted(write_fits, mask, cube
 def test_darks_among_the_files_are_left_out_and_alone_are_refused(write_fits, mask, cube):
     light, dark = write_fits("light.fits", cube), write_fits("dark.fits", cube[0] / 50, IMAGETYP="DARK")
     with pytest.warns(
-        UserWarning, match=r"files without light are left out \(.*dark\.fits: IMAGETYP is 'DARK'\); dark"
+        UserWarning, match=r"files without light are left out \(.*dark\.fits: IMAGETYP is 'DARK'\); to subtract a dark"
     ):
         assert len(read_observation([dark, light], mask).frames) == 3
     with pytest.raises(ValueError, match=r"no file holds light \(.*dark\.fits: IMAGETYP is 'DARK'\): give exposures"):
