@@ -153,7 +153,7 @@ def test_tensors_are_stored_with_their_dtype(tmp_path, dtype):
 
 def test_objects_are_neither_written_nor_read(tmp_path):
     path = tmp_path / "a.npz"
-    with pytest.raises(ValueError, match="x is no array of numbers"):
+    with pytest.raises(ValueError, match="x has dtype object: only numbers"):
         save_npz(path, {"good": 1, "x": [object()]})
     assert names(tmp_path) == []
     np.savez(path, x=np.array([{}], dtype=object))
@@ -163,7 +163,7 @@ def test_objects_are_neither_written_nor_read(tmp_path):
 
 def test_missing_array_is_named(tmp_path):
     save_npz(tmp_path / "a.npz", {"x": 1, "y": 2})
-    with pytest.raises(ValueError, match=r"a\.npz has no frames, centers; it holds x, y"):
+    with pytest.raises(ValueError, match=r"a\.npz has no frames, centers; it contains x, y"):
         load_npz(tmp_path / "a.npz", ["x", "frames", "centers"])
 
 
@@ -178,12 +178,12 @@ def test_damaged_files_are_refused(tmp_path):
         archive.writestr("a.txt", "not an array")
     cases = {
         "absent": (None, "there is no file"),
-        "empty": (b"", "is no .npz"),
-        "text": (b"frames", "is no .npz"),
-        "truncated": (content[:-100], "is no .npz"),
+        "empty": (b"", "is not an .npz"),
+        "text": (b"frames", "is not an .npz"),
+        "truncated": (content[:-100], "is not an .npz"),
         "flipped": (bytes(flipped), "cannot be read"),
-        "array": ((tmp_path / "array.npy").read_bytes(), "is no .npz"),
-        "archive": ((tmp_path / "other.zip").read_bytes(), "something else than arrays"),
+        "array": ((tmp_path / "array.npy").read_bytes(), "is not an .npz"),
+        "archive": ((tmp_path / "other.zip").read_bytes(), "something other than arrays"),
     }
     for name, (data, message) in cases.items():
         path = tmp_path / f"{name}.npz"
@@ -248,11 +248,11 @@ def test_json_is_strict_and_repeatable(value):
 
 
 def test_json_refuses_the_rest_before_it_writes(tmp_path):
-    with pytest.raises(TypeError, match="no place in JSON"):
+    with pytest.raises(TypeError, match="cannot be stored as JSON"):
         write_json(tmp_path / "a.json", {"x": object()})
     assert names(tmp_path) == []
     (tmp_path / "bad.json").write_text('{"a": 1')
-    with pytest.raises(ValueError, match=r"bad\.json is no valid JSON"):
+    with pytest.raises(ValueError, match=r"bad\.json is not valid JSON"):
         read_json(tmp_path / "bad.json")
     with pytest.raises(ValueError, match="there is no file"):
         read_json(tmp_path / "absent.json")
@@ -265,6 +265,6 @@ def test_a_new_folder_is_new(tmp_path):
     assert free_name(tmp_path / "runs" / "run") == tmp_path / "runs" / "run-3"
     with pytest.raises(ValueError, match=r"run exists and is not overwritten: choose another, such as .*run-3$"):
         new_folder(tmp_path / "runs" / "run")
-    with pytest.raises(ValueError, match="cannot be made"):
+    with pytest.raises(ValueError, match="cannot be created"):
         new_folder(tmp_path / "runs" / "run-2" / "below_a_file")
     assert names(tmp_path / "runs") == ["run", "run-2"]

@@ -200,7 +200,7 @@ def test_files_that_are_none_are_refused(tmp_path, mask):
 def test_a_file_whose_parts_disagree_says_so(tmp_path, mask, change):
     Observation(frames_of(2), mask, GRID, readout_noise=None, psfs=frames_of(2, 1)).save(tmp_path / "a.npz")
     np.savez(tmp_path / "b.npz", **dict(np.load(tmp_path / "a.npz")) | change)
-    with pytest.raises(ValueError, match=r"b\.npz holds no valid observation: "):
+    with pytest.raises(ValueError, match=r"b\.npz does not contain a valid observation: "):
         Observation.load(tmp_path / "b.npz")
 
 
@@ -285,7 +285,7 @@ def test_arrays_and_frames_with_a_gradient_are_frames_too():
     ("change", "message"),
     [
         (lambda f: f[0], "at least one frame"),
-        (lambda f: f[:, :-1], "as the grid says"),
+        (lambda f: f[:, :-1], "the grid needs"),
         (lambda f: f[:0], "at least one frame"),
         (lambda f: f.index_fill(0, torch.tensor([1]), math.nan), r"frames \[1\] hold values that are not finite"),
         (lambda f: f.index_fill(0, torch.tensor([2]), 0.0), r"frames \[2\] hold no light"),

@@ -227,7 +227,7 @@ def test_a_line_cut_off_is_dropped_and_a_damaged_one_is_told(tmp_path):
     path.write_text("{" + content)
     with pytest.raises(ValueError, match=r"metrics\.jsonl is damaged"):
         read_metrics(tmp_path / "run")
-    with pytest.raises(ValueError, match="is no run folder"):
+    with pytest.raises(ValueError, match="is not a run folder"):
         read_metrics(tmp_path)
 
 
@@ -270,13 +270,13 @@ def test_nothing_is_overwritten(tmp_path):
     assert {path: path.read_bytes() for path in before} == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run", "run-2"]
     (tmp_path / "file").touch()
-    with pytest.raises(ValueError, match="cannot be made"):
+    with pytest.raises(ValueError, match="cannot be created"):
         RunLogger(tmp_path / "file" / "run")
 
 
 def test_the_configuration_is_written_once_or_not_at_all(tmp_path):
     with RunLogger(tmp_path / "run") as log:
-        with pytest.raises(TypeError, match="no place in JSON"):
+        with pytest.raises(TypeError, match="cannot be stored as JSON"):
             log.log_config({"model": object()})
         assert not (tmp_path / "run" / "config.json").exists()
         log.log_config({"n": 1})

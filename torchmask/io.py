@@ -1,7 +1,4 @@
-"""Files that are whole or absent, written under a temporary name and renamed, read without unpickling; and extras.
-
-Extras are what a plain install leaves out: whoever lacks one is told how to get it.
-"""
+"""Reading files without unpickling, writing them completely or not at all, and importing optional dependencies."""
 
 from __future__ import annotations
 
@@ -29,22 +26,22 @@ _KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: 
 
 
 def as_array(values: Any) -> np.ndarray:
-    """A tensor (any device, with or without gradient), number or sequence as a NumPy array."""
+    """Convert a tensor (on any device, with or without gradient), number or sequence to a NumPy array."""
     return values.numpy(force=True) if isinstance(values, Tensor) else np.asarray(values)
 
 
 @contextmanager
 def atomic_write(path: str | Path, *, replace: bool = False) -> Iterator[BinaryIO]:
-    """Open a file that appears at `path` only when the block ends well; otherwise nothing is left behind.
+    """Open a file that appears at `path` only if the block ends without an error; otherwise nothing is left behind.
 
     The bytes go to a temporary file in the same folder, which is synchronised to disk and renamed.
 
     Parameters
     ----------
     path : str or Path
-        Its folder must exist.
+        Name of the file, in an existing folder.
     replace : bool
-        Whether an existing file may be replaced; readers see the old one or the new one, never a mixture.
+        Whether an existing file may be replaced. Readers see either the old or the new one, never a mixture.
 
     Raises
     ------
@@ -62,7 +59,7 @@ def atomic_write(path: str | Path, *, replace: bool = False) -> Iterator[BinaryI
     """
     path = Path(path)
     if not path.parent.is_dir():
-        raise ValueError(f"{path} cannot be written: there is no folder {path.parent}, make it first")
+        raise ValueError(f"{path} cannot be written: there is no folder {path.parent}, create it first")
     if not replace:
         _refuse_existing(path)
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
@@ -72,7 +69,7 @@ def atomic_write(path: str | Path, *, replace: bool = False) -> Iterator[BinaryI
             file.flush()
             os.fsync(file.fileno())
         if not replace:
-            _refuse_existing(path)  # it may have appeared in the meantime
+            _refuse_existing(path)  # it may have been created in the meantime
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -84,9 +81,9 @@ def _refuse_existing(path: Path) -> None:
 
 
 def new_folder(path: str | Path) -> Path:
-    """Make a folder, and those above it.
+    """Create a folder and its parents.
 
-    Raises ValueError if it exists (the message names one that is free) or cannot be made.
+    Raises ValueError if it exists (the message suggests a free name) or cannot be created.
     """
     path = Path(path)
     try:
@@ -94,12 +91,12 @@ def new_folder(path: str | Path) -> Path:
     except FileExistsError:
         raise ValueError(f"{path} exists and is not overwritten: choose another, such as {free_name(path)}") from None
     except OSError as error:
-        raise ValueError(f"{path} cannot be made: {error}") from error
+        raise ValueError(f"{path} cannot be created: {error}") from error
     return path
 
 
 def free_name(path: str | Path) -> Path:
-    """`path` if nothing is there yet, or else the first of path-2, path-3, ... that is free."""
+    """Return `path` if it does not exist, or else the first of path-2, path-3, ... that does not."""
     path = candidate = Path(path)
     number = 1
     while candidate.exists():
@@ -111,51 +108,50 @@ def free_name(path: str | Path) -> Path:
 def save_npz(path: str | Path, arrays: Mapping[str, Any], *, replace: bool = False) -> None:
     """Write tensors, arrays and numbers to a compressed .npz file, atomically.
 
-    Raises ValueError for what `atomic_write` refuses, for a path that does not end in .npz, and for values that only
-    pickling could store; then nothing is written.
+    Raises ValueError, and writes nothing, if `atomic_write` refuses the path, it does not end in .npz, or a value could
+    only be stored by pickling.
     """
     if Path(path).suffix != ".npz":
-        raise ValueError(f"{path} does not end in .npz")
+        raise ValueError(f"{path} does not end in .npz: give a name that does")
     converted = {name: as_array(values) for name, values in arrays.items()}
     for name, array in converted.items():
         if array.dtype.hasobject:
-            raise ValueError(f"{name} is no array of numbers or text (dtype {array.dtype}): only those are stored")
+            raise ValueError(f"{name} has dtype {array.dtype}: only numbers and text can be stored")
     with atomic_write(path, replace=replace) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, array in converted.items():  # np.savez reserves some names, a Record none
+        for name, array in converted.items():  # not np.savez, which reserves some names
             with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
                 np.lib.format.write_array(entry, array, allow_pickle=False)
 
 
 def load_npz(path: str | Path, required: Sequence[str] = ()) -> dict[str, np.ndarray]:
-    """Read all arrays of an .npz file; nothing is ever unpickled.
+    """Read all arrays of an .npz file, without unpickling.
 
-    Raises ValueError if the file is missing, is damaged or no .npz, holds pickled objects, or lacks an array that
-    is named in `required`.
+    Raises ValueError if the file is missing, damaged or not an .npz file, contains pickled objects, or lacks an array
+    named in `required`.
     """
     need = f" (needed: an .npz file with {', '.join(required)})" if required else " (needed: an .npz file)"
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"there is no file {path}{need}")
     if not zipfile.is_zipfile(path):
-        raise ValueError(f"{path} is no .npz file, or the end of it is missing{need}")
+        raise ValueError(f"{path} is not an .npz file, or its end is missing{need}")
     try:
         with np.load(path, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
     except (zipfile.BadZipFile, zlib.error, OSError, EOFError, ValueError, NotImplementedError) as error:
         raise ValueError(f"{path} cannot be read: {error}{need}") from error
     if not all(isinstance(array, np.ndarray) for array in arrays.values()):
-        raise ValueError(f"{path} is an archive of something else than arrays{need}")
+        raise ValueError(f"{path} is an archive of something other than arrays{need}")
     missing = [name for name in required if name not in arrays]
     if missing:
-        raise ValueError(f"{path} has no {', '.join(missing)}; it holds {', '.join(arrays) or 'nothing'}{need}")
+        raise ValueError(f"{path} has no {', '.join(missing)}; it contains {', '.join(arrays) or 'nothing'}{need}")
     return arrays
 
 
 def to_json(value: Any) -> Any:
-    """Turn dataclasses, mappings, sequences, paths, arrays and tensors into what strict JSON can hold.
+    """Convert dataclasses, mappings, sequences, paths, arrays and tensors to values that strict JSON can represent.
 
-    JSON knows no NaN and no infinity: both become None (null), which tables read back as missing.
-    Raises TypeError for anything else.
+    NaN and infinity, which JSON lacks, become None (null). Raises TypeError for values of other types.
     """
     if value is None or isinstance(value, bool | int | str):
         return value
@@ -171,19 +167,19 @@ def to_json(value: Any) -> Any:
         return [to_json(item) for item in value]
     if isinstance(value, Path | torch.dtype | torch.device):
         return str(value)
-    raise TypeError(f"{value!r} ({type(value).__name__}) has no place in JSON: give a number, text, list or mapping")
+    raise TypeError(f"{value!r} ({type(value).__name__}) cannot be stored as JSON: give a number, text, list or dict")
 
 
 def from_json(kind: type[T], values: Any, prefix: str = "", leave_out: Sequence[str] = ()) -> T:
-    """The dataclass `kind` from a mapping, as JSON or YAML hold one; what the mapping lacks has its default.
+    """Create the dataclass `kind` from a mapping read from JSON or YAML; missing keys take their defaults.
 
-    Strict, so that a misspelt key cannot be taken for a default. `prefix` begins the keys in messages, and fields in
-    `leave_out` are none.
+    Unknown keys are errors, so a misspelt key cannot silently mean a default. `prefix` is put before keys in messages,
+    and fields in `leave_out` count as unknown.
 
-    Raises ValueError for an unknown or missing key and a value of the wrong kind: the message says which.
+    Raises ValueError if a key is unknown or missing, or a value has the wrong type; the message says which.
     """
     if not isinstance(values, dict):
-        raise ValueError(f"{prefix.rstrip('.')} holds {values!r}: names with values are needed")
+        raise ValueError(f"{prefix.rstrip('.')} is {values!r}: a mapping of names to values is needed")
     fields = [field for field in dataclasses.fields(typing.cast(Any, kind)) if field.name not in leave_out]
     known = [field.name for field in fields]
     for key in values:
@@ -198,7 +194,7 @@ def from_json(kind: type[T], values: Any, prefix: str = "", leave_out: Sequence[
 
 
 def _convert(hint: Any, value: Any, key: str) -> Any:
-    """`value` as the type `hint`, or ValueError."""
+    """Convert `value` to the type `hint`, or raise ValueError."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if dataclasses.is_dataclass(hint):
         return from_json(typing.cast(type, hint), value, f"{key}.")
@@ -218,7 +214,7 @@ def _convert(hint: Any, value: Any, key: str) -> Any:
         return _convert_items(arguments, value, key)
     if hint is float and isinstance(value, str):
         try:
-            return float(value)  # YAML takes 550e-9, without a point, for text
+            return float(value)  # YAML reads 550e-9, without a point, as text
         except ValueError:
             pass
     accepted = {float: (int, float), Path: str}.get(hint, hint)
@@ -228,7 +224,7 @@ def _convert(hint: Any, value: Any, key: str) -> Any:
 
 
 def _convert_items(hints: tuple[Any, ...], values: Any, key: str) -> tuple[Any, ...]:
-    """A list as a tuple of fixed length, or of any length if `hints` ends in an ellipsis."""
+    """Convert a list to a tuple of fixed length, or of any length if `hints` ends in an ellipsis."""
     if not isinstance(values, list):
         raise ValueError(f"{key} is {values!r}: a list is needed")
     if hints[-1] is Ellipsis:
@@ -241,7 +237,7 @@ def _convert_items(hints: tuple[Any, ...], values: Any, key: str) -> tuple[Any, 
 
 
 def write_json(path: str | Path, value: Any, *, replace: bool = False) -> None:
-    """Write `to_json(value)` to a file, indented, atomically. Errors as in `to_json` and `atomic_write`."""
+    """Write `to_json(value)` to a file, indented, atomically. Raises the errors of `to_json` and `atomic_write`."""
     text = json.dumps(to_json(value), indent=2, allow_nan=False)
     with atomic_write(path, replace=replace) as file:
         file.write(f"{text}\n".encode())
@@ -255,17 +251,17 @@ def read_json(path: str | Path) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
-        raise ValueError(f"{path} is no valid JSON: {error}") from error
+        raise ValueError(f"{path} is not valid JSON: {error}") from error
 
 
 @contextmanager
 def extra(name: str) -> Iterator[None]:
-    """Around imports of what the extra of this name brings.
+    """Wrap imports of packages that the extra called `name` installs.
 
     Raises
     ------
     ModuleNotFoundError
-        If one is not installed: names it, and the extra.
+        If a package is not installed; the message says how to install the extra.
 
     Examples
     --------

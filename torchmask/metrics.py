@@ -1,7 +1,7 @@
-"""How close a restoration comes to the truth, when position and brightness are free.
+"""Scores of a restoration against the truth that ignore position and brightness.
 
-Neither the position of the object nor its brightness can be seen by a restoration from unknown aberrations, and
-nothing beyond the diffraction limit can. So an estimate is compared after a hard low-pass, a registration and a gain.
+A restoration with unknown aberrations determines neither the position of the object nor its brightness, nor anything
+beyond the diffraction limit. Estimates are therefore low-passed, registered and scaled before they are compared.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from torch import Tensor
 
 from torchmask.io import extra
 
-_ROUNDING = 1e-9  # relative slack, so that frequencies exactly on the rim stay in
+_ROUNDING = 1e-9  # relative tolerance, so that frequencies exactly at the cut-off are kept
 _PEAK_PERCENTILE = 99.5  # glints above it would set the range of the structural similarity
 
 
 def lowpass(image: Any, cutoff: float) -> Tensor:
-    """Remove all frequencies above `cutoff` [cycles/pixel] from images (..., H, W): a hard circular cut.
+    """Remove all frequencies above `cutoff` [cycles/pixel] from images (..., H, W) by a sharp circular cut.
 
-    Takes a tensor or an array; differentiable, dtype and device follow.
-    Raises ValueError if `cutoff` is not finite and positive.
+    `image` is a tensor or an array. The result is differentiable and keeps dtype and device. Raises ValueError if
+    `cutoff` is not finite and positive.
     """
     if not (math.isfinite(cutoff) and cutoff > 0):
         raise ValueError(
@@ -38,18 +38,19 @@ def lowpass(image: Any, cutoff: float) -> Tensor:
 
 
 def shift(image: Tensor, offset: Tensor | tuple[float, float]) -> Tensor:
-    """Move images by any fraction of a pixel, with wrap-around, by the shift theorem: what is band-limited stays exact.
+    """Shift images by any fraction of a pixel, with wrap-around, by the shift theorem, exact for band-limited images.
 
     Parameters
     ----------
     image : (..., H, W) tensor
+        Images to shift.
     offset : (..., 2) tensor or (dy, dx)
-        Rows and columns by which each image moves [pixels]; leading axes broadcast against those of `image`.
+        Shift of each image along rows and columns [pixels]; leading axes broadcast against those of `image`.
 
     Returns
     -------
     Tensor
-        (..., H, W), of the dtype and device of `image`; differentiable in both arguments.
+        (..., H, W), with the dtype and device of `image`; differentiable in both arguments.
 
     Raises
     ------
@@ -58,9 +59,8 @@ def shift(image: Tensor, offset: Tensor | tuple[float, float]) -> Tensor:
 
     Notes
     -----
-    A whole number of pixels is a roll; the adjoint is the shift by `-offset`. Shifts add, and the one by `-offset` is
-    the inverse, but for the highest frequency of an even side, 1/2 cycles/pixel: its wave, +1 and -1 in turn, vanishes
-    half a pixel further.
+    A shift by whole pixels is a roll, and the adjoint is the shift by `-offset`. Shifts add up, and that by `-offset`
+    is the inverse, except at the Nyquist frequency of an even side, whose wave a shift by half a pixel removes.
 
     Examples
     --------
@@ -73,10 +73,10 @@ def shift(image: Tensor, offset: Tensor | tuple[float, float]) -> Tensor:
 
 
 def shift_transfer(shape: Sequence[int], offset: Tensor) -> Tensor:
-    """The factor (..., H, W // 2 + 1) by which a shift changes the transform `torch.fft.rfft2` of an image.
+    """Return the factor (..., H, W // 2 + 1) by which a shift multiplies the transform `torch.fft.rfft2` of an image.
 
-    `shape` is the image's, (..., H, W), and `offset` (..., 2) the way it goes, (dy, dx) [pixels]. Differentiable;
-    raises ValueError as `shift` does.
+    `shape` (..., H, W) is that of the image, and `offset` (..., 2) the shift (dy, dx) [pixels]. Differentiable; raises
+    ValueError as `shift` does.
     """
     if offset.shape[-1:] != (2,):
         raise ValueError(f"offset has shape {tuple(offset.shape)}: its last axis must be (dy, dx), in pixels")
@@ -86,26 +86,27 @@ def shift_transfer(shape: Sequence[int], offset: Tensor) -> Tensor:
 
 
 def align(estimate: Any, truth: Any, cutoff: float) -> Tensor:
-    """Low-pass `estimate`, move it and scale it so that it fits the low-passed `truth` best.
+    """Low-pass, shift and scale `estimate` so that it fits the low-passed `truth` best.
 
     Parameters
     ----------
-    estimate, truth : (H, W) tensor or array
-        The scale of each is arbitrary, and so is the position of `estimate`, up to a wrap-around.
+    estimate : (H, W) tensor or array
+        Restored image, in any unit and at any position, with wrap-around.
+    truth : (H, W) tensor or array
+        True image, in any unit.
     cutoff : float
-        Highest frequency that counts, diameter * pixel_scale / wavelength [cycles/pixel].
+        Highest frequency that is compared, diameter * pixel_scale / wavelength [cycles/pixel].
 
     Returns
     -------
     Tensor
-        (H, W), on the pixels and in the units of `truth`, of dtype float64 on the CPU. Compare it with
-        `lowpass(truth, cutoff)`.
+        (H, W), on the pixels and in the unit of `truth`, float64 on the CPU. Compare it with `lowpass(truth, cutoff)`.
 
     Raises
     ------
     ValueError
-        If the shapes disagree, a value is not finite, the sum of `truth` is not positive, or `estimate` is zero below
-        the cut-off.
+        If the shapes differ, a value is not finite, the sum of `truth` is not positive, or `estimate` is zero below the
+        cut-off.
 
     Examples
     --------
@@ -123,20 +124,20 @@ def align(estimate: Any, truth: Any, cutoff: float) -> Tensor:
 
 
 def relative_error(estimate: Any, truth: Any, cutoff: float) -> float:
-    """Relative error of a restoration up to the diffraction limit: 0 is perfect, below 1 is better than nothing.
+    """Return the relative error of a restoration up to the diffraction limit: 0 is perfect, 1 no better than nothing.
 
-    ||align(estimate) - lowpass(truth)|| / ||lowpass(truth)||: both low-passed at `cutoff`, registered (far
-    finer than the 1e-3 pixel that the value needs), one gain fitted. Arguments and errors as in `align`.
+    It is ||align(estimate) - lowpass(truth)|| / ||lowpass(truth)||. Registration is much finer than the 1e-3 pixels
+    that this needs. Arguments and errors are those of `align`.
     """
     reference = lowpass(_checked(estimate, truth)[1], cutoff)
     return float((align(estimate, truth, cutoff) - reference).norm() / reference.norm())
 
 
 def ssim(estimate: Any, truth: Any, cutoff: float) -> float:
-    """Structural similarity of the aligned estimate and the low-passed truth, 1 at best (scikit-image).
+    """Return the structural similarity of the aligned estimate and the low-passed truth, 1 at best (scikit-image).
 
-    Both are clipped to [0, the 99.5th percentile of the low-passed truth], which is also the data range, so that a
-    few glints do not set the scale. Arguments and errors as in `align`; images of at least 7 x 7 pixels.
+    Both are clipped to [0, the 99.5th percentile of the low-passed truth], which is also the data range, so that a few
+    glints do not set the scale. Arguments and errors are those of `align`; images need at least 7 x 7 pixels.
     """
     with extra("data"):
         from skimage.metrics import structural_similarity
@@ -145,7 +146,7 @@ def ssim(estimate: Any, truth: Any, cutoff: float) -> float:
     reference = lowpass(_checked(estimate, truth)[1], cutoff).numpy()
     peak = float(np.percentile(reference, _PEAK_PERCENTILE))
     if peak <= 0:
-        raise ValueError("more than 99.5 % of the truth is not positive: its structural similarity has no range")
+        raise ValueError("fewer than 0.5 % of the pixels of the truth are positive: structural similarity needs more")
     similarity: Any = structural_similarity(aligned.clip(0, peak), reference.clip(0, peak), data_range=peak)
     return float(similarity)
 
@@ -164,7 +165,7 @@ def _checked(estimate: Any, truth: Any) -> tuple[Tensor, Tensor]:
             f"estimate has shape {tuple(images[0].shape)} and truth {tuple(images[1].shape)}: they must be equal"
         )
     if not float(images[1].sum()) > 0:
-        raise ValueError("the sum of truth is not positive: it is no image of light")
+        raise ValueError("the sum of truth is not positive: an image of light is needed")
     return images[0], images[1]
 
 
@@ -175,11 +176,11 @@ def _frequencies(shape: Sequence[int], dtype: torch.dtype, device: torch.device)
 
 
 def _registration(image: Tensor, reference: Tensor) -> Tensor:
-    """The shift (dy, dx) of `image` with the highest correlation with `reference`.
+    """Return the shift (dy, dx) of `image` that correlates best with `reference`.
 
-    The best whole-pixel shift comes from the FFT; from there a trust-region Newton method climbs the correlation,
-    a trigonometric polynomial of the shift whose derivatives autograd gives. (scikit-image's phase_cross_correlation
-    takes the largest modulus, so a negative image would match too, and searches 1e-3 pixel by brute force.)
+    The FFT gives the best shift by whole pixels. From there a trust-region Newton method maximises the correlation, a
+    trigonometric polynomial of the shift whose derivatives come from autograd. (scikit-image's phase_cross_correlation
+    takes the largest modulus, so a negative image would match too, and finds 1e-3 pixels by brute force.)
     """
     norm = float(image.norm() * reference.norm())
     rows, columns = image.shape

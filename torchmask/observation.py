@@ -1,4 +1,4 @@
-"""A stack of short exposures with what is known about them, and the checks that make it one."""
+"""A stack of short exposures with all that is known about it, and its checks."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ _NUMBERS = (*_NEEDED_NUMBERS, "readout_noise", *_OPTIONAL_NUMBERS)
 
 _ARRAYS = ("object", "psfs", "phases", "valid", "errors", "transmission")
 
-_TRUE = "true_"  # begins what a file holds of the true aperture
+_TRUE = "true_"  # prefix of the true aperture's entries in a file
 
-PHASE_OVERSAMPLING = 4  # of the pupil samples that the phases of an observation lie on
+PHASE_OVERSAMPLING = 4  # oversampling of the pupil samples on which phases are stored
 
 _CELESTIAL = re.compile(
     r"WCSAXES|CRPIX[12]|CRVAL[12]|CTYPE[12]|CUNIT[12]|CDELT[12]|CROTA[12]|CD[12]_[12]|PC[12]_[12]|P[VS][12]_\d+"
@@ -42,27 +42,28 @@ _CELESTIAL = re.compile(
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Observation(Brief):
-    """Short exposures of one object, how they were taken and, where it is known, the truth behind them.
+    """Short exposures of one object, how they were taken and, for simulations, the truth behind them.
 
-    frames : (T, H, W) electrons
-    aperture, grid : what they were taken through
-    readout_noise : electrons rms per pixel and frame; None where nobody knows it: the restoration measures it then
-    object : (H, W) the scene in expected electrons per frame, on the frames' pixels
-    psfs : (T, H, W) centred on pixel [H // 2, W // 2] and cropped to the field, not renormalised: what is missing to a
-        sum of 1 fell outside
-    phases : (T, N, P) [rad] of the wavefronts on the pupil samples `aperture.samples(grid, PHASE_OVERSAMPLING)`: what
-        `PSF` takes and `ZernikePhase` makes of coefficients, both with that oversampling
-    r0, outer_scale : of the turbulence [m]
-    n_photons : electrons per frame, before the field was cropped
-    valid : (H, W) or (T, H, W) bool, False where a pixel is dead or saturated; None: all are valid
-    errors : (T, H, W) electrons rms of each pixel, or None
-    true_aperture : through which the light went, where it is not `aperture`
-    background : electrons per pixel and frame that the object did not send
-    transmission : (T,) of the object's light in each frame, 1 in the mean
-    header : FITS cards that go with the frames: sky coordinates, target, telescope, filter, date
+    frames : (T, H, W) exposures [electrons]
+    aperture : aperture through which they were taken, as far as the observer knows
+    grid : pixels and wavelength of the frames
+    readout_noise : read-out noise [electrons rms per pixel and frame]; None if unknown: the restoration measures it
+    object : (H, W) true scene, expected electrons per pixel and frame
+    psfs : (T, H, W) true PSFs, centred on pixel [H // 2, W // 2] and cropped to the field; sums below 1 mean lost light
+    phases : (T, N, P) true phases [rad] on the pupil samples `aperture.samples(grid, PHASE_OVERSAMPLING)`, as `PSF`
+        takes them and `ZernikePhase` returns them with that oversampling
+    r0 : true Fried parameter [m]
+    outer_scale : true outer scale of the turbulence [m]
+    n_photons : true number of electrons per frame, including those outside the field
+    valid : (H, W) or (T, H, W) bool, False for dead and saturated pixels; None if all are valid
+    errors : (T, H, W) standard deviation of each pixel [electrons], or None
+    true_aperture : real aperture, if it differs from `aperture`
+    background : true sky [electrons per pixel and frame]
+    transmission : (T,) true transmission of each frame, 1 on average
+    header : FITS cards that belong to the frames: sky coordinates, target, telescope, filter, date
 
-    The truth (object, psfs, phases, r0, outer_scale, n_photons, background, transmission, true_aperture) is None where
-    nobody knows it: in real observations.
+    In real observations the truth (object, psfs, phases, r0, outer_scale, n_photons, background, transmission,
+    true_aperture) is None.
 
     Examples
     --------
@@ -99,7 +100,7 @@ class Observation(Brief):
             )
         noise = self.readout_noise
         if noise is not None and not (math.isfinite(noise) and noise >= 0):
-            raise ValueError(f"readout_noise is {noise}: it must be finite and not negative")
+            raise ValueError(f"readout_noise is {noise}: it must be finite and not negative, in electrons rms")
         shapes = {"object": self.grid.shape, "psfs": self.frames.shape, "errors": self.frames.shape}
         shapes["transmission"] = (len(self.frames),)
         if self.phases is not None:
@@ -119,15 +120,15 @@ class Observation(Brief):
 
     @property
     def sky_matrix(self) -> Tensor | None:
-        """(2, 2) from pixels (x, y) to angles (east, north) on the sky [rad]; None if the header tells no directions.
+        """Matrix (2, 2) that converts pixels (x, y) to angles (east, north) on the sky [rad].
 
-        Needs astropy (extra `data`).
+        It is None if the header has no sky coordinates. Needs astropy (extra `data`).
         """
         matrix = pixel_matrix(self.header) if self.header else None
         return None if matrix is None else torch.from_numpy(matrix)
 
     def take(self, frames: Sequence[int] | np.ndarray) -> Observation:
-        """The observation of these frames alone, numbered from 0, with what belongs to each of them."""
+        """Return the observation reduced to these frames, numbered from 0."""
         chosen = torch.as_tensor(np.asarray(frames, dtype=np.int64), device=self.frames.device)
         per_frame = ["frames", "psfs", "phases", "errors", "transmission"]
         if self.valid is not None and self.valid.ndim == 3:
@@ -136,7 +137,7 @@ class Observation(Brief):
         return replace(self, **{name: part[chosen] for name, part in parts.items() if part is not None})
 
     def save(self, path: str | Path) -> None:
-        """Write everything to a new .npz file (compressed, without pickle; the format of `load`).
+        """Write the observation to a new compressed .npz file, which `load` reads.
 
         Raises ValueError if the file exists, its folder does not, or its name does not end in .npz.
         """
@@ -157,21 +158,21 @@ class Observation(Brief):
 
     @classmethod
     def load(cls, path: str | Path) -> Observation:
-        """Read what `save` wrote, or any .npz file with its keys.
+        """Read an observation written by `save`, or any .npz file with the same keys.
 
-        Of an aperture, the `shape` of the holes may be missing (discs), of an observation all that may be None. One
-        centred disc is a full pupil of its own diameter, whatever `mask_diameter` says.
+        Keys of values that may be None may be missing, and so may the `shape` of the holes, which are discs by default.
+        A single centred disc is a full pupil of its own diameter, whatever `mask_diameter` says.
 
         Raises
         ------
         ValueError
-            If the file is missing, damaged, holds pickled objects, lacks a key or holds arrays that disagree.
+            If the file is missing or damaged, contains pickled objects, lacks a key or has arrays that disagree.
         """
         stored = load_npz(path, required=("frames", "centers", *_NEEDED_NUMBERS))
         try:
             return cls._from_arrays(stored)
         except (ValueError, TypeError) as error:
-            raise ValueError(f"{path} holds no valid observation: {error}") from error
+            raise ValueError(f"{path} does not contain a valid observation: {error}") from error
 
     @classmethod
     def _from_arrays(cls, stored: dict[str, Any]) -> Observation:
@@ -191,18 +192,18 @@ class Observation(Brief):
 
 
 def check_frames(frames: Tensor | np.ndarray, valid: Tensor | np.ndarray | None, grid: Grid) -> tuple[Tensor, Tensor]:
-    """Frames (T, H, W) in float64 with pixels that are not valid filled in, and `valid` as (T, H, W).
+    """Return frames (T, H, W) in float64 with their invalid pixels filled in, and `valid` as (T, H, W).
 
-    Pixels that are not valid carry no weight in what is done with the frames; to fill them (`fill_bad_pixels`) keeps
-    them from spoiling means and Fourier transforms.
+    Pixels that are not valid have no weight in later fits, but means and Fourier transforms need values for them, which
+    `fill_bad_pixels` provides.
 
-    Raises ValueError if a shape is wrong, a valid pixel is not finite, or a frame holds no light.
+    Raises ValueError if a shape is wrong, a valid pixel is not finite, or a frame has no light.
     """
     frames = frames if isinstance(frames, Tensor) else torch.as_tensor(frames)  # which also moves to a default device
     if frames.ndim != 3 or tuple(frames.shape[1:]) != grid.shape or not len(frames):
         raise ValueError(
-            f"frames has shape {tuple(frames.shape)}: it must be (n_frames, {grid.shape[0]}, {grid.shape[1]}), with "
-            "at least one frame, as the grid says"
+            f"frames has shape {tuple(frames.shape)}: the grid needs (n_frames, {grid.shape[0]}, {grid.shape[1]}), "
+            "with at least one frame"
         )
     frames = frames.detach().double()
     if valid is None:
@@ -234,9 +235,9 @@ def _read_aperture(stored: Mapping[str, Any], prefix: str) -> Aperture:
 
 
 def pixel_matrix(header: Any) -> np.ndarray | None:
-    """(2, 2) from pixels (x, y) to (east, north) [rad], by CD, PC and CDELT, or CROTA and CDELT; None without.
+    """Return the matrix (2, 2) that converts pixels (x, y) to (east, north) [rad], or None if the header has none.
 
-    Axes of the sky that stand the other way round, as DEC before RA, are put in order.
+    It is read from CD, PC and CDELT, or CROTA and CDELT. Sky axes in reverse order, DEC before RA, are swapped.
     """
     with extra("data"):
         from astropy.io.fits import Header
@@ -249,22 +250,22 @@ def pixel_matrix(header: Any) -> np.ndarray | None:
         cards[name] = value
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # astropy's corrections of old-fashioned cards
+            warnings.simplefilter("ignore")  # astropy warns when it corrects old-fashioned cards
             wcs = WCS(cards, naxis=2)
-            if not all(str(unit) for unit in wcs.wcs.cunit):  # plain pixel coordinates, which say nothing of the sky
+            if not all(str(unit) for unit in wcs.wcs.cunit):  # plain pixel coordinates, not the sky
                 return None
             scale = [unit.to("rad") for unit in wcs.wcs.cunit]
             matrix = np.diag(scale) @ wcs.pixel_scale_matrix
             if wcs.wcs.lng > wcs.wcs.lat >= 0:
                 matrix = matrix[::-1].copy()
-    except (ValueError, TypeError, AttributeError, MemoryError):  # cards that make no sense, units that are no angle
+    except (ValueError, TypeError, AttributeError, MemoryError):  # senseless cards, units that are not angles
         return None
     return matrix if np.isfinite(matrix).all() and np.linalg.det(matrix) != 0 else None
 
 
 def celestial_cards(header: Any) -> dict[str, Any]:
-    """The cards of the two sky axes of a header, as they are."""
+    """Return the cards of a header's two sky axes."""
     cards = {name: header[name] for name in header if _CELESTIAL.fullmatch(name)}
     if "WCSAXES" in cards:
-        cards["WCSAXES"] = 2  # a cube's third axis is left behind
+        cards["WCSAXES"] = 2  # without a cube's third axis
     return cards

@@ -1,4 +1,4 @@
-"""Progress of a running algorithm on the terminal: one bar per stage, or a few plain lines where there is none."""
+"""Progress of a running algorithm, as one bar per stage on a terminal and as plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ _PLAIN_INTERVAL = 10.0  # seconds between the plain lines of one stage
 
 
 class Progress:
-    """A callback that shows how far each stage is, what it minimises (its first scalar), and the time left.
+    """Callback that shows the progress of each stage, the quantity it minimises (its first scalar), and the time left.
 
-    A stage is shown once it has run for `delay` seconds, so that what is quick stays silent. On a terminal it is a bar
-    of rich; elsewhere (a file, a pipe, a notebook) it is a plain line every 10 seconds and one at the end.
+    A stage is shown once it has run for `delay` seconds, so quick ones stay silent. On a terminal it is a progress bar;
+    elsewhere (a file, a pipe, a notebook) a plain line every 10 seconds and one at the end.
 
     Parameters
     ----------
     delay : float
-        [s].
+        Running time after which a stage is shown [s].
     console : rich.console.Console, optional
-        Where to write; standard error by default.
+        Console to write to; standard error by default.
 
     Examples
     --------
@@ -64,7 +64,7 @@ class Progress:
             self._print(record, f", {left:.0f} s left")
 
     def close(self, interrupted: bool = False) -> None:
-        """End the stage that is running, and give the terminal back. An interrupted stage keeps its unfilled bar."""
+        """End the current stage and release the terminal. An interrupted stage keeps its unfilled bar."""
         self._end_stage(interrupted)
         if self._bars is not None:
             self._bars.stop()
@@ -94,7 +94,7 @@ class Progress:
             self._bars.start()
         if record.stage not in self._tasks:
             self._tasks[record.stage] = self._bars.add_task(record.stage, total=record.n_steps, value="")
-        budget: dict[str, Any] = {"completed": record.step, "total": record.n_steps}  # a new start may raise it
+        budget: dict[str, Any] = {"completed": record.step, "total": record.n_steps}  # a restart may raise the budget
         self._bars.update(self._tasks[record.stage], **budget, value=_objective(record))
 
     def _print(self, record: Record, estimate: str = "") -> None:
@@ -103,7 +103,7 @@ class Progress:
         self._console.print(line, highlight=False, markup=False, soft_wrap=True)
 
     def _end_stage(self, interrupted: bool = False) -> None:
-        """Fill the bar of the stage that ran last, which may have converged before its budget was spent."""
+        """Fill the bar of the latest stage, which may have converged before its budget was used up."""
         last, self._last = self._last, None
         if last is None or self._last_time - self._started[last.stage] < self._delay:
             return

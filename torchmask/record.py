@@ -1,4 +1,4 @@
-"""What an algorithm tells the outside while it runs, to a callback, and what its results print, in a few lines."""
+"""Records that running algorithms pass to callbacks, and a short `repr` for their results."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Record:
-    """One step of a running stage.
+    """One step of a running algorithm.
 
-    stage : which algorithm is speaking, such as "design/cma" or "restoration"
-    step : iterations done so far, counted from 1 within the stage
-    n_steps : the budget, for progress bars
-    scalars : what is being minimised first, then anything else worth a curve
-    arrays : the best state so far (centres, object, coefficients), detached; enough to keep after an interruption
-    preparatory : whether this is still the look at what was asked for, before any result
+    stage : name of the algorithm, such as "design/cma" or "restoration"
+    step : number of iterations so far within the stage, from 1
+    n_steps : budget of iterations, for progress bars
+    scalars : the quantity that is minimised, then any others worth plotting
+    arrays : best state so far (centres, object, coefficients), detached; what is kept after an interruption
+    preparatory : whether the stage only prepares the run and has no result yet
     """
 
     stage: str
@@ -33,7 +33,7 @@ Callback = Callable[[Record], None]
 
 
 def fan_out(*callbacks: Callback) -> Callback:
-    """One callback that hands each record to several, such as a `RunLogger` and a `Progress`."""
+    """Return a callback that passes each record to several others, such as a `RunLogger` and a `Progress`."""
 
     def call_all(record: Record) -> None:
         for callback in callbacks:
@@ -43,15 +43,15 @@ def fan_out(*callbacks: Callback) -> Callback:
 
 
 def label_stage(callback: Callback, label: str) -> Callback:
-    """The same callback for an algorithm that runs several times: its stage, such as "fit", becomes "fit/LABEL"."""
+    """Return a callback for one of several runs of an algorithm, which renames its stage "fit" to "fit/LABEL"."""
     return lambda record: callback(replace(record, stage=f"{record.stage}/{label}"))
 
 
-_LONGEST = 60  # characters of one field that is a sequence
+_LONGEST = 60  # characters up to which a sequence is printed in full
 
 
 class Brief:
-    """A base of dataclasses (with `repr=False`) whose arrays are not printed in full.
+    """Base class for dataclasses (with `repr=False`) whose `repr` gives only the shapes of tensors.
 
     Examples
     --------

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchmask.grid import Grid
 
 PSD = Tensor | Callable[..., Tensor]
-"""A tensor broadcastable to (H, W) in FFT order, or a callable psd(grid, dtype, device) that returns one."""
+"""A tensor that broadcasts to (H, W) in FFT order, or a callable psd(grid, dtype, device) that returns one."""
 
 
 def _require_positive(name: str, value: float, unit: str, zero: bool = False) -> None:
@@ -28,11 +28,11 @@ class PowerLawPSD:
     Parameters
     ----------
     exponent : float
-        p, at least 0; between 1 and 3 for most scenes.
+        Exponent of the power law, at least 0; between 1 and 3 for most scenes.
     n_photons : float
-        Photons of the whole image, so that S_o(0) = n_photons^2 whatever the grid.
+        Number of photons in the whole image. S_o(0) = n_photons^2 on any grid.
     knee : float
-        One over the size of the object [cycles/pixel]; the PSD is flat below.
+        Frequency below which the PSD is flat, one over the size of the object [cycles/pixel].
 
     Raises
     ------
@@ -60,24 +60,24 @@ class PowerLawPSD:
     def __call__(
         self, grid: Grid, dtype: torch.dtype | None = torch.float64, device: torch.device | str | None = None
     ) -> Tensor:
-        """The PSD on the frequencies of `grid`, (H, W) in FFT order [photons^2]."""
+        """Return the PSD at the frequencies of `grid`, (H, W) in FFT order [photons^2]."""
         nu_y, nu_x = grid.frequencies(dtype, device)
         return self.n_photons**2 * (torch.hypot(nu_y, nu_x) / self.knee).clamp(min=1) ** -self.exponent
 
 
 @dataclass(frozen=True)
 class NoisePSD:
-    """PSD of photon and read-out noise, white: S_n = n_photons + (number of the detector's pixels) readout_noise^2.
+    """White PSD of photon and read-out noise: S_n = n_photons + n_pixels readout_noise^2.
 
     Parameters
     ----------
     n_photons : float
-        Photons of one exposure, summed over its pixels.
+        Number of photons in one exposure.
     readout_noise : float
-        [electrons rms per pixel].
+        Read-out noise [electrons rms per pixel].
     n_pixels : int, optional
-        That are read out, all together. None: those of the grid, which is right where the grid is the image; a grid of
-        frequencies for an integral may be finer.
+        Total number of pixels that are read out; by default that of the grid. Give it if the grid is not the image,
+        such as a finer grid for an integral over frequencies.
 
     Raises
     ------
@@ -105,7 +105,7 @@ class NoisePSD:
     def __call__(
         self, grid: Grid, dtype: torch.dtype | None = torch.float64, device: torch.device | str | None = None
     ) -> Tensor:
-        """The PSD on the frequencies of `grid`, (H, W) [photons]."""
+        """Return the PSD at the frequencies of `grid`, (H, W) [photons]."""
         n_pixels = math.prod(grid.shape) if self.n_pixels is None else self.n_pixels
         level = self.n_photons + n_pixels * self.readout_noise**2
         return torch.full(grid.shape, level, dtype=dtype, device=device)
@@ -118,14 +118,14 @@ def evaluate_psd(
     dtype: torch.dtype | None = torch.float64,
     device: torch.device | str | None = None,
 ) -> Tensor:
-    """`psd` on the frequencies of `grid` as a tensor (H, W) of its own.
+    """Evaluate `psd` at the frequencies of `grid` as a new tensor (H, W).
 
     Raises
     ------
     TypeError
-        If it is neither a tensor nor callable, or gives something else than a real floating-point tensor.
+        If it is neither a tensor nor callable, or returns something other than a real floating-point tensor.
     ValueError
-        If it does not broadcast to the grid, or holds negative or non-finite values; `name` says which PSD.
+        If it does not broadcast to the grid, or has negative or non-finite values. Messages call the PSD `name`.
     """
     value: Any = psd if isinstance(psd, Tensor) or not callable(psd) else psd(grid, dtype, device)
     if not isinstance(value, Tensor) or not value.is_floating_point():
@@ -138,18 +138,18 @@ def evaluate_psd(
             f"{name} has shape {tuple(value.shape)}: it must broadcast to the grid's {grid.shape[0]} x {grid.shape[1]}"
         ) from None
     if not bool((torch.isfinite(value) & (value >= 0)).all()):
-        raise ValueError(f"{name} holds negative or non-finite values: a PSD is finite and at least 0")
+        raise ValueError(f"{name} holds negative or non-finite values: a PSD must be finite and at least 0")
     return value
 
 
 def resample_psd(psd: Tensor, shape: tuple[int, int]) -> Tensor:
-    """`psd` (H, W) on the frequencies of a grid of `shape` with the same pixels, bilinear on the frequency torus.
+    """Interpolate `psd` (H, W) to a grid of `shape` with the same pixels, bilinearly on the frequency torus.
 
-    Exact for a white PSD; the frequencies common to both grids keep their values.
+    Frequencies common to both grids keep their values.
     """
     for axis, size in ((-2, shape[0]), (-1, shape[1])):
         old = psd.shape[axis]
-        # whole-number arithmetic: a common frequency falls exactly on itself
+        # Integer arithmetic, so that common frequencies coincide exactly.
         position = ((torch.arange(size, device=psd.device) + size // 2) % size - size // 2) * old
         lower, weight = position // size, (position % size).to(psd.dtype) / size
         if axis == -2:

@@ -1,13 +1,13 @@
-"""The log of a run: TensorBoard events, and the same in plain files that outlive it.
+"""The log of a run, as TensorBoard events and as plain files.
 
-A run folder holds
+A run folder contains
 
     events.out.tfevents...   scalars, images, figures, text and hyperparameters for TensorBoard
     metrics.jsonl            one JSON object per line: stage, step, n_steps, seconds, scalars
-    config.json              what was asked for
+    config.json              configuration of the run
     environment.json         command, seed, versions
-    status.json              running, finished, interrupted or failed, and what it came to
-    checkpoints/STAGE.npz    the last state of each stage
+    status.json              running, finished, interrupted or failed, and the conclusion
+    checkpoints/STAGE.npz    last state of each stage
     NAME.png                 figures
 """
 
@@ -37,35 +37,35 @@ from torchmask.viz.figures import stretch
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_IMAGES_PER_STAGE = 8  # of each array, and the last: TensorBoard shows 10 of a tag
+_IMAGES_PER_STAGE = 8  # of each array, besides the last one; TensorBoard shows 10 of a tag
 _SMALLEST_IMAGE = 16  # pixels on a side; smaller arrays are tables of numbers
 _CHECKPOINT_INTERVAL = 5.0  # s
-_FLUSH_INTERVAL = 10  # s, of TensorBoard's events
+_FLUSH_INTERVAL = 10  # s between writes of TensorBoard's events
 _PACKAGES = ("torch", "numpy", "scipy", "cma", "scikit-image", "kornia", "astropy", "trimesh")
 
 
 class RunLogger:
-    """Log a run to a folder of its own; a callback for every algorithm of torchmask, and for any training loop.
+    """Logger of a run to its own folder; a callback for every algorithm of torchmask and for any training loop.
 
-    Used as a context manager, it closes the log properly whatever happens, and writes how the run ended.
+    As a context manager it always closes the log properly, and records how the run ended.
 
     Parameters
     ----------
     directory : str or Path
-        The run folder, which must not exist yet.
+        Run folder, which must not exist yet.
     seed : int, optional
-        Written beside the versions.
+        Random seed of the run, to be logged.
 
     Raises
     ------
     ValueError
-        If `directory` exists (the message names a free one) or cannot be made.
+        If `directory` exists (the message suggests a free name) or cannot be created.
 
     Notes
     -----
-    `logger(record)` writes the scalars of a `Record` at every step. Two-dimensional arrays of at least 16 x 16 among
-    its arrays become images up to 8 times in a stage and at its end, and all of its arrays a checkpoint every
-    5 seconds and at the end. `writer` is the SummaryWriter, for whatever else TensorBoard can show.
+    `logger(record)` writes the scalars of a `Record` at every step. Two-dimensional arrays of at least 16 x 16 become
+    images, up to 8 times in a stage and at its end. All arrays are saved as a checkpoint every 5 seconds and at the
+    end. `writer` is the SummaryWriter, for anything else that TensorBoard can show.
 
     Examples
     --------
@@ -80,7 +80,7 @@ class RunLogger:
     """
 
     def __init__(self, directory: str | Path, *, seed: int | None = None) -> None:
-        from torch.utils.tensorboard import SummaryWriter  # before the folder is made: it may not be installed
+        from torch.utils.tensorboard import SummaryWriter  # may not be installed, so imported before the folder is made
 
         self.directory: Path = new_folder(directory)
         self._start = time.monotonic()
@@ -113,35 +113,35 @@ class RunLogger:
             self._checkpoint()
 
     def log_config(self, config: Any) -> None:
-        """Write a dataclass or mapping to config.json, as text, and as the hyperparameters of TensorBoard's HPARAMS.
+        """Log a configuration (dataclass or mapping) to config.json, as text, and as hyperparameters for HPARAMS.
 
-        There the run stands with all its scalars, those of an interrupted run too. Once per run. Raises TypeError
-        for values that JSON cannot hold, and ValueError at the second call; then nothing is written.
+        TensorBoard's HPARAMS tab lists the run with all its scalars, even if it is interrupted. Call it once per run: a
+        second call raises ValueError. Values that JSON cannot represent raise TypeError. Then nothing is written.
         """
         from torch.utils.tensorboard.summary import hparams
 
         values = to_json(config)
         write_json(self.directory / "config.json", values)
         self.text("run/config", _code_block(values))
-        # SummaryWriter.add_hparams would write a second run, and a list of hyperparameters and metrics that hides those
-        # of all later runs. Without that list TensorBoard gathers the hyperparameters and scalars of every run.
+        # Not SummaryWriter.add_hparams, which writes a second run, and a list of hyperparameters and metrics that hides
+        # those of later runs. Without that list TensorBoard collects the hyperparameters and scalars of every run.
         _, start, self._session_end = hparams(_flatten(values), {})
         self.writer._get_file_writer().add_summary(start)
 
     def scalar(self, tag: str, value: float, step: int = 0) -> None:
-        """Log one number under "group/name", such as a final score."""
+        """Log one number, such as a final score, under the tag "group/name"."""
         stage, _, name = tag.rpartition("/")
         self._write_scalars(stage or "scalars", step, {name: value})
 
     def image(self, tag: str, image: Any, step: int = 0) -> None:
-        """Log an image (H, W), stretched by `viz.stretch`. Raises ValueError for another shape."""
+        """Log an image (H, W), stretched by `viz.stretch`. Raises ValueError if it has another shape."""
         values = as_array(image)
         if values.ndim != 2:
             raise ValueError(f"image {tag} has shape {values.shape}: it must be (rows, columns)")
         self.writer.add_image(tag, (255 * stretch(values) + 0.5).astype(np.uint8), step, dataformats="HW")
 
     def figure(self, name: str, figure: Figure, step: int = 0) -> None:
-        """Log a figure, and write it to NAME.png in the run folder; a later one of that name replaces it."""
+        """Log a figure and write it to NAME.png in the run folder, replacing an earlier one of that name."""
         with extra("experiments"):
             import matplotlib.image
 
@@ -158,19 +158,19 @@ class RunLogger:
         self.writer.add_text(tag, markdown, step)
 
     def table(self, tag: str, rows: Sequence[Mapping[str, Any]], step: int = 0) -> None:
-        """Log rows, whose keys are the columns, as a table. Raises ValueError for none or for rows of other columns."""
+        """Log rows, whose keys are the columns, as a table. Raises ValueError if there is no row or columns differ."""
         columns = list(rows[0]) if rows else []
         if not columns or any(list(row) != columns for row in rows):
-            raise ValueError(f"table {tag} needs rows that all have the same columns; the first has {columns}")
+            raise ValueError(f"table {tag} needs rows that all have the same columns; the first row has {columns}")
         lines = [columns, ["---"] * len(columns), *([_cell(value) for value in row.values()] for row in rows)]
         self.text(tag, "\n".join(f"| {' | '.join(line)} |" for line in lines), step)
 
     def conclude(self, **values: Any) -> None:
-        """Say in status.json what the run came to, such as a verdict. Raises TypeError for what JSON cannot hold."""
+        """Add conclusions such as a verdict to status.json. Raises TypeError for values that JSON cannot represent."""
         self._conclusion |= to_json(values)
 
     def close(self, status: str = "finished", error: str | None = None) -> None:
-        """Write the last states and images, and how the run ended. A second call does nothing."""
+        """Write the last states and images and how the run ended. Further calls do nothing."""
         if self._closed:
             return
         self._closed = True
@@ -208,12 +208,12 @@ class RunLogger:
         self._add_charts(stage, values)
 
     def _add_charts(self, stage: str, names: Mapping[str, float]) -> None:
-        """Group the curves: a category per kind of stage, in it a chart per scalar with that of all its stages."""
+        """Group curves for CUSTOM SCALARS: a category per kind of stage, in it a chart per scalar of all its stages."""
         new = [name for name in names if (stage, name) not in self._charted]
         for name in new:
             self._charted.add((stage, name))
             self._charts.setdefault(stage.split("/")[0], {}).setdefault(name, []).append(f"{stage}/{name}")
-        if new:  # TensorBoard shows the last layout of a run
+        if new:  # TensorBoard shows only the last layout of a run
             self.writer.add_custom_scalars(
                 {
                     title: {
@@ -248,15 +248,15 @@ class RunLogger:
 
 
 def read_metrics(directory: str | Path) -> list[dict[str, Any]]:
-    """The rows of a run's metrics.jsonl; a last line that a killed run left unfinished is dropped.
+    """Return the rows of a run's metrics.jsonl, without a last line that a killed run left unfinished.
 
-    Raises ValueError if the file is missing, or another line is damaged.
+    Raises ValueError if the file is missing or another line is damaged.
     """
     path = Path(directory) / "metrics.jsonl"
     if not path.is_file():
-        raise ValueError(f"there is no file {path}: {directory} is no run folder")
+        raise ValueError(f"there is no file {path}: {directory} is not a run folder")
     *lines, rest = path.read_text(encoding="utf-8").split("\n")
-    del rest  # empty, or cut off before its end
+    del rest  # empty, or an unfinished line
     try:
         return [json.loads(line) for line in lines]
     except ValueError as error:
@@ -280,7 +280,7 @@ def _environment(seed: int | None) -> dict[str, Any]:
 
 
 def _flatten(value: Any, prefix: str = "") -> dict[str, float | str]:
-    """Leaves of nested mappings under dotted names, as hyperparameters know them: numbers and text."""
+    """Flatten nested mappings to dotted names, with numbers and text as values, as hyperparameters need them."""
     if isinstance(value, dict):
         return {name: leaf for key, item in value.items() for name, leaf in _flatten(item, f"{prefix}{key}.").items()}
     if isinstance(value, bool) or not isinstance(value, int | float | str):

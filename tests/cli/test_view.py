@@ -176,7 +176,7 @@ def test_mistakes_about_files(tmp_path, capsys):
     refused(capsys, "bad.npz", "view", tmp_path / "bad.npz")
     refused(capsys, "bad.fits", "view", tmp_path / "bad.fits")
     refused(capsys, "no mask that can be read", "view", tmp_path / "other.json")
-    refused(capsys, "no run folder", "view", tmp_path / "empty")
+    refused(capsys, "is not a run folder", "view", tmp_path / "empty")
     save_npz(tmp_path / "half.npz", {"frames": np.zeros((2, 8, 8))})
     refused(capsys, "has no centers", "view", tmp_path / "half.npz")
 

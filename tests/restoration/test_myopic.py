@@ -347,7 +347,7 @@ def test_refuses_settings(options, words, observation):
 
 def test_refuses_shapes_that_disagree(observation, restored, restoring):
     method, frames, shape = restoring(), observation.frames, observation.grid.shape
-    with pytest.raises(ValueError, match="as the grid says"):
+    with pytest.raises(ValueError, match="the grid needs"):
         method.restore(frames[:, :-2])
     with pytest.raises(ValueError, match="coefficients has shape"):
         method.restore(frames, coefficients=restored.coefficients[..., :4])
