@@ -19,9 +19,12 @@ from torchmask.grid import Grid
 from torchmask.instrument.instrument import Instrument
 from torchmask.instrument.parts import Camera, Site, Source, Telescope
 from torchmask.interferometry.calibration import MaskCalibration, calibrate_mask
+from torchmask.interferometry.companion_map import fit_pair, map_companions
 from torchmask.interferometry.fringes import frame_observables
+from torchmask.interferometry.measurements import Measurements
 from torchmask.interferometry.observables import Observables
 from torchmask.interferometry.oifits import save_oifits
+from torchmask.interferometry.oifits_reader import load_oifits
 from torchmask.interferometry.visibilities import restored_observables
 from torchmask.observation import Observation
 from torchmask.optics.aperture import FullAperture, SparseAperture
@@ -60,6 +63,7 @@ __all__ = [
     "Layers",
     "MaskCalibration",
     "MaskGeometry",
+    "Measurements",
     "MyopicDeconvolution",
     "NoisePSD",
     "Observables",
@@ -83,9 +87,12 @@ __all__ = [
     "calibrate_mask",
     "check_mask",
     "design_table",
+    "fit_pair",
     "frame_observables",
     "load_mask",
+    "load_oifits",
     "make_scene",
+    "map_companions",
     "multiframe_wiener",
     "named_layers",
     "read_observation",

@@ -37,7 +37,7 @@ def help_of(command, capsys):
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_shows_every_option(command, capsys):
     text = help_of(command, capsys)
-    positional = {"stacks", "name" if command == "masks" else "", "path" if command == "view" else ""}
+    positional = {"stacks", "files", "name" if command == "masks" else "", "path" if command == "view" else ""}
     for name, _ in leaves(options_of(command)):
         if name not in positional:
             assert f"--{name.replace('_', '-')}" in text
@@ -59,6 +59,8 @@ UNITS = {
     "imaging.outer_scale": "units of D",
     "outer_scale": r"\[m\]",
     "pixel_scale_arcsec": r"\[arcsec\]",
+    "least_arcsec": r"\[arcsec\]",
+    "most_arcsec": r"\[arcsec\]",
     "exposure_time": r"\[s\]",
     "crop": r"\[pixels\]",
     "pixel_fill": "[Pp]art of the area",

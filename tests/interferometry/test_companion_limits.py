@@ -35,7 +35,7 @@ def test_limits_are_the_scatter_of_each_annulus():
 
 
 def test_between_annuli_limits_are_linear_and_beyond_them_constant():
-    limits = DetectionLimits(np.array([0.1, 0.3]), np.array([0.02, 0.01]))
+    limits = DetectionLimits(np.array([0.1, 0.3]), np.array([0.02, 0.01]), np.array([0.002, 0.001]))
     offsets = torch.tensor([[[0.06, 0.08], [0.0, 0.25]], [[0.0, 0.0], [-3.0, 4.0]]], dtype=torch.float64) * ARCSEC
     expected = torch.tensor([[0.02, 0.0125], [0.02, 0.01]], dtype=torch.float64)
     torch.testing.assert_close(limits(offsets), expected, rtol=1e-12, atol=0)

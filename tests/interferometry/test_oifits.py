@@ -93,7 +93,8 @@ def test_the_file_says_what_was_observed(tmp_path, mask, grid, expose_points, sk
         frame = hdus["OI_ARRAY"].header["FRAME"]
         first = [hdus["OI_T3"].data[name][0] for name in ("U1COORD", "V1COORD", "U2COORD", "V2COORD")]
         data = reader.open(hdus, quiet=True)
-    assert names == ["OI_TARGET", "OI_ARRAY", "OI_WAVELENGTH", "OI_VIS", "OI_VIS2", "OI_T3"]
+    assert names == ["OI_TARGET", "OI_ARRAY", "OI_WAVELENGTH", "OI_VIS", "OI_VIS2", "OI_T3", "OI_CORR"]
+    assert rows.pop("OI_CORR") == 15 + 6 + 6
     assert rows == {"OI_TARGET": 1, "OI_ARRAY": 4, "OI_WAVELENGTH": 1, "OI_VIS": 6, "OI_VIS2": 6, "OI_T3": 4}
     assert primary["CONTENT"] == "OIFITS2"
     assert "COMMENT" not in primary

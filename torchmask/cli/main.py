@@ -15,6 +15,7 @@ COMMANDS = {
     "simulate": "draw short exposures of a scene through a mask and turbulence",
     "restore": "restore the image behind a stack of short exposures (.npz or FITS)",
     "calibrate": "measure how a mask lies, on exposures of a star",
+    "companion": "look for a companion beside a star in OIFITS files",
     "codesign": "all of it at once: design, simulate, restore, compare with a full pupil",
     "masks": "list the catalogue of masks, or show one",
     "view": "draw a mask, a stack, a result or a run, and say what it holds",

@@ -43,16 +43,18 @@ class DetectionLimits(Brief):
 
     separation : (A,) middle of each annulus [arcsec]
     contrast : (A,) flux over that of the star
+    errors : (A,) how well each contrast is known
 
     Examples
     --------
-    >>> limits = DetectionLimits(np.array([0.1, 0.3]), np.array([0.02, 0.01]))
+    >>> limits = DetectionLimits(np.array([0.1, 0.3]), np.array([0.02, 0.01]), np.array([0.002, 0.001]))
     >>> round(float(limits(torch.tensor([0.2 * ARCSEC, 0.0]))), 6)
     0.015
     """
 
     separation: np.ndarray
     contrast: np.ndarray
+    errors: np.ndarray
 
     def __call__(self, offsets: Tensor) -> Tensor:
         """Limiting contrast at offsets (..., 2) [rad], linear between annuli."""
@@ -70,6 +72,12 @@ def detection_limits(offsets: Tensor, contrast: Tensor) -> DetectionLimits:
     contrast : (M,) tensor
         What `search_companions` finds there beside a single star.
 
+    Returns
+    -------
+    DetectionLimits
+        The error of a limit is that of an rms of as many independent values as squares as wide as the annulus fit into
+        it.
+
     Examples
     --------
     >>> offsets = search_offsets(0.05)
@@ -81,4 +89,6 @@ def detection_limits(offsets: Tensor, contrast: Tensor) -> DetectionLimits:
     edges = torch.arange(_ANNULUS, float(away.max()) + _ANNULUS / 2, _ANNULUS, dtype=torch.float64)
     rings = [(away >= low - _REACH) & (away < low + _ANNULUS + _REACH) for low in edges[:-1]]
     rms = [SIGNIFICANCE * float(contrast[ring].square().mean().sqrt()) for ring in rings]
-    return DetectionLimits((edges[:-1] + _ANNULUS / 2).numpy(), np.array(rms))
+    middles = (edges[:-1] + _ANNULUS / 2).numpy()
+    independent = 2 * math.pi * middles / _ANNULUS  # squares as wide as the annulus
+    return DetectionLimits(middles, np.array(rms), np.array(rms) / np.sqrt(2 * independent))

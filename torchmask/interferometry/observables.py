@@ -16,9 +16,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from torchmask.interferometry.measurements import SAME, Measurements, correlation
 from torchmask.record import Brief
-
-_SAME_LENGTH = 1e-3  # of baselines of one mask, which lies otherwise on the sky from one star to the next
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -78,6 +77,25 @@ class Observables(Brief):
         """(B, 2) (u, v) of each pair [m]."""
         return self.stations[self.pairs[:, 1]] - self.stations[self.pairs[:, 0]]
 
+    def measurements(self, wavelength: float) -> Measurements:
+        """What of these a model of the object is compared with, as `load_oifits` reads it from a file.
+
+        Raises ValueError if the wavelength [m] or an error is not positive.
+        """
+        first, second, third = (self.stations[self.triangles[:, side]] for side in range(3))
+        return Measurements(
+            baselines=self.baselines,
+            wavelengths=torch.full_like(self.vis2, wavelength),
+            vis2=self.vis2,
+            vis2_errors=self.vis2_errors,
+            vis2_correlation=correlation(self.vis2_covariance),
+            triangles=torch.stack([second - first, third - second], 1),
+            triangle_wavelengths=torch.full_like(self.closure_phases, wavelength),
+            closure_phases=self.closure_phases,
+            closure_errors=self.closure_errors,
+            closure_correlation=correlation(self.closure_covariance),
+        )
+
     def calibrate(self, star: Observables) -> Observables:
         """These, divided by those of a star that is a point: what lowers the contrast of both alike drops out.
 
@@ -134,7 +152,7 @@ class Observables(Brief):
     def _require_same_mask(self, star: Observables) -> None:
         lengths = [torch.linalg.vector_norm(each.baselines, dim=1) for each in (self, star)]
         same = torch.equal(self.pairs, star.pairs) and torch.equal(self.triangles, star.triangles)
-        if not (same and torch.allclose(*lengths, rtol=_SAME_LENGTH, atol=0)):
+        if not (same and torch.allclose(*lengths, rtol=SAME, atol=0)):
             raise ValueError(
                 f"the star was seen through another mask: its {len(star.stations)} holes and the "
                 f"{len(self.stations)} of the object must be the same, in the same order"

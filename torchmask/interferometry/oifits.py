@@ -17,17 +17,19 @@ from torch import Tensor
 
 from torchmask.grid import ARCSEC
 from torchmask.interferometry.observables import Observables
+from torchmask.interferometry.oifits_correlations import correlation_triplets
 from torchmask.io import as_array, atomic_write, extra
 from torchmask.observation import Observation
 from torchmask.optics.band import filter_of_header
 
 _ARRAY = "MASK"
+_CORRELATIONS = "MASK"
 
 
 def save_oifits(
     path: str | Path, observables: Observables, observation: Observation, bandwidth: float | None = None
 ) -> None:
-    """Write OI_TARGET, OI_ARRAY, OI_WAVELENGTH, OI_VIS, OI_VIS2 and OI_T3 to a new OIFITS file.
+    """Write OI_TARGET, OI_ARRAY, OI_WAVELENGTH, OI_VIS, OI_VIS2, OI_T3 and OI_CORR to a new OIFITS file.
 
     Parameters
     ----------
@@ -91,7 +93,7 @@ def save_oifits(
     hdus.append(_array(observables, observation))
     wave = {"EFF_WAVE": ("1E", "m", [observation.grid.wavelength]), "EFF_BAND": ("1E", "m", [bandwidth])}
     hdus.append(_table("OI_WAVELENGTH", {"INSNAME": common["INSNAME"]}, wave))
-    for table in _measurements(observables, common, mjd, seconds):
+    for table in [*_measurements(observables, common, mjd, seconds), _correlations(observables)]:
         hdus.append(table)
     content = BytesIO()  # astropy does not know the mode that atomic_write opens files in
     hdus.writeto(content, checksum=True)
@@ -112,10 +114,11 @@ def _measurements(observables: Observables, common: Mapping[str, str], mjd: floa
         "VISPHIERR": ("1D", "deg", (errors / values.abs()).rad2deg()),
     }
     vis2 = {"VIS2DATA": ("1D", None, observables.vis2), "VIS2ERR": ("1D", None, observables.vis2_errors)}
-    absolute = {"AMPTYP": "absolute", "PHITYP": "absolute"}
+    absolute, correlated = {"AMPTYP": "absolute", "PHITYP": "absolute"}, {**common, "CORRNAME": _CORRELATIONS}
+    n, first = len(pairs), len(pairs) + len(triangles)  # data that stand before those of a table in OI_CORR
     tables = [
         _table("OI_VIS", {**common, **absolute}, _rows(vis, uv, pairs, mjd, seconds)),
-        _table("OI_VIS2", common, _rows(vis2, uv, pairs, mjd, seconds)),
+        _table("OI_VIS2", correlated, _rows(vis2, uv | _places_of("VIS2DATA", 0, n), pairs, mjd, seconds)),
     ]
     if len(triangles):
         i, j, k = (observables.stations[triangles[:, side]] for side in range(3))
@@ -127,8 +130,23 @@ def _measurements(observables: Observables, common: Mapping[str, str], mjd: floa
             "T3PHIERR": ("1D", "deg", observables.closure_errors.rad2deg()),
         }
         places = {name: ("1D", "m", side) for name, side in sides.items()}
-        tables.append(_table("OI_T3", common, _rows(t3, places, triangles, mjd, seconds)))
+        places |= _places_of("T3AMP", n, len(triangles)) | _places_of("T3PHI", first, len(triangles))
+        tables.append(_table("OI_T3", correlated, _rows(t3, places, triangles, mjd, seconds)))
     return tables
+
+
+def _places_of(name: str, before: int, count: int) -> dict[str, Any]:
+    """The column that says where data stand in OI_CORR."""
+    return {f"CORRINDX_{name}": ("1J", None, np.arange(before + 1, before + 1 + count, dtype=np.int32))}
+
+
+def _correlations(observables: Observables) -> Any:
+    """OI_CORR of |V|^2, triple amplitudes and closure phases."""
+    covariances = (observables.vis2_covariance, observables.triple_covariance, observables.closure_covariance)
+    i, j, values = correlation_triplets(covariances)
+    columns = {"IINDX": ("1J", None, i), "JINDX": ("1J", None, j), "CORR": ("1D", None, values)}
+    cards = {"CORRNAME": _CORRELATIONS, "NDATA": sum(map(len, covariances))}
+    return _table("OI_CORR", {**cards, "OI_REVN": 1}, columns)
 
 
 def _rows(
@@ -170,7 +188,7 @@ def _table(name: str, cards: Mapping[str, Any], columns: Mapping[str, tuple[str,
         ],
         name=name,
     )
-    for card, value in {"OI_REVN": 2, **cards}.items():
+    for card, value in {"OI_REVN": 2, **cards}.items():  # the newest revision of most tables
         table.header[card] = value
     return table
 

@@ -1,0 +1,91 @@
+"""`torchmask companion`: what it finds, writes and refuses."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from torchmask.cli.main import main
+from torchmask.grid import ARCSEC, MAS, Grid
+from torchmask.interferometry.fringes import frame_observables
+from torchmask.interferometry.oifits import save_oifits
+from torchmask.observation import Observation
+from torchmask.optics.aperture import SparseAperture
+
+pytest.importorskip("astropy.io.fits")
+
+MASK = SparseAperture([[0.0, 0.42], [0.38, -0.2], [-0.4, -0.15], [0.1, -0.05], [-0.2, 0.28]], 0.1, 1.0)
+GRID = Grid.nyquist(MASK.extent, 550e-9, 48, 1.1)
+
+
+@pytest.fixture
+def write(tmp_path, expose_points):
+    def write(name, stars, seed):
+        frames = expose_points(MASK, GRID, stars, electrons=1e6, n_frames=8)
+        observation = Observation(torch.poisson(frames, torch.Generator().manual_seed(seed)), MASK, GRID, 0.0)
+        save_oifits(tmp_path / name, frame_observables(observation), observation, bandwidth=1e-8)
+        return tmp_path / name
+
+    return write
+
+
+def run(*arguments):
+    return main(["companion", *map(str, arguments)])
+
+
+def test_a_companion_is_found_beside_its_star_and_none_beside_another(write, tmp_path, capsys):
+    binary = write("binary.oifits", ((0, 0, 1), (-1.8, 1.2, 0.05)), 1)
+    star, other = write("star.oifits", ((0, 0, 1),), 2), write("other.oifits", ((0, 0, 1),), 3)
+    assert run(binary, "--star", star, "--out", tmp_path / "found") == 0
+    found = json.loads((tmp_path / "found/companion.json").read_text())
+    companion, errors = found["companion"], found["companion"]["errors"]
+    assert found["detected"]
+    assert found["side_known"]
+    # without sky coordinates east runs along the columns and north along the rows
+    separation = float(np.hypot(1.8, 1.2)) * GRID.pixel_scale / MAS
+    angle = float(np.degrees(np.arctan2(-1.8, 1.2))) % 360
+    # 5 % for what a hole's diffraction pattern dims, as far as errors allow
+    assert abs(companion["separation"] - separation) < 4 * errors["separation"] + 0.02 * separation
+    assert abs(companion["position_angle"] - angle) < 4 * errors["position_angle"] + 1
+    assert abs(companion["contrast"] - 0.05) < 4 * companion["contrast_error"] + 0.05 * 0.05
+    with np.load(tmp_path / "found/companion.npz") as stored:
+        best = stored["offsets"][stored["significance"].argmax()] / GRID.pixel_scale
+    assert np.abs(best - [-1.8, 1.2]).max() < 0.3
+    assert (tmp_path / "found/companion.png").read_bytes().startswith(b"\x89PNG")
+    assert "a companion of 0.0" in capsys.readouterr().out
+    assert run(other, "--star", star, "--closures-only", "--out", tmp_path / "none") == 0
+    assert not json.loads((tmp_path / "none/companion.json").read_text())["detected"]
+    assert "no companion above 5 standard errors" in capsys.readouterr().out
+
+
+def test_bounds_are_in_arcsec(write, tmp_path):
+    star = write("star.oifits", ((0, 0, 1),), 2)
+    wide = ("--least-arcsec", "0.1", "--most-arcsec", "0.3")
+    assert run(star, *wide, "--out", tmp_path / "run") == 0
+    with np.load(tmp_path / "run/companion.npz") as stored:
+        away = np.linalg.norm(stored["offsets"], axis=1) / ARCSEC
+    assert 0.1 < away.min() < 0.12
+    assert 0.28 < away.max() < 0.3
+
+
+def test_a_mistake_is_one_line_and_nothing_is_written(write, tmp_path, capsys):
+    star = write("star.oifits", ((0, 0, 1),), 2)
+    text = tmp_path / "text.fits"
+    text.write_text("no FITS")
+    for arguments, message in (
+        ((), "there is nothing to look at: give OIFITS files"),
+        ((tmp_path / "none.fits",), "there is no file"),
+        ((text,), "is no OIFITS file"),
+        ((star, star, star, "--star", star, star), "--star names 2 files for 3 of the object"),
+        (
+            (star, "--least-arcsec", "0.3", "--most-arcsec", "0.1"),
+            "--least-arcsec, --most-arcsec: separations from 0.3",
+        ),
+        ((star, "--target", "moon"), "no target 'moon': it holds UNKNOWN"),
+    ):
+        assert run(*arguments, "--out", tmp_path / "run") == 1
+        err = capsys.readouterr().err
+        assert message in err
+        assert err.count("\n") == 1
+        assert not (tmp_path / "run").exists()

@@ -1,0 +1,141 @@
+"""Companions in squared visibilities and closure phases: found where they are, with errors and limits that hold."""
+
+import math
+
+import pytest
+import torch
+
+from torchmask.grid import Grid
+from torchmask.interferometry.companion_map import fit_pair, map_companions, raster
+from torchmask.interferometry.fringes import frame_observables
+from torchmask.interferometry.measurements import join
+from torchmask.observation import Observation
+from torchmask.optics.aperture import SparseAperture
+
+TRUTH = torch.tensor([0.08, 1.1e-7 * 4, -0.6e-7 * 4], dtype=torch.float64)
+SEEDS = 60
+
+
+def pull_statistics(pulls):
+    """Mean in units of its standard error, and the variance's distance from 1 in units of its own."""
+    n = len(pulls)
+    return pulls.mean(0) * math.sqrt(n), (pulls.var(0) - 1) / math.sqrt(2 / n)
+
+
+@pytest.mark.parametrize("contrast", [0.02, 0.6, 0.95])
+def test_without_noise_the_companion_is_found_exactly(contrast, measure_pair):
+    truth = torch.cat([torch.tensor([contrast], dtype=torch.float64), TRUTH[1:]])
+    seen = measure_pair(truth)
+    found = map_companions(seen)
+    best = found.best
+    assert torch.linalg.vector_norm(best[1:] - truth[1:]) < seen.finest / 8
+    fit = fit_pair(seen, best)
+    assert fit.companion[0] == pytest.approx(contrast, rel=1e-6)
+    torch.testing.assert_close(fit.companion[1:], truth[1:], rtol=1e-5, atol=0)
+    assert fit.chi_square < 1e-9
+
+
+def test_the_errors_are_those_that_occur(measure_pair):
+    pulls, chi_squares = [], []
+    for seed in range(SEEDS):
+        fit = fit_pair(measure_pair(TRUTH, seed), TRUTH)
+        pulls.append((fit.companion - TRUTH) @ torch.linalg.inv(torch.linalg.cholesky(fit.covariance)).T)
+        chi_squares.append(fit.chi_square)
+    mean, variance = pull_statistics(torch.stack(pulls))
+    # errors grow with a chi-square above its expectation, by a few percent on average
+    assert mean.abs().max() < 4
+    assert (variance + 1.0).abs().max() < 4
+    expected = fit.degrees_of_freedom
+    assert expected == 22
+    scatter = math.sqrt(2 * expected / SEEDS)
+    assert abs(sum(chi_squares) / SEEDS - expected) < 4 * scatter
+
+
+def test_errors_that_were_told_too_small_grow_with_what_is_left(measure_pair):
+    pulls = []
+    for seed in range(SEEDS):
+        fit = fit_pair(measure_pair(TRUTH, seed, told=0.3), TRUTH)
+        pulls.append((fit.companion - TRUTH) / fit.covariance.diagonal().sqrt())
+    mean, variance = pull_statistics(torch.stack(pulls))
+    assert mean.abs().max() < 4
+    # Student's t of 22 degrees of freedom has a variance of 22/20, and a kurtosis of 6/18
+    assert (variance * math.sqrt(2 / SEEDS) + 1 - 1.1).abs().max() < 4 * 1.1 * math.sqrt((2 + 6 / 18) / SEEDS)
+
+
+def test_a_star_alone_is_as_significant_as_chance(measure_pair):
+    place = TRUTH[None, 1:]
+    maps = [map_companions(measure_pair(seed=seed), place) for seed in range(SEEDS)]
+    pulls = torch.cat([found.contrast / found.errors for found in maps])
+    mean, variance = pull_statistics(pulls)
+    assert abs(mean) < 4
+    assert variance < 4  # errors count what chance leaves above the expectation
+    assert variance > -4 - 0.15 / math.sqrt(2 / SEEDS)
+    linear = torch.cat([found.significance for found in maps])
+    assert torch.allclose(linear, pulls, atol=0.15, rtol=0.15)
+
+
+def test_a_companion_at_the_limit_is_found_at_the_significance_of_the_limit(measure_pair):
+    limits = map_companions(measure_pair(seed=1000, rms=0.01)).limits(2 * measure_pair().finest)
+    assert (limits.errors > 0).all()
+    contrast = limits(TRUTH[1:])[None]
+    truth = torch.cat([contrast.double(), TRUTH[1:]])
+    found = [map_companions(measure_pair(truth, seed), TRUTH[None, 1:]) for seed in range(SEEDS)]
+    significance = torch.cat([each.contrast / each.errors for each in found])
+    # 5 of them, as far as the limit of the ring is that of this place and its own chance allows
+    slack = 5 * float(limits.errors[0] / limits.contrast[0])
+    assert abs(float(significance.mean()) - 5) < slack + 4 / math.sqrt(SEEDS)
+    assert float(significance.mean()) > 4
+
+
+def test_closure_phases_alone_and_several_observations(measure_pair):
+    one, other = measure_pair(TRUTH, 1), measure_pair(TRUTH, 2)
+    alone, both = fit_pair(one, TRUTH), fit_pair(join([one, other]), TRUTH)
+    closures = fit_pair(one.closures_only(), TRUTH)
+    assert closures.degrees_of_freedom == 10 - 3
+    assert both.degrees_of_freedom == 2 * 25 - 3
+    assert closures.covariance[0, 0] > alone.covariance[0, 0] > both.covariance[0, 0]
+    assert (closures.companion - TRUTH).abs().div(closures.covariance.diagonal().sqrt()).max() < 4
+
+
+def test_a_companion_in_front_of_a_mask_is_found_after_calibration(expose_points):
+    # Frames of a binary and of a star, divided; a hole's diffraction pattern dims what is away from the middle.
+    mask = SparseAperture([[0.0, 0.42], [0.38, -0.2], [-0.4, -0.15], [0.1, -0.05], [-0.2, 0.28], [0.3, 0.22]], 0.1, 1.0)
+    grid = Grid.nyquist(mask.extent, 550e-9, 48, 1.1)
+    generator = torch.Generator().manual_seed(3)
+
+    def observe(stars):
+        frames = torch.poisson(expose_points(mask, grid, stars, electrons=1e6, n_frames=12), generator)
+        return frame_observables(Observation(frames, mask, grid, 0.0)).measurements(grid.wavelength)
+
+    seen = observe(((0, 0, 1), (1.8, -1.2, 0.05))).calibrate(observe(((0, 0, 1),)))
+    truth = torch.tensor([0.05, 1.8 * grid.pixel_scale, -1.2 * grid.pixel_scale], dtype=torch.float64)
+    fit = fit_pair(seen, map_companions(seen).best)
+    errors = fit.covariance.diagonal().sqrt()
+    assert fit.significance > 10
+    # dimmed by 2 to 3 %, and moved by a hundredth, which the fringes' envelopes take up
+    assert (fit.companion - truth).abs()[0] < 4 * errors[0] + 0.05 * truth[0]
+    assert ((fit.companion - truth).abs() < 4 * errors + 0.02 * truth.abs())[1:].all()
+    nothing = observe(((0, 0, 1),)).calibrate(observe(((0, 0, 1),)))
+    assert fit_pair(nothing, map_companions(nothing).best).significance < 5
+
+
+def test_what_cannot_be_is_refused(measure_pair):
+    seen = measure_pair(TRUTH)
+    with pytest.raises(ValueError, match=r"from 0\.3 to 0\.2 arcsec: the first must"):
+        raster(seen, 0.3 * math.pi / 648000, 0.2 * math.pi / 648000)
+    with pytest.raises(ValueError, match="no place lies between"):
+        raster(seen, 0.0, 1e-12)
+    few = seen.closures_only()
+    two = type(seen)(
+        *(few.baselines, few.wavelengths, few.vis2, few.vis2_errors, None, few.triangles[:2]),
+        *(few.triangle_wavelengths[:2], few.closure_phases[:2], few.closure_errors[:2], None),
+    )
+    with pytest.raises(ValueError, match="2 independent numbers were measured"):
+        map_companions(two)
+    line = torch.tensor([[1.0, 0.0]], dtype=torch.float64) * torch.arange(1, 6, dtype=torch.float64)[:, None]
+    flat = type(seen)(
+        *(line, seen.wavelengths[:5], seen.vis2[:5], seen.vis2_errors[:5], None, few.triangles[:0]),
+        *(few.wavelengths, few.closure_phases[:0], few.closure_errors[:0], None),
+    )
+    with pytest.raises(ValueError, match="baselines in more than one direction"):
+        fit_pair(flat, TRUTH)

@@ -1,0 +1,64 @@
+"""Lists of measurements: calibration against the observables' own, joining, and what cannot be."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from torchmask.grid import Grid
+from torchmask.interferometry.fringes import frame_observables
+from torchmask.interferometry.measurements import join
+from torchmask.observation import Observation
+from torchmask.optics.aperture import SparseAperture
+
+MASK = SparseAperture([[0.0, 0.42], [0.38, -0.2], [-0.4, -0.15], [0.1, -0.05]], 0.1, 1.0)
+GRID = Grid.nyquist(MASK.extent, 550e-9, 48, 1.1)
+
+
+@pytest.fixture(scope="module")
+def observe(expose_points):
+    def observe(seed, stars=((0, 0, 1),)):
+        frames = expose_points(MASK, GRID, stars, electrons=1e5, n_frames=4)
+        drawn = torch.poisson(frames, torch.Generator().manual_seed(seed))
+        return frame_observables(Observation(drawn, MASK, GRID, 0.0))
+
+    return observe
+
+
+def test_calibration_is_that_of_the_observables(observe):
+    seen, star = observe(0, ((0, 0, 1), (2, 1, 0.3))), observe(1)
+    one = seen.calibrate(star).measurements(GRID.wavelength)
+    other = seen.measurements(GRID.wavelength).calibrate(star.measurements(GRID.wavelength))
+    for field in dataclasses.fields(one):
+        torch.testing.assert_close(getattr(other, field.name), getattr(one, field.name), msg=field.name)
+
+
+def test_those_of_different_nights_are_independent(observe):
+    seen = observe(0).measurements(GRID.wavelength)
+    both = join([seen, seen])
+    assert both.vis2.shape == (12,)
+    torch.testing.assert_close(both.vis2_correlation[:6, :6], seen.vis2_correlation)
+    assert not both.closure_correlation[:4, 4:].any()
+    assert both.finest == seen.finest == pytest.approx(1 / float(seen.frequencies.norm(dim=1).max()))
+    sides = seen.triangle_frequencies
+    assert sides.sum(1).abs().max() < 1e-9 * sides.abs().max()
+    alone = join([seen.closures_only(), dataclasses.replace(seen, closure_correlation=None).closures_only()])
+    torch.testing.assert_close(alone.closure_correlation[4:, 4:], torch.eye(4, dtype=torch.float64))
+
+
+def test_what_cannot_be_is_refused(observe):
+    seen = observe(0).measurements(GRID.wavelength)
+    with pytest.raises(ValueError, match=r"wavelengths holds 0: all must be positive"):
+        observe(0).measurements(0.0)
+    with pytest.raises(ValueError, match=r"vis2 holds values that are not finite"):
+        dataclasses.replace(seen, vis2=seen.vis2 * torch.nan)
+    with pytest.raises(ValueError, match=r"baselines has shape \(5, 2\): it must be \(6, 2\)"):
+        dataclasses.replace(seen, baselines=seen.baselines[:5])
+    with pytest.raises(ValueError, match="the star was seen otherwise: its 0 baselines and 4 triangles"):
+        seen.calibrate(seen.closures_only())
+    with pytest.raises(ValueError, match="the star was seen otherwise"):
+        seen.calibrate(observe(0).measurements(1.01 * GRID.wavelength))
+    with pytest.raises(ValueError, match="shows no fringes on 6 of 6 baselines"):
+        seen.calibrate(dataclasses.replace(seen, vis2=-seen.vis2))
+    with pytest.raises(ValueError, match="measurements is empty"):
+        join([])

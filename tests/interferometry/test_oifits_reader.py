@@ -1,0 +1,173 @@
+"""OIFITS files read back: this library's own, and files that another program has written."""
+
+import dataclasses
+import datetime
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from torchmask.grid import Grid
+from torchmask.interferometry.fringes import frame_observables
+from torchmask.interferometry.oifits import save_oifits
+from torchmask.interferometry.oifits_reader import load_oifits
+from torchmask.observation import Observation
+from torchmask.optics.aperture import SparseAperture
+
+package = pytest.importorskip("oifits")
+fits = pytest.importorskip("astropy.io.fits")
+
+MASK = SparseAperture([[0.0, 0.42], [0.38, -0.2], [-0.4, -0.15], [0.1, -0.05]], 0.1, 1.0)
+GRID = Grid.nyquist(MASK.extent, 550e-9, 48, 1.1)
+
+
+@pytest.fixture
+def observables(expose_points):
+    frames = torch.poisson(expose_points(MASK, GRID, electrons=1e5, n_frames=8), torch.Generator().manual_seed(0))
+    observation = Observation(frames, MASK, GRID, 0.0)
+    return frame_observables(observation), observation
+
+
+def test_what_was_written_is_read_back(tmp_path, observables):
+    seen, observation = observables
+    save_oifits(tmp_path / "a.fits", seen, observation, bandwidth=1e-8)
+    read, expected = load_oifits(tmp_path / "a.fits"), seen.measurements(GRID.wavelength)
+    for field in dataclasses.fields(expected):
+        # EFF_WAVE has single precision in the standard
+        tolerance = 1e-7 if "wavelength" in field.name else 1e-12
+        values = getattr(read, field.name), getattr(expected, field.name)
+        torch.testing.assert_close(*values, rtol=tolerance, atol=1e-12, msg=field.name)
+
+
+def test_the_package_reads_the_same_correlations(tmp_path, observables):
+    seen, observation = observables
+    save_oifits(tmp_path / "a.fits", seen, observation, bandwidth=1e-8)
+    with fits.open(tmp_path / "a.fits") as hdus:
+        assert hdus["OI_CORR"].header["NDATA"] == 6 + 4 + 4
+        data = package.open(hdus, quiet=True)
+    assert data.isvalid()
+    assert data.isconsistent()
+    corr = data.corr["MASK"]
+    assert (corr.iindx < corr.jindx).all()
+    matrix = np.eye(14)
+    matrix[corr.iindx - 1, corr.jindx - 1] = matrix[corr.jindx - 1, corr.iindx - 1] = corr.corr
+    for rows, name, covariance in (
+        (data.vis2, "corrindx_vis2data", seen.vis2_covariance),
+        (data.t3, "corrindx_t3phi", seen.closure_covariance),
+        (data.t3, "corrindx_t3amp", seen.triple_covariance),
+    ):
+        places = np.array([int(getattr(row, name)) for row in rows]) - 1
+        scale = covariance.diagonal().rsqrt()
+        expected = covariance * scale[:, None] * scale
+        np.testing.assert_allclose(matrix[np.ix_(places, places)], expected, atol=1e-12)
+    assert abs(matrix - np.eye(14)).max() > 0.1
+
+
+def interferometer(revision=1):
+    """Two targets, three wavelengths, four telescopes, two times: in the order of the package's own classes."""
+    data = package.oifits()
+    wave = package.OI_WAVELENGTH(np.array([1.6e-6, 1.7e-6, 1.8e-6]), np.full(3, 5e-8), revision=revision)
+    data.wavelength = {"PIONIER": wave}
+    places = np.array([[0.0, 0.0], [40.0, 5.0], [10.0, 60.0], [-30.0, 20.0]])
+    stations = [
+        {"TEL_NAME": f"U{n}", "STA_NAME": f"U{n}", "STA_INDEX": n, "DIAMETER": 8.0, "STAXYZ": [x, y, 0.0]}
+        for n, (x, y) in enumerate(places, 1)
+    ]
+    array = package.OI_ARRAY("GEOCENTRIC", (1.0, 1.0, 1.0), stations, revision=1)
+    data.array = {"VLTI": array}
+    targets = [package.OI_TARGET(name, 10.0, 20.0, revision=revision) for name in ("star", "binary")]
+    data.target = np.array(targets)
+    vis2, t3 = [], []
+    for number, target in enumerate(targets):
+        for hour in range(2):
+            time = datetime.datetime(2024, 1, 1, hour)
+            common = {"timeobs": time, "int_time": 60.0, "wavelength": wave, "target": target, "array": array}
+            for i, j in ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)):
+                u, v = places[j] - places[i]
+                flag = np.array([False, hour == 1 and (i, j) == (0, 1), False])
+                values = np.array([0.5, 0.6, 0.7]) + 0.1 * number
+                vis2.append(
+                    package.OI_VIS2(
+                        vis2data=values,
+                        vis2err=np.full(3, 0.01),
+                        flag=flag,
+                        ucoord=u,
+                        vcoord=v,
+                        station=[array.station[i], array.station[j]],
+                        revision=revision,
+                        **common,
+                    )
+                )
+            for i, j, k in ((0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3)):
+                (u1, v1), (u2, v2) = places[j] - places[i], places[k] - places[j]
+                error = np.array([1.0, 1.0, math.nan if hour == 0 and k == 2 else 2.0])
+                t3.append(
+                    package.OI_T3(
+                        t3amp=np.ones(3),
+                        t3amperr=np.ones(3),
+                        t3phi=np.array([10.0, 20.0, 180.0 * number]),
+                        t3phierr=error,
+                        flag=np.zeros(3, bool),
+                        u1coord=u1,
+                        v1coord=v1,
+                        u2coord=u2,
+                        v2coord=v2,
+                        station=[array.station[n] for n in (i, j, k)],
+                        revision=revision,
+                        **common,
+                    )
+                )
+    data.vis2, data.t3 = np.array(vis2), np.array(t3)
+    return data
+
+
+@pytest.mark.parametrize("revision", [1, 2])
+def test_a_file_of_a_spectrograph_on_telescopes(revision, tmp_path, recwarn):
+    path = tmp_path / "pionier.fits"
+    interferometer(revision).save(str(path))
+    with pytest.raises(ValueError, match=r"several targets: say which of star, binary is meant"):
+        load_oifits(path)
+    with pytest.raises(ValueError, match=r"no target 'moon': it holds star, binary"):
+        load_oifits(path, "moon")
+    seen = load_oifits(path, "binary")
+    # two times of six baselines and four triangles at three wavelengths, one flagged, one without error
+    assert seen.vis2.shape == (2 * 6 * 3 - 1,)
+    assert seen.closure_phases.shape == (2 * 4 * 3 - 1,)
+    torch.testing.assert_close(seen.vis2[:3], torch.tensor([0.6, 0.7, 0.8], dtype=torch.float64))
+    assert seen.wavelengths[:3].tolist() == pytest.approx([1.6e-6, 1.7e-6, 1.8e-6], rel=1e-7)
+    torch.testing.assert_close(seen.baselines[3], torch.tensor([10.0, 60.0], dtype=torch.float64))
+    assert seen.triangles[0].flatten().tolist() == [40.0, 5.0, -30.0, 55.0]
+    assert seen.closure_phases[:3].tolist() == pytest.approx([math.radians(10), math.radians(20), math.radians(10)])
+    assert seen.vis2_correlation is None
+    # triangles 0-1-2, 0-1-3, 0-2-3, 1-2-3 of the first time and wavelength; no other shares a baseline with them
+    correlation = seen.closure_correlation
+    ours = [0, 2, 5, 8]
+    expected = torch.tensor([[3, 1, -1, 1], [1, 3, 1, -1], [-1, 1, 3, 1], [1, -1, 1, 3]], dtype=torch.float64) / 3
+    torch.testing.assert_close(correlation[ours][:, ours], expected)
+    others = [n for n in range(len(correlation)) if n not in ours]
+    assert not correlation[ours][:, others].any()
+    assert int((torch.linalg.eigvalsh(expected) > 1e-9).sum()) == 3
+
+
+def test_what_is_no_oifits_is_refused(tmp_path, observables):
+    with pytest.raises(ValueError, match=r"there is no file .*none\.fits"):
+        load_oifits(tmp_path / "none.fits")
+    (tmp_path / "text.fits").write_text("no FITS at all")
+    with pytest.raises(ValueError, match=r"text\.fits is no OIFITS file, or is damaged"):
+        load_oifits(tmp_path / "text.fits")
+    fits.PrimaryHDU(np.zeros((4, 4))).writeto(tmp_path / "image.fits")
+    with pytest.raises(ValueError, match=r"image\.fits holds no squared visibility and no closure phase"):
+        load_oifits(tmp_path / "image.fits")
+    seen, observation = observables
+    save_oifits(tmp_path / "a.fits", seen, observation, bandwidth=1e-8)
+    with fits.open(tmp_path / "a.fits") as hdus:
+        kept = [hdu.copy() for hdu in hdus if hdu.name != "OI_WAVELENGTH"]
+        fits.HDUList(kept).writeto(tmp_path / "b.fits")
+        hdus["OI_VIS2"].data["FLAG"] = True
+        hdus["OI_T3"].data["FLAG"] = True
+        hdus.writeto(tmp_path / "c.fits")
+    with pytest.raises(ValueError, match=r"OI_VIS2 is of UNKNOWN, for which there is no OI_WAVELENGTH"):
+        load_oifits(tmp_path / "b.fits")
+    with pytest.raises(ValueError, match=r"holds no squared visibility and no closure phase"):
+        load_oifits(tmp_path / "c.fits")

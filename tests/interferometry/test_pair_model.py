@@ -1,0 +1,41 @@
+"""A star and its companion as visibilities: closed form, and residuals whose covariance is 1."""
+
+import math
+
+import numpy as np
+import torch
+from torch.autograd import gradcheck
+from torch.autograd.functional import jacobian
+
+from torchmask.interferometry.pair_model import PairResiduals, pair_visibilities
+
+
+def test_the_closed_form_of_another_hand(binary):
+    pair = binary(3e-7, -1e-7, 0.2)
+    baselines = 4 * np.random.default_rng(0).standard_normal((7, 2))
+    found = pair_visibilities(torch.as_tensor(baselines) / 2e-6, torch.tensor([0.2, 3e-7, -1e-7], dtype=torch.float64))
+    np.testing.assert_allclose(found.numpy(), pair.visibilities(baselines, 2e-6), rtol=1e-12)
+
+
+def test_residuals_differentiate(measure_pair):
+    truth = torch.tensor([0.3, 8e-8, -5e-8], dtype=torch.float64)
+    problem = PairResiduals(measure_pair(truth, seed=0))
+    for contrast in (0.0, 0.2):
+        scaled = torch.tensor([contrast, 0.4, -0.2], dtype=torch.float64, requires_grad=True)
+        assert gradcheck(lambda x: problem.residuals(x * problem.unit), scaled)
+        at = (scaled * problem.unit).detach()
+        torch.testing.assert_close(problem.slopes(at), -jacobian(problem.residuals, at))
+
+
+def test_residuals_of_noise_are_independent_and_of_variance_one(measure_pair):
+    # 15 squared visibilities, and of 20 closure phases only 10 that are independent
+    n = 400
+    none = torch.zeros(3, dtype=torch.float64)
+    problems = [PairResiduals(measure_pair(seed=seed)) for seed in range(n)]
+    draws = torch.stack([problem.residuals(none) for problem in problems])
+    assert draws.shape == (n, 25)
+    covariance = draws.T @ draws / n
+    away = (covariance - torch.eye(25)).abs()
+    # variances scatter by sqrt(2/n), covariances by 1/sqrt(n); 25 and 300 of them stay below 4.5 of it
+    assert away.diagonal().max() < 4.5 * math.sqrt(2 / n)
+    assert (away - away.diagonal().diag()).max() < 4.5 / math.sqrt(n)

@@ -1,0 +1,142 @@
+"""`torchmask companion`: a companion beside a star, from squared visibilities and closure phases."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+
+from torchmask.cli.options import RunOptions
+from torchmask.cli.run import new_run
+from torchmask.grid import ARCSEC, MAS
+from torchmask.interferometry.companion_errors import MEASURED, polar, rotation_towards
+from torchmask.interferometry.companion_limits import SIGNIFICANCE, DetectionLimits
+from torchmask.interferometry.companion_map import PairFit, fit_pair, map_companions, raster
+from torchmask.interferometry.measurements import Measurements, join
+from torchmask.interferometry.oifits_reader import load_oifits
+from torchmask.io import save_npz, write_json
+from torchmask.viz.companion import companion_figure
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(RunOptions):
+    """Look for a companion beside a star in OIFITS files, and say how faint one would have been found.
+
+    The files are those of `torchmask restore --oifits` or of any other program. Several are taken together. Writes
+    companion.json, the map of all places that were tried as companion.npz, and a figure to a new folder.
+    """
+
+    files: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """OIFITS files of the star that may have a companion."""
+    star: tuple[Path, ...] = ()
+    """OIFITS files of a star that is a point, to divide by: one for each of the files, or one for all. Without it the
+    files must be calibrated already."""
+    target: str | None = None
+    """Name of the target, where a file holds several."""
+    closures_only: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Leave the squared visibilities out: closure phases bear a contrast that is not calibrated."""
+    least_arcsec: float | None = None
+    """Smallest separation that is tried [arcsec]; None: half of the finest fringe."""
+    most_arcsec: float | None = None
+    """Largest separation that is tried [arcsec]; None: half of the widest fringe."""
+
+
+def run(options: Options) -> None:
+    """Read, look, write and print."""
+    measured = read_measurements(options)
+    bounds = [None if value is None else value * ARCSEC for value in (options.least_arcsec, options.most_arcsec)]
+    try:
+        offsets = raster(measured, *bounds)
+    except ValueError as error:
+        raise ValueError(f"--least-arcsec, --most-arcsec: {error}") from error
+    with new_run("companion", options) as output:
+        found = map_companions(measured, offsets)
+        limits = found.limits(measured.finest)
+        fit = fit_pair(measured, found.best)
+        sides = len(measured.closure_phases) > 0
+        numbers = {
+            "files": [str(path) for path in options.files],
+            "stars": [str(path) for path in options.star],
+            "detected": fit.significance >= SIGNIFICANCE,
+            "companion": describe(fit),
+            "side_known": sides,
+            "limits": dataclasses.asdict(limits),
+        }
+        write_json(output.directory / "companion.json", numbers)
+        arrays = {
+            name: getattr(found, name) for name in ("offsets", "contrast", "errors", "chi_square", "significance")
+        }
+        save_npz(output.directory / "companion.npz", arrays)
+        output.logger.figure("companion", companion_figure(found, limits))
+        output.summary.extend(summary(numbers["companion"], limits, sides))
+
+
+def read_measurements(options: Options) -> Measurements:
+    """All files as one, divided by the star. Raises ValueError, which names the file, for what cannot be used."""
+    if not options.files:
+        raise ValueError("there is nothing to look at: give OIFITS files")
+    if len(options.star) not in (0, 1, len(options.files)):
+        raise ValueError(
+            f"--star names {len(options.star)} files for {len(options.files)} of the object: give one for each, or one "
+            "for all"
+        )
+    stars = [load_oifits(path) for path in options.star]
+    parts = []
+    for number, path in enumerate(options.files):
+        seen = load_oifits(path, options.target)
+        if stars:
+            star = number if len(stars) > 1 else 0
+            try:
+                seen = seen.calibrate(stars[star])
+            except ValueError as error:
+                raise ValueError(f"--star {options.star[star]} and {path}: {error}") from error
+        parts.append(seen.closures_only() if options.closures_only else seen)
+    if options.closures_only and not any(len(part.closure_phases) for part in parts):
+        raise ValueError("--closures-only: the files hold no closure phases")
+    return join(parts)
+
+
+def describe(fit: PairFit) -> dict[str, Any]:
+    """The companion of a fit with its errors, as numbers for a table: mas, degrees and magnitudes."""
+    rotation = rotation_towards(fit.companion)
+    contrast, along, across = (rotation @ fit.covariance @ rotation.T).diagonal().sqrt().tolist()
+    radius = float(torch.linalg.vector_norm(fit.companion[1:]))
+    share = contrast / abs(float(fit.companion[0]))
+    errors = (along / MAS, math.degrees(across / radius), 2.5 / math.log(10) * share)
+    return {
+        "contrast": float(fit.companion[0]),
+        "contrast_error": contrast,
+        **polar(fit.companion),
+        "errors": dict(zip(MEASURED, errors, strict=True)),
+        "significance": fit.significance,
+        "chi_square": fit.chi_square,
+        "chi_square_without": fit.star_chi_square,
+        "degrees_of_freedom": fit.degrees_of_freedom,
+    }
+
+
+def summary(companion: dict[str, Any], limits: DetectionLimits, side_known: bool) -> Sequence[str]:
+    """What is printed."""
+    errors, significant = companion["errors"], companion["significance"] >= SIGNIFICANCE
+    head = "a companion" if significant else f"no companion above {SIGNIFICANCE:g} standard errors; the likeliest is"
+    lines = [
+        f"{head} of {companion['contrast']:.3g} +- {companion['contrast_error']:.2g} of the star's light, "
+        f"{companion['separation']:.4g} +- {errors['separation']:.2g} mas from it at "
+        f"{companion['position_angle']:.4g} +- {errors['position_angle']:.2g} deg, north through east "
+        f"({companion['significance']:.1f} standard errors; chi-square {companion['chi_square']:.4g} of "
+        f"{companion['degrees_of_freedom']}, {companion['chi_square_without']:.4g} without it)"
+    ]
+    if not side_known:
+        lines.append("without closure phases the opposite side of the star fits as well")
+    for place, contrast, error in zip(limits.separation, limits.contrast, limits.errors, strict=True):
+        lines.append(
+            f"  at {1000 * place:.4g} mas a companion of {contrast:.2g} +- {error:.1g} of the star's light would be "
+            "found"
+        )
+    return lines

@@ -1,0 +1,183 @@
+"""Squared visibilities and closure phases as a list of numbers on the sky, whichever instrument measured them.
+
+Signs as in `torchmask.interferometry.observables`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchmask.record import Brief
+
+SAME = 1e-3  # relative: baselines of one array, which lies otherwise on the sky from one star to the next, and colours
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Measurements(Brief):
+    """B squared visibilities and C closure phases, each on baselines and at a wavelength of its own.
+
+    baselines : (B, 2) u and v, towards east and north [m]
+    wavelengths : (B,) [m]
+    vis2, vis2_errors : (B,) |V|^2 and its rms
+    vis2_correlation : (B, B), or None if the errors are independent
+    triangles : (C, 2, 2) first and second baseline of each triangle; the third leads back [m]
+    triangle_wavelengths : (C,) [m]
+    closure_phases, closure_errors : (C,) [rad]
+    closure_correlation : (C, C), or None if the errors are independent
+
+    Raises ValueError if they disagree in shape, are not finite, or a wavelength or an error is not positive.
+
+    Examples
+    --------
+    >>> none = torch.zeros(0, dtype=torch.float64)
+    >>> one = torch.ones(1, dtype=torch.float64)
+    >>> seen = Measurements(
+    ...     torch.tensor([[3.0, 4.0]]), 2e-6 * one, 0.8 * one, 0.02 * one, None,
+    ...     none.view(0, 2, 2), none, none, none, None)
+    >>> bool(seen.finest == 2e-6 / 5)
+    True
+    """
+
+    baselines: Tensor
+    wavelengths: Tensor
+    vis2: Tensor
+    vis2_errors: Tensor
+    vis2_correlation: Tensor | None
+    triangles: Tensor
+    triangle_wavelengths: Tensor
+    closure_phases: Tensor
+    closure_errors: Tensor
+    closure_correlation: Tensor | None
+
+    def __post_init__(self) -> None:
+        n, m = len(self.vis2), len(self.closure_phases)
+        shapes = {"baselines": (n, 2), "wavelengths": (n,), "vis2": (n,), "vis2_errors": (n,)}
+        shapes |= {"vis2_correlation": (n, n), "triangles": (m, 2, 2), "triangle_wavelengths": (m,)}
+        shapes |= {"closure_phases": (m,), "closure_errors": (m,), "closure_correlation": (m, m)}
+        for name, shape in shapes.items():
+            values = getattr(self, name)
+            if values is None:
+                continue
+            if tuple(values.shape) != shape:
+                raise ValueError(f"{name} has shape {tuple(values.shape)}: it must be {shape}")
+            if not bool(torch.isfinite(values).all()):
+                raise ValueError(f"{name} holds values that are not finite: leave those measurements out")
+        for name in ("wavelengths", "triangle_wavelengths", "vis2_errors", "closure_errors"):
+            values = getattr(self, name)
+            if not bool((values > 0).all()):
+                raise ValueError(f"{name} holds {float(values.min()):g}: all must be positive")
+
+    @property
+    def frequencies(self) -> Tensor:
+        """(B, 2) of the baselines [cycles per radian]."""
+        return self.baselines / self.wavelengths[:, None]
+
+    @property
+    def triangle_frequencies(self) -> Tensor:
+        """(C, 3, 2) of the three baselines of every triangle [cycles per radian]; they add up to 0."""
+        sides = torch.cat([self.triangles, -self.triangles.sum(1, keepdim=True)], 1)
+        return sides / self.triangle_wavelengths[:, None, None]
+
+    @property
+    def finest(self) -> float:
+        """Wavelength over the longest baseline, the least of all measurements [rad]."""
+        return 1 / float(self._lengths().max())
+
+    @property
+    def widest(self) -> float:
+        """Wavelength over the shortest baseline, the largest of all measurements [rad]."""
+        return 1 / float(self._lengths().min())
+
+    def _lengths(self) -> Tensor:
+        """Of all baselines [cycles per radian]."""
+        every = torch.cat([self.frequencies, self.triangle_frequencies.flatten(0, 1)])
+        return torch.linalg.vector_norm(every, dim=1)
+
+    def closures_only(self) -> Measurements:
+        """The closure phases alone, which need no calibration of the contrast."""
+        none = slice(0, 0)
+        return replace(
+            self,
+            baselines=self.baselines[none],
+            wavelengths=self.wavelengths[none],
+            vis2=self.vis2[none],
+            vis2_errors=self.vis2_errors[none],
+            vis2_correlation=None,
+        )
+
+    def calibrate(self, star: Measurements) -> Measurements:
+        """These, divided by those of a star that is a point, with the errors of both.
+
+        |V|^2 is divided by the star's, closure phases are subtracted. Directions on the sky stay those of the object.
+
+        Raises ValueError if the star was not seen on the same baselines and at the same wavelengths in the same order,
+        or shows no fringes on one of them.
+        """
+        _require_same(self, star)
+        dark = int((star.vis2 <= 0).sum())
+        if dark:
+            raise ValueError(
+                f"the star shows no fringes on {dark} of {len(star.vis2)} baselines: use a brighter star, or more "
+                "frames of it"
+            )
+        ratio = self.vis2 / star.vis2
+        own, its = (_covariance(each.vis2_errors, each.vis2_correlation) for each in (self, star))
+        vis2 = (own + ratio[:, None] * ratio * its) / (star.vis2[:, None] * star.vis2)
+        one, other = (_covariance(each.closure_errors, each.closure_correlation) for each in (self, star))
+        closure = one + other
+        phases = self.closure_phases - star.closure_phases
+        return replace(
+            self,
+            vis2=ratio,
+            vis2_errors=vis2.diagonal().sqrt(),
+            vis2_correlation=correlation(vis2),
+            closure_phases=torch.atan2(phases.sin(), phases.cos()),
+            closure_errors=closure.diagonal().sqrt(),
+            closure_correlation=correlation(closure),
+        )
+
+
+def join(measurements: Sequence[Measurements]) -> Measurements:
+    """All of them as one, those of different ones taken as independent. Raises ValueError if there is none."""
+    if not measurements:
+        raise ValueError("measurements is empty: give at least one")
+    names = ("baselines", "wavelengths", "vis2", "vis2_errors")
+    names += ("triangles", "triangle_wavelengths", "closure_phases", "closure_errors")
+    together = {name: torch.cat([getattr(each, name) for each in measurements]) for name in names}
+    return Measurements(
+        **together,
+        vis2_correlation=_blocks([(len(each.vis2), each.vis2_correlation) for each in measurements]),
+        closure_correlation=_blocks([(len(each.closure_phases), each.closure_correlation) for each in measurements]),
+    )
+
+
+def correlation(covariance: Tensor) -> Tensor | None:
+    """Of a covariance (M, M) with a positive diagonal; None if nothing in it is correlated."""
+    scale = covariance.diagonal().rsqrt()
+    found = covariance * scale[:, None] * scale
+    return None if bool((found == found.diagonal().diag()).all()) else found
+
+
+def _blocks(parts: Sequence[tuple[int, Tensor | None]]) -> Tensor | None:
+    if all(part is None for _, part in parts):
+        return None
+    return torch.block_diag(*(torch.eye(n, dtype=torch.float64) if part is None else part for n, part in parts))
+
+
+def _covariance(errors: Tensor, correlations: Tensor | None) -> Tensor:
+    return (errors**2).diag() if correlations is None else errors[:, None] * errors * correlations
+
+
+def _require_same(seen: Measurements, star: Measurements) -> None:
+    for name in ("frequencies", "triangle_frequencies"):
+        lengths = [torch.linalg.vector_norm(getattr(each, name), dim=-1) for each in (seen, star)]
+        if lengths[0].shape != lengths[1].shape or not torch.allclose(*lengths, rtol=SAME, atol=0):
+            raise ValueError(
+                f"the star was seen otherwise: its {len(star.vis2)} baselines and {len(star.closure_phases)} triangles "
+                f"and the {len(seen.vis2)} and {len(seen.closure_phases)} of the object must be the same, at the same "
+                "wavelengths, in the same order"
+            )

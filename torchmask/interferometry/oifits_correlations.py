@@ -1,0 +1,63 @@
+"""OI_CORR, the table of an OIFITS file that says which errors go together.
+
+A matrix for all data of a file: a row for each pair of them that is correlated. Each row of a table of measurements
+says where its first wavelength stands in that matrix, counted from 1 (CORRINDX_...).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+Triplets = tuple[np.ndarray, np.ndarray, np.ndarray]  # IINDX, JINDX and CORR
+_NO_INDEX = 0  # a row whose data have no place in the matrix
+
+
+def correlation_triplets(covariances: Sequence[Tensor]) -> Triplets:
+    """IINDX < JINDX, counted from 1, and CORR of several (M, M) covariances, one after the other.
+
+    What is not finite is left out.
+    """
+    first, rows, columns, values = 1, [], [], []
+    for covariance in covariances:
+        scale = covariance.diagonal().rsqrt()
+        correlation = (covariance * scale[:, None] * scale).numpy(force=True)
+        i, j = np.triu_indices(len(correlation), 1)
+        upper = correlation[i, j]
+        kept = np.isfinite(upper) & (upper != 0)
+        rows.append(first + i[kept])
+        columns.append(first + j[kept])
+        values.append(upper[kept])
+        first += len(correlation)
+    return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
+
+
+def read_correlations(hdus: Any) -> dict[str, Triplets]:
+    """IINDX, JINDX and CORR of every OI_CORR by its CORRNAME."""
+    found = {}
+    for hdu in hdus:
+        if hdu.name == "OI_CORR":
+            i, j, values = (np.asarray(hdu.data[name]).ravel() for name in ("IINDX", "JINDX", "CORR"))
+            found[str(hdu.header["CORRNAME"]).strip()] = (i.astype(int), j.astype(int), values.astype(float))
+    return found
+
+
+def correlation_of(names: np.ndarray, places: np.ndarray, triplets: Mapping[str, Triplets]) -> Tensor | None:
+    """(M, M) of data that stand at `places` (M,) of the matrices called `names` (M,); None if none is correlated."""
+    matrix = torch.eye(len(places), dtype=torch.float64)
+    correlated = False
+    for name, (i, j, values) in triplets.items():
+        mine = np.flatnonzero((names == name) & (places > _NO_INDEX))
+        if not len(mine):
+            continue
+        number = np.full(1 + max(int(places[mine].max()), int(max(i.max(initial=0), j.max(initial=0)))), -1)
+        number[places[mine]] = mine
+        both = (number[i] >= 0) & (number[j] >= 0)
+        a, b = torch.as_tensor(number[i[both]]), torch.as_tensor(number[j[both]])
+        matrix[a, b] = matrix[b, a] = torch.as_tensor(values[both])
+        correlated = correlated or bool(both.any())
+    return matrix if correlated else None

@@ -1,0 +1,222 @@
+"""OIFITS files of this library and of other instruments, read back as a list of measurements.
+
+First and second version of the standard (Pauls et al. 2005, PASP 117, 1255; Duvert et al. 2017, A&A 597, A8).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchmask.interferometry.measurements import Measurements
+from torchmask.interferometry.oifits_correlations import correlation_of, read_correlations
+from torchmask.io import extra
+
+_SHARED_SIDE = 1 / 3  # correlation of two closure phases that share a baseline, if all baselines are as noisy
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Measurements of all tables of a kind, a row for each number: `columns` (M, ...), and what says where it is from.
+
+    stations : (M, 2 or 3), -1 where unknown
+    exposure : (M, 3) number of its table, time and wavelength
+    corrname, place : (M,) where the number stands in which matrix of correlations; 0 if nowhere
+    """
+
+    columns: dict[str, np.ndarray]
+    wavelength: np.ndarray
+    stations: np.ndarray
+    exposure: np.ndarray
+    corrname: np.ndarray
+    place: np.ndarray
+
+
+def load_oifits(path: str | Path, target: str | None = None) -> Measurements:
+    """Squared visibilities and closure phases of an OIFITS file, with the correlations of their errors.
+
+    Parameters
+    ----------
+    path : str or Path
+        Of one or more instruments, times and wavelengths.
+    target : str, optional
+        Which one is meant, where the file holds several.
+
+    Returns
+    -------
+    Measurements
+        Of OI_VIS2 and OI_T3, table by table, row by row and wavelength by wavelength, but for what is flagged or not
+        finite or has no positive error. Correlations are those of OI_CORR. Closure phases without it count as sums of
+        phases of baselines that are all as noisy: where two triangles share a baseline their correlation is 1/3, or
+        -1/3 if they run along it in opposite directions. Taken as independent they would count several times, since
+        only (N - 1)(N - 2)/2 of N holes' N (N - 1)(N - 2)/6 are.
+
+    Raises
+    ------
+    ValueError
+        If the file is missing or no OIFITS, a table lacks a column or its OI_WAVELENGTH, it holds several targets and
+        none is named or that one is not there, or nothing is left.
+
+    Examples
+    --------
+    The file of `save_oifits`:
+
+    >>> import tempfile
+    >>> from torchmask.grid import Grid
+    >>> from torchmask.interferometry.fringes import frame_observables
+    >>> from torchmask.interferometry.oifits import save_oifits
+    >>> from torchmask.observation import Observation
+    >>> from torchmask.optics.aperture import SparseAperture
+    >>> frames = torch.rand(4, 64, 64, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 1e4
+    >>> mask = SparseAperture([[0.0, 0.4], [-0.35, -0.2], [0.35, -0.25]], 0.15, 1.0)
+    >>> observation = Observation(frames, mask, Grid.nyquist(1.0, 550e-9, 64), readout_noise=1.0)
+    >>> observables = frame_observables(observation)
+    >>> path = tempfile.mkdtemp() + "/seen.oifits"
+    >>> save_oifits(path, observables, observation, bandwidth=30e-9)
+    >>> seen = load_oifits(path)
+    >>> bool(torch.allclose(seen.vis2, observables.vis2)), len(seen.closure_phases)
+    (True, 1)
+    """
+    with extra("oifits"):
+        from astropy.io import fits
+
+    path = Path(path)
+    if not path.is_file():
+        raise ValueError(f"there is no file {path}: an OIFITS file is needed")
+    try:
+        with fits.open(path, memmap=False) as hdus:
+            return _read(path, hdus, target)
+    except (OSError, TypeError, KeyError) as error:
+        raise ValueError(f"{path} is no OIFITS file, or is damaged: {error}") from error
+
+
+def _read(path: Path, hdus: Any, target: str | None) -> Measurements:
+    chosen = _target_number(path, hdus, target)
+    waves = {
+        str(hdu.header["INSNAME"]).strip(): np.asarray(hdu.data["EFF_WAVE"], dtype=float).ravel()
+        for hdu in hdus
+        if hdu.name == "OI_WAVELENGTH"
+    }
+    triplets = read_correlations(hdus)
+    vis2 = _gather(path, hdus, "OI_VIS2", ("VIS2DATA", "VIS2ERR"), ("UCOORD", "VCOORD"), chosen, waves)
+    sides = ("U1COORD", "V1COORD", "U2COORD", "V2COORD")
+    t3 = _gather(path, hdus, "OI_T3", ("T3PHI", "T3PHIERR"), sides, chosen, waves)
+    if not len(vis2.wavelength) and not len(t3.wavelength):
+        raise ValueError(f"{path} holds no squared visibility and no closure phase that is finite and not flagged")
+    closure_correlation = correlation_of(t3.corrname, t3.place, triplets)
+    return Measurements(
+        baselines=_tensor(vis2, "UCOORD", "VCOORD"),
+        wavelengths=torch.as_tensor(vis2.wavelength),
+        vis2=torch.as_tensor(vis2.columns["VIS2DATA"]),
+        vis2_errors=torch.as_tensor(vis2.columns["VIS2ERR"]),
+        vis2_correlation=correlation_of(vis2.corrname, vis2.place, triplets),
+        triangles=_tensor(t3, *sides).view(-1, 2, 2),
+        triangle_wavelengths=torch.as_tensor(t3.wavelength),
+        closure_phases=torch.as_tensor(t3.columns["T3PHI"]).deg2rad(),
+        closure_errors=torch.as_tensor(t3.columns["T3PHIERR"]).deg2rad(),
+        closure_correlation=_shared_sides(t3) if closure_correlation is None else closure_correlation,
+    )
+
+
+def _target_number(path: Path, hdus: Any, target: str | None) -> int | None:
+    """TARGET_ID of the target that is meant; None if the file names none."""
+    tables = [hdu.data for hdu in hdus if hdu.name == "OI_TARGET"]
+    names = {str(row["TARGET"]).strip(): int(row["TARGET_ID"]) for table in tables for row in table}
+    if target is not None:
+        if target not in names:
+            raise ValueError(f"{path} has no target {target!r}: it holds {', '.join(names) or 'none with a name'}")
+        return names[target]
+    if len(names) > 1:
+        raise ValueError(f"{path} holds several targets: say which of {', '.join(names)} is meant")
+    return next(iter(names.values()), None)
+
+
+def _gather(
+    path: Path,
+    hdus: Any,
+    kind: str,
+    measured: tuple[str, str],
+    places: tuple[str, ...],
+    target: int | None,
+    waves: dict[str, np.ndarray],
+) -> _Rows:
+    """All good numbers of the tables of a kind; `measured` names those of values and errors."""
+    parts: list[_Rows] = []
+    for hdu in hdus:
+        if hdu.name != kind:
+            continue
+        instrument = str(hdu.header["INSNAME"]).strip()
+        if instrument not in waves:
+            raise ValueError(f"{path}: {kind} is of {instrument}, for which there is no OI_WAVELENGTH")
+        parts.append(_good_rows(hdu, len(parts), measured, places, target, waves[instrument]))
+    if not parts:
+        none = np.zeros(0)
+        columns = dict.fromkeys((*measured, *places), none)
+        nowhere = np.zeros((0, 3), dtype=int)
+        return _Rows(columns, none, nowhere, nowhere, none.astype(str), none.astype(int))
+    return _Rows(
+        {name: np.concatenate([part.columns[name] for part in parts]) for name in parts[0].columns},
+        *(
+            np.concatenate([getattr(part, name) for part in parts])
+            for name in ("wavelength", "stations", "exposure", "corrname", "place")
+        ),
+    )
+
+
+def _good_rows(
+    hdu: Any, table: int, measured: tuple[str, str], places: tuple[str, ...], target: int | None, wave: np.ndarray
+) -> _Rows:
+    data, n = hdu.data, len(wave)
+    shape = (len(data), n)
+    values, errors = (np.asarray(data[name], dtype=float).reshape(shape) for name in measured)
+    good = np.isfinite(values) & np.isfinite(errors) & (errors > 0)
+    good &= ~np.asarray(data["FLAG"], dtype=bool).reshape(shape)
+    if target is not None:
+        good &= np.asarray(data["TARGET_ID"]).reshape(-1, 1) == target
+
+    def spread(column: Any) -> np.ndarray:
+        """Of the rows, for each good number."""
+        return np.broadcast_to(np.asarray(column).reshape(-1, 1), shape)[good]
+
+    columns = {measured[0]: values[good], measured[1]: errors[good]}
+    columns |= {name: spread(np.asarray(data[name], dtype=float)) for name in places}
+    channels = np.broadcast_to(np.arange(n), shape)
+    _, times = np.unique(np.asarray(data["MJD"], dtype=float), return_inverse=True)
+    exposure = np.stack([np.full(good.sum(), table), spread(times), channels[good]], 1)
+    holes = np.asarray(data["STA_INDEX"], dtype=int).reshape(len(data), -1)
+    stations = np.broadcast_to(holes[:, None], (*shape, holes.shape[1]))[good]
+    index = f"CORRINDX_{measured[0]}"
+    first = np.asarray(data[index]).reshape(-1, 1) if index in hdu.columns.names else np.zeros((len(data), 1), int)
+    place = np.where(first > 0, first + channels, 0)[good].astype(int)
+    corrname = np.full(good.sum(), str(hdu.header.get("CORRNAME", "")).strip())
+    return _Rows(columns, np.broadcast_to(wave, shape)[good], stations, exposure, corrname, place)
+
+
+def _shared_sides(rows: _Rows) -> Tensor | None:
+    """(C, C) correlation of closure phases that are sums of phases of equally noisy baselines; None if none share."""
+    matrix = np.eye(len(rows.wavelength))
+    _, group = np.unique(rows.exposure, axis=0, return_inverse=True)
+    for number in range(group.max(initial=-1) + 1):
+        mine = np.flatnonzero(group.ravel() == number)
+        names = sorted({frozenset(pair) for triangle in rows.stations[mine] for pair in _pairs(triangle)}, key=sorted)
+        column = {name: index for index, name in enumerate(names)}
+        signs = np.zeros((len(mine), len(names)))
+        for row, triangle in enumerate(rows.stations[mine]):
+            for first, second in _pairs(triangle):
+                signs[row, column[frozenset((first, second))]] = 1 if first < second else -1
+        matrix[np.ix_(mine, mine)] = _SHARED_SIDE * signs @ signs.T
+    return None if (matrix == np.diag(matrix.diagonal())).all() else torch.as_tensor(matrix)
+
+
+def _pairs(triangle: np.ndarray) -> list[tuple[int, int]]:
+    i, j, k = triangle.tolist()
+    return [(i, j), (j, k), (k, i)]
+
+
+def _tensor(rows: _Rows, *names: str) -> Tensor:
+    return torch.as_tensor(np.stack([rows.columns[name] for name in names], 1))

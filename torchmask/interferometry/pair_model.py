@@ -1,0 +1,139 @@
+"""A star and its companion as visibilities, and how measurements of them differ from the model.
+
+A star of flux 1 and a companion of flux c at (east, north) show the visibility V = (1 + c exp(-2 pi i f . s)) / (1 + c)
+at the frequency f = (u, v) / wavelength (Berger & Segransan 2007, New Astronomy Reviews 51, 576). Contrasts below 0
+are what noise makes of none.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchmask.interferometry.measurements import Measurements
+
+PARAMETERS = 3  # of a companion: contrast, east and north
+_FAINTEST, _BRIGHTEST = -0.5, 0.98  # contrasts of a map; at 1 no measurement changes with the contrast
+_STEPS = 12  # of Gauss-Newton for the contrast at each place
+_HALVINGS = 20  # of a step that makes a fit worse
+_ENOUGH = 1e-6  # chi-square gained for each measurement: the end of a fit
+_LEAST_EIGENVALUE = 1e-6  # of a correlation matrix, over its largest: below, measurements say nothing new
+
+
+def pair_visibilities(frequencies: Tensor, companion: Tensor) -> Tensor:
+    """(..., F) complex, of a star and its companion (..., 3) at frequencies (F, 2) [cycles per radian].
+
+    Examples
+    --------
+    A companion as bright as the star, half a fringe away, leaves nothing:
+
+    >>> place = torch.tensor([1.0, 5e-7, 0.0], dtype=torch.float64)
+    >>> found = pair_visibilities(torch.tensor([[1e6, 0.0]], dtype=torch.float64), place)
+    >>> bool(found.abs().max() < 1e-12)
+    True
+    """
+    contrast, turns = companion[..., :1], companion[..., 1:] @ frequencies.T
+    return (1 + contrast * torch.polar(torch.ones_like(turns), -2 * math.pi * turns)) / (1 + contrast)
+
+
+class PairResiduals:
+    """Residuals of measurements in units of their errors, without what their correlations make superfluous."""
+
+    size: int
+    unit: Tensor  # (3,) of a companion: contrast, and the finest fringe
+
+    def __init__(self, measured: Measurements) -> None:
+        self._seen = measured
+        self._frequencies, self._sides = measured.frequencies, measured.triangle_frequencies.flatten(0, 1)
+        self.unit = torch.tensor([1.0, measured.finest, measured.finest], dtype=torch.float64)
+        self._vis2 = _whitening(measured.vis2_errors, measured.vis2_correlation)
+        self._closures = _whitening(measured.closure_errors, measured.closure_correlation)
+        self.size = self._vis2.shape[1] + self._closures.shape[1]
+        if self.size < PARAMETERS:
+            raise ValueError(
+                f"{self.size} independent numbers were measured: a companion's contrast and place need {PARAMETERS}"
+            )
+
+    def residuals(self, companion: Tensor) -> Tensor:
+        """(..., K) measured less model, of companions (..., 3)."""
+        vis2, phases = self._model(companion)
+        away = self._seen.closure_phases - phases
+        away = torch.atan2(away.sin(), away.cos())
+        return torch.cat([(self._seen.vis2 - vis2) @ self._vis2, away @ self._closures], -1)
+
+    def slopes(self, companion: Tensor) -> Tensor:
+        """(K, 3) of the whitened model by the companion (3,)."""
+        (of_vis2, vis2_turns), (of_phases, phase_turns) = self._slopes(companion)
+        sides = phase_turns[:, None] * self._sides
+        vis2 = torch.cat([of_vis2[:, None], vis2_turns[:, None] * self._frequencies], 1)
+        phases = torch.cat([of_phases[:, None], sides], 1).unflatten(0, (-1, 3)).sum(1)
+        return torch.cat([self._vis2.T @ vis2, self._closures.T @ phases])
+
+    def descend(self, start: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+        """Gauss-Newton from a companion (3,), to the best one near it; with its residuals (K,)."""
+        found, residual = start, self.residuals(start)
+        for _ in range(steps):
+            slopes = self.slopes(found) * self.unit
+            change = self.unit * torch.linalg.lstsq(slopes, residual[:, None]).solution[:, 0]
+            for _ in range(_HALVINGS):
+                moved = found + change
+                after = self.residuals(moved)
+                if moved[0] >= _FAINTEST and square(after) < square(residual):
+                    break
+                change = change / 2
+            else:
+                break
+            gained = square(residual) - square(after)
+            found, residual = moved, after
+            if gained < _ENOUGH * self.size:
+                break
+        return found, residual
+
+    def best_contrasts(self, offsets: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Contrast, its error and chi-square (M,) at offsets (M, 2), by Gauss-Newton from no companion."""
+        companion = torch.cat([offsets.new_zeros(len(offsets), 1), offsets], 1)
+        for step in range(_STEPS + 1):
+            (of_vis2, _), (of_phases, _) = self._slopes(companion)
+            of_phases = of_phases.unflatten(-1, (-1, 3)).sum(-1)
+            slope = torch.cat([of_vis2 @ self._vis2, of_phases @ self._closures], 1)
+            residual, curvature = self.residuals(companion), slope.square().sum(1)
+            if step < _STEPS:
+                change = (slope * residual).sum(1) / curvature
+                companion[:, 0] = (companion[:, 0] + change).clamp(_FAINTEST, _BRIGHTEST)
+        return companion[:, 0], curvature.rsqrt(), residual.square().sum(1)
+
+    def _model(self, companion: Tensor) -> tuple[Tensor, Tensor]:
+        vis2 = pair_visibilities(self._frequencies, companion).abs() ** 2
+        sides = pair_visibilities(self._sides, companion)
+        return vis2, sides.unflatten(-1, (-1, 3)).prod(-1).angle()
+
+    def _slopes(self, companion: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
+        """Of |V|^2 (..., B), and of the phases of all sides of triangles (..., 3 C): by the contrast, and by what the
+        frequency is multiplied with.
+
+        In closed form: differentiating complex numbers forwards takes far longer than computing them.
+        """
+        c = companion[..., :1]
+        turns = 2 * math.pi * (companion[..., 1:] @ self._frequencies.T)
+        by_contrast = 2 * (1 - c) * (turns.cos() - 1) / (1 + c) ** 3
+        by_turn = -2 * c * turns.sin() / (1 + c) ** 2
+        sides = -2 * math.pi * (companion[..., 1:] @ self._sides.T)
+        wave = torch.polar(torch.ones_like(sides), sides)
+        ratio = wave / (1 + c * wave)
+        return (by_contrast, 2 * math.pi * by_turn), (ratio.imag, -2 * math.pi * c * ratio.real)
+
+
+def square(residual: Tensor) -> float:
+    """Chi-square of residuals (K,)."""
+    return float(residual.square().sum())
+
+
+def _whitening(errors: Tensor, correlation: Tensor | None) -> Tensor:
+    """(M, K), K <= M: what turns residuals (..., M) into independent ones of variance 1."""
+    if correlation is None:
+        return (1 / errors).diag()
+    values, vectors = torch.linalg.eigh(correlation)
+    kept = values > _LEAST_EIGENVALUE * values[-1]
+    return vectors[:, kept] * values[kept].rsqrt() / errors[:, None]
