@@ -112,7 +112,7 @@ def test_a_background_that_cannot_be_one_is_refused(background, message):
 
 
 def test_frames_that_are_darker_than_their_background_are_refused(observation, five_holes):
-    with pytest.raises(ValueError, match="nothing but their background"):
+    with pytest.raises(ValueError, match="hold only background"):
         FrameStack.of(
             observation.frames, None, observation.grid, five_holes, 1.5, 2.0 * float(observation.frames.mean())
         )

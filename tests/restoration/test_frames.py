@@ -72,7 +72,7 @@ def test_border_brightness():
 
 
 def test_a_bright_border_is_noticed():
-    with pytest.warns(UserWarning, match="does the object reach beyond the field"):
+    with pytest.warns(UserWarning, match="does the object extend beyond the field"):
         FrameStack.of(exposures() + 100.0, None, GRID, PUPIL, None)
 
 

@@ -109,7 +109,7 @@ def test_every_descent_has_a_fresh_optimizer():
 def test_refuses_nonsense():
     with pytest.raises(ValueError, match="steps is 0: it must be at least 1"):
         TorchMinimizer(OPTIMIZERS["Adam"], steps=0)
-    with pytest.raises(TypeError, match=r"factory makes a list: it must make an optimiser of torch\.optim"):
+    with pytest.raises(TypeError, match=r"factory returns a list: it must return an optimiser of torch\.optim"):
         TorchMinimizer(list)
     bowl = Bowl()
     with pytest.raises(ValueError, match="start and lower have shapes"):

@@ -47,7 +47,7 @@ def test_errors_that_were_measured_tell_the_variance_of_valid_pixels():
     size = math.prod(GRID.shape)
     mean = (49 * (size - 8) + 64 * 4) / (size - 4)
     assert expected_variance(frames, GRID, PUPIL, None, valid, errors) == pytest.approx(mean, rel=1e-12)
-    with pytest.warns(UserWarning, match="errors make 14"):
+    with pytest.warns(UserWarning, match="errors give 14"):
         expected_variance(frames, GRID, PUPIL, None, None, torch.full_like(frames, 14.0))
 
 

@@ -1,4 +1,4 @@
-"""The background of the frames: light that no object sends, the same in every pixel of a frame."""
+"""The background of the frames, uniform light that does not come from the object."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from enum import Enum
 import torch
 from torch import Tensor
 
-_PRICE = 0.1  # against the weight 1 of total variation: see docs/restoration.md
-_BLOCKS = 8  # along each side of the field, in which its darkest part is looked for
-_SEEN = 0.1  # of the mean light, in the darkest part: holes scatter up to 0.06 there, see docs/restoration.md
+_PRICE = 0.1  # relative to a weight of 1 of total variation, see docs/restoration.md
+_BLOCKS = 8  # blocks along each side of the field, of which the darkest is sought
+_SEEN = 0.1  # of the mean light in the darkest part, where holes scatter up to 0.06, see docs/restoration.md
 
 
 class Background(Enum):
-    """What a restoration assumes of the background where it is not given.
+    """Assumption of a restoration about a background that is not given.
 
-    A constant that is free in every frame costs no variable: whatever the object, the constant that fits best is the
-    weighted mean of what the object leaves, or zero if that is negative, and the misfit is what is left beside it.
+    A free constant in every frame needs no variable: for any object, the best constant is the weighted mean of the
+    residual, or zero if that is negative.
 
-    An even level of the object looks the same in the frames. So the object pays a small price for its light, which
-    moves such a level to the background as far as the object stays positive: one that is nowhere dark loses the light
+    A uniform level of the object looks the same as a background. A small penalty on the object's light therefore moves
+    such a level to the background, as far as the object stays positive: an object that is nowhere dark loses the light
     of its darkest part.
 
-    Where the darkest part of the field holds no more than what optics scatter there, nothing is lost without a sky, and
-    the descent is shorter. `IF_SEEN` decides by that.
+    If the darkest part of the field has no more light than the optics scatter there, the fit does not need a sky and is
+    quicker without one. `IF_SEEN` makes this decision.
 
     Examples
     --------
@@ -38,7 +38,7 @@ class Background(Enum):
     IF_SEEN = "one constant for each frame, if the darkest part of the field shows a sky"
 
     def of(self, frames: Tensor) -> Background:
-        """What is free once the frames (T, H, W) are there, whose own light alone decides: `NONE` or `PER_FRAME`."""
+        """Return the assumption for the frames (T, H, W), `NONE` or `PER_FRAME`; their light decides `IF_SEEN`."""
         if self is not Background.IF_SEEN:
             return self
         is_seen = float(darkest_level(frames).mean()) > _SEEN * float(frames.mean())
@@ -46,26 +46,26 @@ class Background(Enum):
 
     @property
     def price(self) -> float:
-        """Of an object's light, per mean pixel, in the cost of a restoration."""
+        """Penalty on the object's light, per mean pixel, in the cost of a restoration."""
         return 0.0 if self is Background.NONE else _PRICE
 
     def level(self, difference: Tensor, precision: Tensor) -> Tensor:
-        """The background (T, 1, 1) nearest to `difference` (T, H, W), whose pixels count with `precision`."""
+        """Return the background (T, 1, 1) that fits `difference` (T, H, W) best, weighted by `precision`."""
         if self is Background.NONE:
             return torch.zeros_like(difference[:, :1, :1])
         return weighted_mean(difference, precision).clamp(min=0)
 
     def residual(self, difference: Tensor, precision: Tensor) -> Tensor:
-        """`difference` (T, H, W) without the background nearest to it."""
+        """Return `difference` (T, H, W) minus the background that fits it best."""
         return difference if self is Background.NONE else difference - self.level(difference, precision)
 
     def first_guess(self, frames: Tensor) -> Tensor:
-        """The background (T, 1, 1) of frames (T, H, W) before anything is known of their object."""
+        """Return an estimate of the background (T, 1, 1) of frames (T, H, W) before their object is known."""
         return torch.zeros_like(frames[:, :1, :1]) if self is Background.NONE else darkest_level(frames).clamp(min=0)
 
 
 def weighted_mean(values: Tensor, precision: Tensor) -> Tensor:
-    """The mean (T, 1, 1) of values (T, H, W) that count with `precision`; 0 where none counts."""
+    """Return the mean (T, 1, 1) of values (T, H, W) weighted by `precision`; 0 where all weights are 0."""
     if precision.shape[-2:] == (1, 1):
         return values.mean((1, 2), keepdim=True)
     least = torch.finfo(precision.dtype).tiny
@@ -73,9 +73,9 @@ def weighted_mean(values: Tensor, precision: Tensor) -> Tensor:
 
 
 def darkest_level(frames: Tensor) -> Tensor:
-    """The level (T, 1, 1) of frames (T, H, W) in the part of the field that is darkest on average over all of them.
+    """Return the level (T, 1, 1) of frames (T, H, W) in the part of the field that is darkest in their mean.
 
-    It holds the background and what light of the object is scattered there.
+    It includes the background and light that the object scatters there.
 
     Examples
     --------
@@ -89,22 +89,22 @@ def darkest_level(frames: Tensor) -> Tensor:
 
 
 def check_known_level(level: float | Tensor, frames: Tensor) -> Tensor:
-    """A background that is given [electrons] as (T, H, W), for frames of that shape.
+    """Expand a known background [electrons] to the shape of the frames (T, H, W).
 
-    Raises ValueError if it is not finite, negative, or does not broadcast to the frames.
+    Raises ValueError if it is not finite, is negative, or does not broadcast to the frames.
     """
     given = torch.as_tensor(level, dtype=frames.dtype, device=frames.device)
     if not bool(torch.isfinite(given).all()):
         raise ValueError("background holds values that are not finite: electrons per pixel are needed")
     if bool((given < 0).any()):
         raise ValueError(
-            f"background is negative ({float(given.min()):.3g} electrons per pixel), and light is not: if too much was "
-            "subtracted from the frames, add it to them"
+            f"background is negative ({float(given.min()):.3g} electrons per pixel), which light cannot be: if too "
+            "much was subtracted from the frames, add it back"
         )
     try:
         return given.expand_as(frames)
     except RuntimeError:
         raise ValueError(
-            f"background has shape {tuple(given.shape)}: a number, or what broadcasts to the frames "
+            f"background has shape {tuple(given.shape)}: a number, or a tensor that broadcasts to the frames "
             f"{tuple(frames.shape)}, is needed; one number for each frame has shape ({len(frames)}, 1, 1)"
         ) from None

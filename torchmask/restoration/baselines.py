@@ -1,6 +1,6 @@
-"""What a restoration is compared with: frames put on top of each other, and the PSF that this has on average.
+"""Simple methods to compare a restoration with: the mean of registered frames, and its average PSF.
 
-scikit-image's `richardson_lucy` and `unsupervised_wiener` take the two as they come.
+scikit-image's `richardson_lucy` and `unsupervised_wiener` accept both directly.
 """
 
 from __future__ import annotations
@@ -19,29 +19,30 @@ from torchmask.observation import check_frames
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.psf import PSF
 
-_OVERSAMPLING = 4  # of the pupil: phases change within the cells of the Nyquist raster
+_OVERSAMPLING = 4  # of the pupil, because phases change within the cells of the Nyquist raster
 
 
 def shift_and_add(frames: Tensor) -> Tensor:
-    """The mean of frames registered to a tenth of a pixel, first to the sharpest of them, then to their mean.
+    """Return the mean of frames registered to a tenth of a pixel, first to the sharpest frame, then to their mean.
 
     Parameters
     ----------
     frames : (T, H, W) tensor
+        Exposures in any unit.
 
     Returns
     -------
     Tensor
-        (H, W) in the units of the frames, of dtype float64 on the CPU.
+        (H, W) in the unit of the frames, float64 on the CPU.
 
     Raises
     ------
     ValueError
-        If the shape is wrong, a value is not finite or a frame holds no light.
+        If the shape is wrong, a value is not finite or a frame has no light.
 
     Examples
     --------
-    Richardson and Lucy's restoration, in full:
+    A complete Richardson-Lucy restoration:
 
     >>> from skimage.restoration import richardson_lucy
     >>> from torchmask.optics.aperture import SparseAperture
@@ -72,11 +73,11 @@ def average_psf(
     generator: torch.Generator | None = None,
     n_frames: int = 100,
 ) -> Tensor:
-    """What `shift_and_add` makes of a point source behind `n_frames` other screens of the same turbulence.
+    """Return the PSF of `shift_and_add`, from a point source behind `n_frames` new screens of the same turbulence.
 
-    Returns (H', W') of sum 1 and dtype float64 on the CPU, on the pixels of the grid: its sides are odd, one pixel
-    less than an even side of the grid, and the peak is in the middle. Raises ValueError if the grid samples the
-    aperture too coarsely.
+    The result (H', W') has unit sum and is float64 on the CPU, on the pixels of the grid. Its sides are odd, one pixel
+    less than an even side of the grid, with the peak in the middle. Raises ValueError if the grid samples the aperture
+    too coarsely.
 
     Examples
     --------
@@ -93,5 +94,5 @@ def average_psf(
     mean = shift_and_add(torch.fft.fftshift(stars, dim=(-2, -1))).clamp(min=0)
     row, column = divmod(int(mean.argmax()), columns)
     psf = mean.roll((rows // 2 - row, columns // 2 - column), (0, 1))
-    psf = psf[1 - rows % 2 :, 1 - columns % 2 :]  # an even side has no middle
+    psf = psf[1 - rows % 2 :, 1 - columns % 2 :]  # an even side has no middle pixel
     return psf / psf.sum()

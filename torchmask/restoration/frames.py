@@ -1,4 +1,4 @@
-"""The frames of a restoration: checked, in units of their mean pixel, with the noise they have."""
+"""The frames of a restoration, checked and in units of their mean pixel, with their noise."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from torchmask.restoration.noise import check_errors, expected_variance
 
 Array = Tensor | np.ndarray
 
-_BRIGHT_BORDER = 0.5  # of the mean pixel
-_EVEN_LIGHT = 0.6  # of all light: in the darkest part it may be a wide object as well as a sky
+_BRIGHT_BORDER = 0.5  # border brightness, in mean pixels, above which there is a warning
+_EVEN_LIGHT = 0.6  # fraction of even light above which there is a warning: it may be a sky or a wide object
 
 
 @dataclass(frozen=True)
 class FrameStack:
-    """Frames that a restoration can work on.
+    """Frames prepared for a restoration.
 
-    frames : (T, H, W) in units of `unit`; invalid pixels are filled in, and a background that is given is taken off
-    valid : (T, H, W) bool, False where a pixel carries no weight
-    unit : electrons of a mean pixel, without the background
-    variance : mean noise variance of a pixel [electrons^2], with that of the background
-    known : the background that is given [electrons], broadcasts to the frames
-    free : the one that is not, `NONE` or `PER_FRAME`
-    errors : (T, H, W) standard deviations of the pixels [electrons] where they were measured; None: all are alike
+    frames : (T, H, W) in units of `unit`, with invalid pixels filled in and a known background subtracted
+    valid : (T, H, W) bool, False where a pixel has no weight
+    unit : mean pixel without background [electrons]
+    variance : mean noise variance of a pixel [electrons^2], including that of the background
+    known : known background [electrons], which broadcasts to the frames
+    free : unknown background, `NONE` or `PER_FRAME`
+    errors : (T, H, W) measured standard deviations of the pixels [electrons]; None if all pixels have `variance`
     """
 
     frames: Tensor
@@ -56,7 +56,7 @@ class FrameStack:
         """Check `frames` (T, H, W) [electrons] and measure their noise.
 
         `grid` is that of the shortest wavelength; `readout_noise` [electrons rms] may be None. Raises ValueError as
-        `check_frames`, `check_errors` and `expected_variance` do; warns if the object seems to reach beyond the field.
+        `check_frames`, `check_errors` and `expected_variance` do. Warns if the object seems to extend beyond the field.
         """
         frames, valid = check_frames(frames, valid, grid)
         errors = None if errors is None else check_errors(errors, frames, valid)
@@ -68,11 +68,11 @@ class FrameStack:
         light = frames - guess
         unit = float(light.mean())
         if not unit > 0:
-            raise ValueError("the frames hold nothing but their background: there is no object to restore")
+            raise ValueError("the frames hold only background, no object to restore: check background and the target")
         if border_brightness(light) > _BRIGHT_BORDER or float(guess.mean()) > _EVEN_LIGHT * float(frames.mean()):
             warnings.warn(
-                "the frames are bright at the border: does the object reach beyond the field? If that is a sky, give "
-                "what is known of it as background [electrons per pixel]",
+                "the frames are bright at the border: does the object extend beyond the field? If it is sky, give its "
+                "level as background [electrons per pixel]",
                 stacklevel=3,
             )
         return cls(frames / unit, valid, unit, variance, known, free, errors)
@@ -81,7 +81,7 @@ class FrameStack:
         return len(self.frames)
 
     def to(self, dtype: torch.dtype, device: torch.device) -> FrameStack:
-        """The stack in another precision, elsewhere."""
+        """Return the stack in another precision and on another device."""
         return replace(
             self,
             frames=self.frames.to(device, dtype),
@@ -92,7 +92,7 @@ class FrameStack:
 
     @property
     def precision(self) -> Tensor:
-        """Inverse noise variance of the pixels in units of the stack, (T, H, W), or (1, 1, 1) where all are alike."""
+        """Inverse noise variance of the pixels in units of the stack, (T, H, W), or (1, 1, 1) if all are equal."""
         if self.errors is not None:
             return torch.where(self.valid, self.unit / self.errors, 0).square()
         weight = self.valid.new_ones(1, 1, 1) if bool(self.valid.all()) else self.valid
@@ -100,14 +100,14 @@ class FrameStack:
 
     @property
     def change(self) -> float:
-        """Chi-square per pixel of the frames against their mean, each with its own light."""
+        """Chi-square per pixel of the frames against their mean, scaled to the light of each frame."""
         light = self.frames - self.free.first_guess(self.frames)
         moved = light - light.mean((1, 2), keepdim=True) * light.mean(0)
         return float((moved**2 * self.precision).mean())
 
     @property
     def contrast(self) -> float:
-        """Chi-square per pixel of the mean frame against an even one: 1 where frames show nothing but noise."""
+        """Chi-square per pixel of the mean frame against a uniform one, 1 if the frames show only noise."""
         weight = self.precision.expand_as(self.frames)
         total = weight.sum(0)
         mean = (weight * self.frames).sum(0) / total.clamp(min=torch.finfo(total.dtype).tiny)
@@ -116,14 +116,14 @@ class FrameStack:
 
     @property
     def photon_share(self) -> float:
-        """The part of the noise variance that is photon noise, at most 1; 0 where `precision` holds it already."""
+        """Fraction of the noise variance that is photon noise, at most 1; 0 if `errors` include it already."""
         if self.errors is not None:
             return 0.0
         return min(1.0, self.unit / self.variance)
 
 
 def border_brightness(frames: Tensor) -> float:
-    """Mean of the mean frame's outermost pixels over the mean of all."""
+    """Return the mean of the mean frame's outermost pixels, divided by the mean of all its pixels."""
     mean = frames.mean(0)
     border = torch.cat([mean[0], mean[-1], mean[1:-1, 0], mean[1:-1, -1]])
     return float(border.mean() / mean.mean())

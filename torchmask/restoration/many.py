@@ -1,4 +1,4 @@
-"""Several stacks restored side by side, one on each core of a machine or a cluster."""
+"""Restoration of several stacks in parallel, one on each core of a machine or a cluster."""
 
 from __future__ import annotations
 
@@ -24,33 +24,36 @@ def restore_many(
     n_workers: int | None = None,
     callback: Callback | None = None,
 ) -> list[RestorationResult | Exception]:
-    """Restore every stack, each on one core; what goes wrong with one harms no other.
+    """Restore every stack, each on one core; an error in one does not affect the others.
 
     Parameters
     ----------
-    method : MyopicDeconvolution, or one for each stack
+    method : MyopicDeconvolution or sequence of MyopicDeconvolution
+        One method for all stacks, or one for each.
     stacks : sequence
-        Frames (T, H, W) [electrons], or observations, whose valid pixels and errors count.
-    n_samples, seed : int
-        As for `MyopicDeconvolution.restore`.
+        Frames (T, H, W) [electrons], or observations, whose valid pixels and errors are used.
+    n_samples : int
+        Number of posterior samples, as for `MyopicDeconvolution.restore`.
+    seed : int
+        Seed of the posterior samples, as for `MyopicDeconvolution.restore`.
     backend : {"loky", "ray"}
         Processes on this machine (extra `design`), or a Ray cluster (extra `cluster`).
     n_workers : int, optional
-        How many stacks at once; by default one per core. With 1 and "loky" they are restored in this process.
+        Number of stacks restored at a time, one per core by default. With 1 and "loky" no process is started.
     callback : callable, optional
-        Gets a `Record` of stage "stacks" after each stack: how many are done, and of that one its number, and
-        chi-square and iterations, or NaN if it failed.
+        Receives a `Record` of stage "stacks" after each stack, with the number of finished stacks, and the index,
+        chi-square and iterations of the latest one, NaN if it failed.
 
     Returns
     -------
     list
-        In the order of `stacks`: a `RestorationResult`, or the exception that the restoration ended with.
+        In the order of `stacks`, a `RestorationResult` or the exception that the restoration raised.
 
     Raises
     ------
     ValueError
-        Before any work: unknown backend, a number of workers below 1, missing joblib or Ray, not as many methods as
-        stacks, a single tensor in place of a sequence of them.
+        Before any work, if the backend is unknown or not installed, `n_workers` is below 1, the numbers of methods and
+        stacks differ, or `stacks` is a single tensor.
 
     Examples
     --------
@@ -82,17 +85,17 @@ def restore_in_turn(
     n_workers: int | None = None,
     callback: Callback | None = None,
 ) -> Iterator[tuple[int, RestorationResult | Exception]]:
-    """The same as `restore_many`, stack by stack as they end: their numbers, and what they came to."""
+    """Yield the index and the result of each stack as it finishes; otherwise the same as `restore_many`."""
     require_backend(backend, n_workers)
     if isinstance(stacks, Tensor):
         raise ValueError(
-            f"stacks is one tensor of shape {tuple(stacks.shape)}: give a list of stacks (T, H, W), or take "
-            "method.restore for one"
+            f"stacks is one tensor of shape {tuple(stacks.shape)}: give a list of stacks (T, H, W), or use "
+            "method.restore for a single one"
         )
     methods = [method] * len(stacks) if isinstance(method, MyopicDeconvolution) else list(method)
     if len(methods) != len(stacks):
         raise ValueError(
-            f"{len(methods)} methods are given for {len(stacks)} stacks: one for all, or as many are needed"
+            f"{len(methods)} methods are given for {len(stacks)} stacks: give one for all, or one for each"
         )
     restore = partial(_restore, n_samples=n_samples, seed=seed)
     tasks = dict(enumerate(zip(methods, stacks, strict=True)))

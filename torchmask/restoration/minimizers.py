@@ -1,4 +1,4 @@
-"""Optimisers of `torch.optim` as minimisers with bounds, to compare with or to build on."""
+"""Optimisers of `torch.optim` as minimisers with bounds, for comparison or as a basis for your own."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ OptimizerFactory = Callable[[Iterable[Tensor]], torch.optim.Optimizer]
 
 @dataclass(frozen=True)
 class TorchMinimizer:
-    """Any optimiser of `torch.optim`, each step of which is projected on the bounds.
+    """An optimiser of `torch.optim` whose steps are projected onto the bounds.
 
     Parameters
     ----------
     factory : callable
-        Makes an optimiser of the parameters it is given, such as `partial(torch.optim.Adam, lr=0.1)`. Variables are
-        scaled such that the diagonal of the Hessian is about 1. Every descent has a fresh optimiser.
+        Function that returns an optimiser for given parameters, such as `partial(torch.optim.Adam, lr=0.1)`. Variables
+        are scaled so that the diagonal of the Hessian is about 1. Every descent has a new optimiser.
     steps : int
-        Of the optimiser, which make one iteration of the restoration.
+        Number of steps of the optimiser in one iteration of the restoration.
 
     Raises
     ------
     TypeError
-        If `factory` makes something else.
+        If `factory` does not return an optimiser.
     ValueError
         If `steps` is below 1.
 
@@ -50,12 +50,12 @@ class TorchMinimizer:
             raise ValueError(f"steps is {self.steps}: it must be at least 1")
         made = self.factory([torch.zeros(1)])
         if not isinstance(made, torch.optim.Optimizer):
-            raise TypeError(f"factory makes a {type(made).__name__}: it must make an optimiser of torch.optim")
+            raise TypeError(f"factory returns a {type(made).__name__}: it must return an optimiser of torch.optim")
 
     def __call__(
         self, cost: Cost, start: Tensor, lower: Tensor, *, max_iterations: int, callback: AfterIteration | None = None
     ) -> Minimum:
-        """Lower `cost` by `max_iterations` times `steps` steps; the best point that was evaluated comes back.
+        """Minimise `cost` by `max_iterations` times `steps` steps, and return the best point that was evaluated.
 
         Raises ValueError if the shapes differ or the cost is not finite at the start.
         """
@@ -66,7 +66,7 @@ class TorchMinimizer:
 
         def closure() -> float:
             nonlocal best, least, evaluations
-            point = torch.maximum(x.detach(), lower)  # a step of several evaluations leaves the bounds on its way
+            point = torch.maximum(x.detach(), lower)  # a step with several evaluations may leave the bounds in between
             value, gradient = cost(point)
             x.grad = gradient * (x.detach() >= lower)
             if not evaluations:

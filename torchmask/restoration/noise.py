@@ -1,4 +1,4 @@
-"""How strong the noise of a stack of frames is: what is known of it beside what the frames tell."""
+"""The noise variance of a stack of frames, from what is known about it and from the frames themselves."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.noise import noise_variance
 
-_CLEARLY_MORE = 1.1  # than expected: a few times the error of what one small frame tells
+_CLEARLY_MORE = 1.1  # times the expected variance, a few times the error of the estimate from one small frame
 
 
 def expected_variance(
@@ -23,11 +23,12 @@ def expected_variance(
     valid: Tensor | None = None,
     errors: Tensor | None = None,
 ) -> float:
-    """Mean noise variance of a pixel [electrons^2]: that of `errors`, else photon and read-out noise, else measured.
+    """Return the mean noise variance of a pixel [electrons^2].
 
-    Noise that is clearly more than the light of the frames tells is what is left of a sky that was subtracted, or of a
-    dark current: what `noise_variance` measures counts then. Raises ValueError if nothing tells the noise; warns if two
-    ways are open and disagree by more than a factor of 2.
+    It is that of `errors` if they are given, else that of photon and read-out noise if `readout_noise` is given, else
+    measured by `noise_variance`. Noise clearly above that of photons and read-out comes from a sky that was subtracted
+    or from a dark current; then the measured value is used. Raises ValueError if the noise is neither given nor
+    measurable. Warns if the given and the measured variance differ by more than a factor of 2.
     """
     measured = noise_variance(frames, grid, aperture, valid)
     if errors is not None:
@@ -40,8 +41,8 @@ def expected_variance(
         raise ValueError("the noise cannot be measured beyond the cut-off frequency: give readout_noise or errors")
     if measured is not None and not 0.5 < measured / variance < 2:
         warnings.warn(
-            f"the frames' noise is {measured**0.5:.3g} electrons rms, but {told} make {variance**0.5:.3g}: check the "
-            f"gain and {told.split()[-1]}",
+            f"the noise of the frames is {measured**0.5:.3g} electrons rms, but {told} give {variance**0.5:.3g}: check "
+            f"the gain and {told.split()[-1]}",
             stacklevel=4,
         )
     more_than_light = errors is None and measured is not None and measured > _CLEARLY_MORE * variance
@@ -49,9 +50,9 @@ def expected_variance(
 
 
 def check_errors(errors: Tensor | np.ndarray, frames: Tensor, valid: Tensor) -> Tensor:
-    """Standard deviations of pixels (T, H, W) [electrons], where (H, W) are those of every frame (T, H, W).
+    """Return `errors`, standard deviations of pixels [electrons], as (T, H, W); (H, W) applies to every frame.
 
-    Raises ValueError if their shape is another, or that of a valid pixel is not finite and positive.
+    Raises ValueError if they have another shape, or that of a valid pixel is not finite and positive.
     """
     given = torch.as_tensor(errors, dtype=frames.dtype, device=frames.device)
     if tuple(given.shape) not in (tuple(frames.shape), tuple(frames.shape[1:])):

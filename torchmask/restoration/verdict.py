@@ -1,4 +1,4 @@
-"""The verdict on a restoration: whether object and aberrations explain the frames, which they do not, what to check."""
+"""The verdict on a restoration: whether it explains the frames, which frames it does not, and what to check."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from torch import Tensor
 
 from torchmask.restoration.model_error import ModelError
 
-_SURE = 5.0  # standard deviations of noise, above which a mean frame shows something
-_LOST = 2.0  # a single frame may leave so many times more than the stack
+_SURE = 5.0  # standard deviations of the noise above which the mean frame shows an object
+_LOST = 2.0  # times the tolerance of the stack is allowed for a single frame
 
 
 class Finding(Enum):
-    """What a verdict comes to."""
+    """Outcome of a verdict."""
 
     EXPLAINED = "explained"
     NOT_EXPLAINED = "not explained"
@@ -26,18 +26,18 @@ class Finding(Enum):
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether what was restored explains the frames.
+    """Whether a restoration explains the frames.
 
-    finding : what it comes to
-    chi_square : of the residuals, over its degrees of freedom
-    degrees_of_freedom : valid pixels, less what was fitted to each frame as far as its prior left it free. The object
-        is not counted: its prior holds it, and all frames share it
-    model_error : what modes that the model leaves out are expected to add to the chi-square
+    finding : outcome
+    chi_square : chi-square of the residuals over its degrees of freedom
+    degrees_of_freedom : number of valid pixels, less the effective number of parameters fitted to each frame, given
+        their prior. The object is not counted, as its prior constrains it and all frames share it
+    model_error : expected contribution to the chi-square of modes that the model leaves out
     limit : chi-square up to which the frames count as explained
     phase_error : rms of the modes left out, over a sub-aperture [rad]
-    frames : those that are not explained by themselves, counted from 0
-    n_frames : of the stack
-    check : what may be wrong; empty if all is explained
+    frames : frames that are not explained individually, counted from 0
+    n_frames : number of frames in the stack
+    check : what may be wrong; empty if everything is explained
 
     Examples
     --------
@@ -63,7 +63,7 @@ class Verdict:
 
     @property
     def excess(self) -> float:
-        """Chi-square beyond that of noise."""
+        """Chi-square in excess of that of noise."""
         return self.chi_square - 1
 
     def __str__(self) -> str:
@@ -76,12 +76,12 @@ class Verdict:
         return f"{self.finding.value}: {'; '.join([*parts, numbers])}"
 
     def to_json(self) -> dict[str, Any]:
-        """The same as plain values, with what `str` says as "text"."""
+        """Return the verdict as plain values, with the string of `str` as "text"."""
         return asdict(self) | {"finding": self.finding.name, "explained": self.explained, "text": str(self)}
 
     @classmethod
     def from_json(cls, text: str) -> Verdict:
-        """Read what `json.dumps` made of `to_json`. Raises ValueError for anything else."""
+        """Read a verdict from the output of `to_json` as JSON text. Raises ValueError for anything else."""
         try:
             values = {name: value for name, value in json.loads(text).items() if name not in ("explained", "text")}
             values |= {"finding": Finding[values["finding"]], "frames": tuple(values["frames"])}
@@ -92,11 +92,11 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Tolerance:
-    """What counts as explained.
+    """Excess of the chi-square up to which frames count as explained.
 
-    model_errors : so many times the expected model error may be left
-    chance : and so many standard deviations of the chi-square
-    least : or this much, if that is more
+    model_errors : allowance for the model error, in units of its expected value
+    chance : allowance for chance, in standard deviations of the chi-square, which is added
+    least : minimum of the allowance for the model error
     """
 
     model_errors: float
@@ -107,10 +107,10 @@ class Tolerance:
 def judge(
     chi_square: Tensor, pixels: Tensor, contrast: float, error: ModelError, tolerance: Tolerance, *, at_rest: bool
 ) -> Verdict:
-    """The verdict on frames with a mean square residual `chi_square` (T,), over so many valid `pixels` (T,).
+    """Return the verdict on frames with mean square residuals `chi_square` (T,) over `pixels` (T,) valid pixels.
 
-    `contrast` is the chi-square per pixel of the mean frame against an even one, `at_rest` says whether the search was
-    left to its end.
+    `contrast` is the chi-square per pixel of the mean frame against a uniform one; `at_rest` says whether the search
+    ran to its end.
     """
     chi_square, pixels = chi_square.double().cpu(), pixels.double().cpu()
     free = (pixels - error.fitted).clamp(min=1)

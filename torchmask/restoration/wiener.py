@@ -1,4 +1,4 @@
-"""The best linear restoration when every transfer function is known."""
+"""The best linear restoration for known transfer functions."""
 
 from __future__ import annotations
 
@@ -10,26 +10,29 @@ from torchmask.spectra import PSD, evaluate_psd
 
 
 def multiframe_wiener(frames: Tensor, otfs: Tensor, object_psd: PSD, noise_psd: PSD) -> Tensor:
-    """Multi-frame Wiener estimate: O = sum_t conj(H_t) Y_t / (sum_t |H_t|^2 + S_n / S_o).
+    """Return the multi-frame Wiener estimate: O = sum_t conj(H_t) Y_t / (sum_t |H_t|^2 + S_n / S_o).
 
     Parameters
     ----------
     frames : (..., T, H, W) tensor
+        Exposures in any unit.
     otfs : (..., T, H, W) complex tensor
-        In FFT order, 1 at zero frequency.
-    object_psd, noise_psd : callable or Tensor
-        As for `torchmask.design.criterion.wiener_mse`, in the convention of an unnormalised DFT; that of the noise is
-        of one frame. An object PSD of zero sets that frequency to zero.
+        OTF of each frame in FFT order, 1 at zero frequency.
+    object_psd : callable or Tensor
+        PSD of the object in the convention of an unnormalised DFT, as for `torchmask.design.criterion.wiener_mse`.
+        Frequencies at which it is zero become zero.
+    noise_psd : callable or Tensor
+        PSD of the noise of one frame, in the same convention.
 
     Returns
     -------
     Tensor
-        (..., H, W) in the units of the frames, of their dtype; differentiable. Its mean squared error is `wiener_mse`.
+        (..., H, W) in the unit and dtype of the frames, differentiable. Its mean squared error is `wiener_mse`.
 
     Raises
     ------
     ValueError, TypeError
-        If frames and OTFs do not broadcast to each other, or a PSD is of a wrong type, shape or sign.
+        If frames and OTFs do not broadcast to each other, or a PSD has a wrong type, shape or sign.
 
     Examples
     --------
@@ -54,6 +57,6 @@ def multiframe_wiener(frames: Tensor, otfs: Tensor, object_psd: PSD, noise_psd: 
     matched = (otfs.conj() * torch.fft.fft2(frames)).sum(-3)
     power = (otfs.real**2 + otfs.imag**2).sum(-3)
     denominator = signal * power + noise
-    # Where nothing is known, neither signal nor noise, the estimate is 0.
+    # Where signal and noise are both zero, the estimate is 0.
     gain = torch.where(denominator > 0, signal / torch.where(denominator > 0, denominator, 1), 0)
     return torch.fft.ifft2(matched * gain).real
