@@ -175,7 +175,7 @@ def test_mistakes_about_files(tmp_path, capsys):
     refused(capsys, "unknown kind", "view", tmp_path / "text.txt")
     refused(capsys, "bad.npz", "view", tmp_path / "bad.npz")
     refused(capsys, "bad.fits", "view", tmp_path / "bad.fits")
-    refused(capsys, "no mask that can be read", "view", tmp_path / "other.json")
+    refused(capsys, "cannot be read as a mask", "view", tmp_path / "other.json")
     refused(capsys, "is not a run folder", "view", tmp_path / "empty")
     save_npz(tmp_path / "half.npz", {"frames": np.zeros((2, 8, 8))})
     refused(capsys, "has no centers", "view", tmp_path / "half.npz")

@@ -263,7 +263,7 @@ def test_contradictions_and_impossible_symmetries_are_refused():
         (lambda: FixedHoles([(0.0, 0.0)], indices=[1, 2]), "indices is"),
         (lambda: FixedHoles([(0.0, 0.0)], indices=[-1]), "counted from 0"),
         (lambda: NFoldSymmetry(1), "n_fold is 1"),
-        (lambda: FixedHoles([(0.0, 0.0)], indices=[4]).equations(3), "mask of 3"),
+        (lambda: FixedHoles([(0.0, 0.0)], indices=[4]).equations(3), "mask has 3 holes"),
     ],
 )
 def test_bad_rules_are_refused(make, message):

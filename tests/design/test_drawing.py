@@ -105,16 +105,16 @@ def test_drawings_that_are_no_mask_are_refused(tmp_path):
     hole = {"layer": "HOLES"}
     refuse("unequal", "holes differ", widen)
     corners = [(math.cos(k * math.pi / 3), math.sin(k * math.pi / 3)) for k in range(6)]
-    refuse("mixed", "one kind is needed", lambda _, plate: plate.add_lwpolyline(corners, dxfattribs=hole))
+    refuse("mixed", "all must be equal", lambda _, plate: plate.add_lwpolyline(corners, dxfattribs=hole))
     unknown = "corners is none of the known shapes"
     bent = [*corners[:5], (2, 0)]
     refuse("bent", f"6 {unknown}", lambda _, plate: plate.add_lwpolyline(bent, dxfattribs=hole))
     refuse("open", f"5 {unknown}", lambda _, plate: plate.add_lwpolyline(corners[:5], dxfattribs=hole))
     refuse("rims", "layer OUTLINE holds 2 circles", lambda _, plate: plate.add_circle((0, 0), 1, {"layer": "OUTLINE"}))
-    refuse("scale", "millimetres stand for a metre", lambda drawing, _: drawing.header.custom_vars.clear())
+    refuse("scale", "does not give its scale", lambda drawing, _: drawing.header.custom_vars.clear())
     foreign = ezdxf.new()
     foreign.saveas(tmp_path / "foreign.dxf")
-    with pytest.raises(ValueError, match="millimetres stand for a metre"):
+    with pytest.raises(ValueError, match="does not give its scale"):
         load_mask(tmp_path / "foreign.dxf")
 
 

@@ -54,7 +54,7 @@ def test_what_is_no_list_of_rules_is_refused(constraints):
         lambda: project(MASK, constraints),
         lambda: refine_mask(lambda mask: mask.centers.sum(), MASK, constraints=constraints),
     ):
-        with pytest.raises(TypeError, match="a list of rules is needed"):
+        with pytest.raises(TypeError, match="a list of constraints is needed"):
             call()
 
 

@@ -1,4 +1,4 @@
-"""CMA-ES over the positions of the holes: the search of the published method."""
+"""CMA-ES over the positions of the holes, the search of the published method."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ POPULATION = 32
 def evolve(
     criterion: Criterion, holes: Holes, budget: int, rng: np.random.Generator, monitor: Monitor
 ) -> tuple[Tensor, int]:
-    """The best point x (1, F) of CMA-ES with a quadratic penalty for broken rules, and the evaluations used.
+    """Return the best point x (1, F) of CMA-ES with a quadratic penalty on constraints, and the evaluations used.
 
-    Starts from a random mask with steps of a fifth of the mask diameter, each generation in one batched call, and
-    begins anew from another one when it has come to rest and there is budget left. N. Hansen, The CMA evolution
-    strategy: a tutorial, arXiv:1604.00772; package `cma`.
+    It starts from a random mask with steps of a fifth of the mask diameter, evaluates each generation in one batched
+    call, and restarts from another random mask when it has converged and budget is left. Source: N. Hansen, The CMA
+    evolution strategy: a tutorial, arXiv:1604.00772; package `cma`.
     """
     with extra("design"):
         import cma
@@ -34,7 +34,7 @@ def evolve(
         options = {
             "popsize": population,
             "randn": lambda *shape: rng.standard_normal(shape),
-            # pycma would seed NumPy's global state, log to outcmaes/ and obey cma_signals.in
+            # By default pycma seeds NumPy's global state, logs to outcmaes/ and reads cma_signals.in.
             "seed": np.nan,
             "verbose": -9,
             "verb_log": 0,

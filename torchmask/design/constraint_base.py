@@ -1,8 +1,8 @@
-"""Rules on the positions of holes, the subspace they leave free, and the way back to a mask that obeys them.
+"""Base classes of constraints on the positions of holes, the subspace of linear ones, and projection onto all of them.
 
-An inequality is a set of margins: signed clearances in metres, at least 0 where it holds. An equality is linear in
-the centres, so that a search moves in the subspace it leaves and obeys it at every step. All functions take an
-aperture whose `centers` (..., N, 2) may carry leading population axes, and follow its dtype, device and gradient.
+An inequality is a set of margins, signed clearances in metres that are at least 0 where it holds. An equality is linear
+in the centres, so a search moves in the remaining subspace and satisfies it at every step. All functions take an
+aperture whose `centers` (..., N, 2) may have leading population axes, and follow its dtype, device and gradient.
 """
 
 from __future__ import annotations
@@ -23,56 +23,56 @@ Array = np.ndarray
 
 
 class Infeasible(ValueError):
-    """No mask obeys the rules, or none was found."""
+    """No mask satisfies the constraints, or none was found."""
 
 
 class Constraint(ABC):
-    """A rule on the positions of the holes."""
+    """A constraint on the positions of the holes."""
 
     @abstractmethod
     def residuals(self, aperture: SparseAperture) -> Tensor:
-        """Shortfalls (..., M) [m], 0 where the rule holds."""
+        """Return the shortfalls (..., M) [m], 0 where the constraint holds."""
 
     def penalty(self, aperture: SparseAperture) -> Tensor:
-        """Sum of the squared shortfalls (...) [m^2]: smooth, and 0 exactly where the rule holds."""
+        """Return the sum of the squared shortfalls (...) [m^2], smooth and 0 exactly where the constraint holds."""
         return (self.residuals(aperture) ** 2).sum(-1)
 
     def violation(self, aperture: SparseAperture) -> Tensor:
-        """Largest shortfall (...) [m]."""
+        """Return the largest shortfall (...) [m]."""
         shortfalls = self.residuals(aperture).detach().abs()
         return shortfalls.amax(-1) if shortfalls.shape[-1] else shortfalls.sum(-1)
 
     def project(self, aperture: SparseAperture) -> SparseAperture:
-        """The mask nearest to `aperture` that obeys this rule. Raises `Infeasible` if none is found."""
+        """Return the mask nearest to `aperture` that satisfies it. Raises `Infeasible` if none is found."""
         return project(aperture, [self])
 
 
 class Inequality(Constraint):
-    """A rule `margins >= 0`.
+    """A constraint `margins >= 0`.
 
-    length : name of the field [m] that says how much a dataclass of this kind asks for, so that a search that finds
-        no room can say how much would fit; None if there is none
+    length : name of the dataclass field [m] that sets how strict the constraint is, so that a search that finds no
+        room can say which value would fit; None if there is none
     """
 
     length: ClassVar[str | None] = None
 
     @abstractmethod
     def margins(self, aperture: SparseAperture) -> Tensor:
-        """Signed clearances (..., M) [m]."""
+        """Return the signed clearances (..., M) [m]."""
 
     def residuals(self, aperture: SparseAperture) -> Tensor:
         return (-self.margins(aperture)).clamp(min=0)
 
 
 class LinearEquality(Constraint):
-    """A rule `matrix @ centers.flatten() = values`: it pins holes, or ties them together by turns about the centre.
+    """A constraint `matrix @ centers.flatten() = values`, which fixes holes or relates them by rotations.
 
-    Searches stretch the disc radially and count on such rules to survive that.
+    Searches stretch the disc radially, which must leave such constraints satisfied.
     """
 
     @abstractmethod
     def equations(self, n_subapertures: int) -> tuple[Array, Array]:
-        """(matrix (M, 2N), values (M) [m]) for the flattened centres x_0, y_0, x_1, ..."""
+        """Return matrix (M, 2N) and values (M) [m] for the flattened centres x_0, y_0, x_1, ..."""
 
     def residuals(self, aperture: SparseAperture) -> Tensor:
         matrix, values = (torch.as_tensor(a).to(aperture.centers) for a in self.equations(aperture.n_subapertures))
@@ -80,7 +80,7 @@ class LinearEquality(Constraint):
 
 
 class Subspace:
-    """The masks of N holes that obey all linear equalities: centers = origin + basis z, z (..., F) [m].
+    """The masks of N holes that satisfy all linear equalities: centers = origin + basis z, z (..., F) [m].
 
     The columns of `basis` are orthonormal, so lengths in z are lengths in the flattened centres.
 
@@ -100,11 +100,11 @@ class Subspace:
         origin = right[:rank].T @ ((left[:, :rank].T @ values) / singular[:rank])
         if np.abs(matrix @ origin - values).max(initial=0.0) > 1e-12 * max(1.0, np.abs(values).max(initial=0.0)):
             names = " and ".join(str(c) for c in constraints if isinstance(c, LinearEquality))
-            raise Infeasible(f"no mask of {n_subapertures} holes obeys {names} together")
+            raise Infeasible(f"no mask of {n_subapertures} holes obeys {names} together: leave one out")
         like = torch.zeros((), dtype=torch.float64) if like is None else like
         self.origin: Tensor = torch.as_tensor(origin).to(like)
         self.basis: Tensor = torch.as_tensor(right[rank:].T.copy()).to(like)
-        # What z must change by so that one hole moves by a given step, with the smallest change elsewhere.
+        # The change of z that moves one hole by a given step, with the smallest change elsewhere.
         rows = right[rank:].T.reshape(n_subapertures, 2, -1)
         self.lift: Tensor = torch.as_tensor(np.linalg.pinv(rows, rcond=1e-9)).to(like)  # (N, F, 2)
 
@@ -114,41 +114,41 @@ class Subspace:
         return self.basis.shape[1]
 
     def centers(self, z: Tensor) -> Tensor:
-        """(..., F) -> (..., N, 2)."""
+        """Return the centres (..., N, 2) at coordinates (..., F)."""
         return (self.origin + z @ self.basis.T).unflatten(-1, (-1, 2))
 
     def coordinates(self, centers: Tensor) -> Tensor:
-        """(..., N, 2) -> (..., F), of the nearest point of the subspace."""
+        """Return the coordinates (..., F) of the point of the subspace that is nearest to centres (..., N, 2)."""
         return (centers.flatten(-2) - self.origin) @ self.basis
 
     def spread(self) -> Tensor:
-        """A step (F,) that sends every hole its own way, as far as the equalities let it: by the golden angle."""
+        """Return a step (F,) that moves every hole in its own direction (by the golden angle), within the subspace."""
         angles = math.pi * (3 - math.sqrt(5)) * torch.arange(len(self.lift), dtype=self.basis.dtype)
         return torch.stack([angles.cos(), angles.sin()], dim=-1).flatten() @ self.basis
 
     def place(self, z: Tensor, hole: int, position: Tensor) -> Tensor:
-        """Move one hole to `position` (..., 2) as far as the equalities let it, and all that is tied to it."""
+        """Move one hole to `position` (..., 2), or as near as the equalities allow, with the holes tied to it."""
         return z + (position - self.centers(z)[..., hole, :]) @ self.lift[hole].T
 
 
 def require_constraints(constraints: Sequence[Constraint]) -> None:
-    """Raise TypeError unless these are rules, in a sequence."""
+    """Raise TypeError unless `constraints` is a sequence of constraints."""
     given = constraints if isinstance(constraints, Sequence) else [constraints]
     if given is not constraints or not all(isinstance(rule, Constraint) for rule in given):
-        raise TypeError(f"constraints is {constraints}: a list of rules is needed, such as [KeepOutDisc(0.2)]")
+        raise TypeError(f"constraints is {constraints}: a list of constraints is needed, such as [KeepOutDisc(0.2)]")
 
 
 def all_margins(aperture: SparseAperture, constraints: Sequence[Constraint]) -> Tensor:
-    """Margins of all inequalities side by side (..., M) [m]."""
+    """Return the margins of all inequalities, concatenated (..., M) [m]."""
     margins = [c.margins(aperture) for c in constraints if isinstance(c, Inequality)]
     return torch.cat(margins, dim=-1) if margins else aperture.centers.flatten(-2)[..., :0]
 
 
 def project(aperture: SparseAperture, constraints: Sequence[Constraint]) -> SparseAperture:
-    """The mask nearest to `aperture` that obeys all `constraints`, to rounding.
+    """Return the mask nearest to `aperture` that satisfies all `constraints`, to rounding.
 
-    Nearest in the sum of squared shifts, by sequential quadratic programming; each mask of a population by itself.
-    The result carries no gradient.
+    Nearest means the smallest sum of squared shifts, found by sequential quadratic programming. Masks of a population
+    are projected one by one. The result has no gradient.
 
     Raises
     ------
@@ -159,7 +159,7 @@ def project(aperture: SparseAperture, constraints: Sequence[Constraint]) -> Spar
     centers = aperture.centers.detach()
     double = aperture.replace(centers=centers.double().cpu())
     subspace = Subspace(aperture.n_subapertures, constraints)
-    # What is returned is rounded to the dtype of the aperture, and must still hold.
+    # The result is rounded to the dtype of the aperture and must still satisfy the constraints.
     slack = aperture.mask_diameter * (1e-12 if centers.dtype == torch.float64 else 8 * torch.finfo(centers.dtype).eps)
     masks = [
         _project_one(double.replace(centers=one), subspace, constraints, slack)
@@ -175,7 +175,7 @@ def _project_one(
     slack = slack / scale
     margins = _margin_function(aperture, subspace, constraints)
     nearest = subspace.coordinates(aperture.centers).numpy() / scale
-    nudge = 1e-9 * subspace.spread().numpy()  # holes that coincide, or sit on an axis, must part somehow
+    nudge = 1e-9 * subspace.spread().numpy()  # separates coincident holes, which have no direction to part in
     z = nearest
     relevant = np.zeros(0, dtype=bool)
     while True:
@@ -183,21 +183,21 @@ def _project_one(
         shortfall = -values.min(initial=np.inf)
         if shortfall <= -slack / 2:
             return subspace.centers(torch.as_tensor(z * scale))
-        # Only margins near zero matter; others may come near as the holes move, so look again.
+        # Only margins near zero matter. Others may come near as the holes move, so this is repeated.
         near = values < (0.05 if shortfall > 1e-3 else 0.002)
         before, relevant = relevant, near | relevant if len(relevant) else near
         if len(before) and not (relevant & ~before).any():
             names = ", ".join(map(str, constraints))
             raise Infeasible(f"no mask near the given one obeys {names}: {shortfall * scale:.3g} m are missing")
         rows = np.flatnonzero(relevant)
-        # From afar the nearest mask is a matter of optimisation; what is then left goes by Newton's method.
+        # From far away the nearest mask takes an optimisation; Newton's method removes the remaining shortfall.
         if shortfall > 1e-3:
             z = _nearest_point(nearest, z + nudge, margins, rows, slack)
         z = _onto(z, margins, rows, slack)
 
 
 def _nearest_point(target: Array, start: Array, margins: _Margins, rows: Array, slack: float) -> Array:
-    """argmin |z - target|^2 subject to margins >= slack."""
+    """Return argmin |z - target|^2 subject to margins >= slack."""
     result = minimize(
         lambda z: (0.5 * ((z - target) ** 2).sum(), z - target),
         start,
@@ -214,7 +214,7 @@ def _nearest_point(target: Array, start: Array, margins: _Margins, rows: Array, 
 
 
 def _onto(z: Array, margins: _Margins, rows: Array, slack: float) -> Array:
-    """The smallest steps onto the margins that are short, repeated: converges quadratically from nearby."""
+    """Repeat the smallest step that satisfies the violated margins, which converges quadratically from nearby."""
     for _ in range(30):
         values = margins.values(z)[rows]
         short = values < slack
@@ -225,7 +225,7 @@ def _onto(z: Array, margins: _Margins, rows: Array, slack: float) -> Array:
 
 
 class _Margins(NamedTuple):
-    """Margins (M) and the Jacobian (rows, F) of some of them, at z (F); all lengths in mask diameters."""
+    """Functions for the margins (M) and the Jacobian (rows, F) of some of them, at z (F), in mask diameters."""
 
     values: Callable[[Array], Array]
     jacobian: Callable[[Array, Array], Array]
@@ -242,7 +242,7 @@ def _margin_function(aperture: SparseAperture, subspace: Subspace, constraints: 
             return margins(torch.as_tensor(z)).numpy()
 
     def jacobian(z: Array, rows: Array) -> Array:
-        # One copy of the mask a row: the gradient of the sum of the rows' own margins is the Jacobian.
+        # With one copy of the mask per row, the gradient of the sum of each copy's own margin is the Jacobian.
         copies = torch.as_tensor(z).expand(len(rows), -1).clone().requires_grad_()
         own = margins(copies)[torch.arange(len(rows)), torch.as_tensor(rows)]
         return torch.autograd.grad(own.sum(), copies)[0].numpy()

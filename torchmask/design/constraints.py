@@ -1,6 +1,6 @@
-"""What a mask must obey: small objects, each with a penalty, a violation and a projection.
+"""Constraints on masks, each with a penalty, a violation and a projection.
 
-Every search obeys `InsideDisc` and `NoOverlap` without being told; the others are handed to it.
+Every search applies `InsideDisc` and `NoOverlap`; others are passed to it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from torchmask.optics.shape_base import safe_length
 
 @dataclass(frozen=True)
 class InsideDisc(Inequality):
-    """Every hole lies wholly inside the disc of diameter `mask_diameter`. N margins, one a hole."""
+    """Every hole lies wholly inside the disc of diameter `mask_diameter`. N margins, one per hole."""
 
     def margins(self, aperture: SparseAperture) -> Tensor:
         return aperture.shape.clearance(aperture.centers, aperture.subaperture_diameter, aperture.mask_diameter)
@@ -30,7 +30,7 @@ class InsideDisc(Inequality):
 
 @dataclass(frozen=True)
 class RimMargin(Inequality):
-    """Between any hole and the rim of the mask disc at least `margin` [m] of solid material. N margins, one a hole."""
+    """At least `margin` [m] of material lies between every hole and the rim of the mask disc. N margins."""
 
     length: ClassVar[str] = "margin"
 
@@ -46,10 +46,10 @@ class RimMargin(Inequality):
 
 @dataclass(frozen=True)
 class MinimumGap(Inequality):
-    """Between any two holes at least `gap` [m] of solid material. N(N-1)/2 margins, one a pair.
+    """At least `gap` [m] of material lies between any two holes. N(N-1)/2 margins, one per pair.
 
     For hexagons the gap is measured along the normal of a side, which is exact for sides that face each other and
-    never more than the true distance.
+    never exceeds the true distance.
     """
 
     length: ClassVar[str] = "gap"
@@ -80,9 +80,9 @@ class KeepOutDisc(Inequality):
     Parameters
     ----------
     diameter : float
-        [m].
+        Diameter of the disc [m].
     center : (float, float)
-        (x, y) [m].
+        Centre (x, y) of the disc [m].
     """
 
     length: ClassVar[str] = "diameter"
@@ -102,14 +102,16 @@ class KeepOutDisc(Inequality):
 
 @dataclass(frozen=True)
 class KeepOutSegment(Inequality):
-    """No hole reaches into a thick segment, such as a spider or the gap between two mirror segments. N margins.
+    """No hole reaches into a thick line, such as a spider vane or the gap between two mirror segments. N margins.
 
-    The segment has round ends. Hexagons count as their circumscribed discs.
+    The line has round ends. Hexagons count as their circumscribed discs.
 
     Parameters
     ----------
-    start, end : (float, float)
-        (x, y) [m].
+    start : (float, float)
+        First end (x, y) [m].
+    end : (float, float)
+        Second end (x, y) [m].
     width : float
         Full width [m]; 0 for a line.
     """
@@ -133,7 +135,7 @@ class KeepOutSegment(Inequality):
         length = torch.linalg.vector_norm(end - start)
         along = (end - start) / length
         offset = aperture.centers - start
-        # From the nearest point of the segment: across it, and beyond its ends. On the axis a hole leaves sideways.
+        # Vector from the nearest point of the segment. On the axis, the gradient pushes a hole sideways.
         position = offset @ along
         across = offset[..., 1] * along[0] - offset[..., 0] * along[1]
         difference = torch.stack([across, position - position.clamp(min=0).minimum(length)], dim=-1)
@@ -142,10 +144,9 @@ class KeepOutSegment(Inequality):
 
 @dataclass(frozen=True)
 class NonRedundancy(Inequality):
-    """All N(N-1) baselines of the mask lie at least `distance` [m] apart, and from zero.
+    """All N(N-1) baselines of the mask are at least `distance` [m] apart from each other and from zero.
 
-    With `distance` twice the hole diameter no two pairs of holes share a spatial frequency.
-    (N(N-1)/2)^2 margins.
+    If `distance` is twice the hole diameter, no two pairs of holes share a spatial frequency. (N(N-1)/2)^2 margins.
     """
 
     length: ClassVar[str] = "distance"
@@ -174,14 +175,14 @@ class NonRedundancy(Inequality):
 
 @dataclass(frozen=True)
 class FixedHoles(LinearEquality):
-    """Some holes stay where they are.
+    """Some holes have fixed positions.
 
     Parameters
     ----------
     positions : sequence of (float, float)
-        (x, y) [m].
+        Centres (x, y) of these holes [m].
     indices : sequence of int, optional
-        Which holes of the mask these are; the first ones if left out.
+        Indices of these holes in the mask, by default the first ones.
     """
 
     positions: Sequence[tuple[float, float]]
@@ -199,17 +200,19 @@ class FixedHoles(LinearEquality):
     def equations(self, n_subapertures: int) -> tuple[np.ndarray, np.ndarray]:
         indices = list(range(len(self.positions)) if self.indices is None else self.indices)
         if max(indices, default=-1) >= n_subapertures:
-            raise ValueError(f"hole {max(indices)} is to be fixed in a mask of {n_subapertures}, counted from 0")
+            raise ValueError(
+                f"hole {max(indices)} is to be fixed, but the mask has {n_subapertures} holes, counted from 0"
+            )
         matrix = np.eye(2 * n_subapertures).reshape(n_subapertures, 2, -1)[indices].reshape(-1, 2 * n_subapertures)
         return matrix, np.asarray(self.positions, dtype=float).reshape(-1)
 
 
 @dataclass(frozen=True)
 class NFoldSymmetry(LinearEquality):
-    """The mask looks the same after a turn by 1/n_fold about the centre.
+    """The mask is unchanged by a rotation of 1/n_fold of a turn about the centre.
 
-    Holes n_fold k, ..., n_fold k + n_fold - 1 are the turns of one of them, counterclockwise; if one hole is left
-    over, it is the last and sits at the centre.
+    Holes n_fold k, ..., n_fold k + n_fold - 1 are rotations of one of them, counterclockwise. If one hole is left over,
+    it is the last one and lies at the centre.
     """
 
     n_fold: int
@@ -239,16 +242,18 @@ class NFoldSymmetry(LinearEquality):
 
 
 def check_mask(aperture: SparseAperture, tolerance: float = 1e-9, constraints: Sequence[Constraint] = ()) -> None:
-    """Raise ValueError unless the holes lie in the mask disc, do not overlap and obey `constraints`.
+    """Raise ValueError unless the holes lie in the mask disc, do not overlap and satisfy `constraints`.
 
-    The message says by how much, in metres, and of holes that overlap which they are.
+    The message says by how much, in metres, and names holes that overlap.
 
     Parameters
     ----------
     aperture : SparseAperture
-        One mask or a population: every one is checked.
+        One mask, or a population of which every mask is checked.
     tolerance : float
-        Largest shortfall that passes, as a fraction of the mask diameter.
+        Largest shortfall that is accepted, as a fraction of the mask diameter.
+    constraints : sequence of Constraint
+        Further constraints to check.
 
     Examples
     --------

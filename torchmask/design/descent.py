@@ -1,4 +1,4 @@
-"""Quasi-Newton descents of many masks at once: every evaluation is one batched call, and none waits for another."""
+"""Quasi-Newton descents of many masks at once, in which every evaluation is one batched call."""
 
 from __future__ import annotations
 
@@ -9,32 +9,32 @@ from torch import Tensor
 
 Function = Callable[[Tensor], Tensor]
 
-_ARMIJO = 1e-4  # share of the predicted decrease that a step must reach
-_SHORTEST = 1e-10  # steps below this fraction of the first one end a descent
+_ARMIJO = 1e-4  # share of the predicted decrease that a step must achieve
+_SHORTEST = 1e-10  # fraction of a full step below which a descent ends
 
 
 class BatchedBFGS:
     """BFGS with a backtracking line search on P independent problems of F variables, by ask and tell.
 
-    Each round evaluates one point a problem: `ask()` gives the points (P, F), `tell(values, gradients)` takes what
-    was found there. A problem whose step was good enough turns to a new direction, one whose step was too long
-    shortens it; `finished` (P,) marks those that came to rest, which `restart` sets to work from another point.
+    Each round evaluates one point per problem: `ask()` returns the points (P, F), and `tell(values, gradients)` takes
+    the results. A problem whose step was good enough gets a new direction; one whose step was too long shortens it.
+    `finished` (P,) marks converged problems, which `restart` starts again from another point.
 
     Parameters
     ----------
-    start : (P, F)
+    start : (P, F) tensor
+        First point of each problem.
     first_step : float
-        Length of the first step of a descent, and longest of any, in the units of the variables.
+        Length of the first step of a descent and upper limit of all others, in the units of the variables.
     tolerance : float
-        A descent rests when the decrease that its next step promises falls below this, in the units of the function.
+        Predicted decrease of the next step below which a descent ends, in the units of the function.
     patience : int
-        Accepted steps after which a descent ends in any case.
+        Largest number of accepted steps of a descent.
 
     Notes
     -----
-    The inverse Hessian approximation is kept in full: at 2N variables it costs less than a history of pairs.
-    The first update scales it (Nocedal & Wright, Numerical Optimization, eq. 6.20); pairs without positive curvature
-    are skipped.
+    The full inverse Hessian approximation is kept: with 2N variables it costs less than a history of pairs. The first
+    update scales it (Nocedal & Wright, Numerical Optimization, eq. 6.20); pairs without positive curvature are skipped.
     """
 
     first_step: float
@@ -57,7 +57,7 @@ class BatchedBFGS:
         self._accepted = start.new_zeros(n, dtype=torch.long)
 
     def restart(self, members: Tensor | slice, points: Tensor) -> None:
-        """Let the problems `members` (indices, mask or slice) begin anew at `points`."""
+        """Restart the problems `members` (indices, mask or slice) from `points`."""
         self.points[members] = points
         self.values[members] = torch.inf
         self._direction[members] = 0.0
@@ -67,17 +67,17 @@ class BatchedBFGS:
         self.finished[members] = False
 
     def ask(self) -> Tensor:
-        """Points to evaluate (P, F); those of finished problems are where they rest."""
+        """Return the points to evaluate (P, F); those of finished problems no longer change."""
         return self.points + (self._step * ~self.finished)[:, None] * self._direction
 
     def tell(self, values: Tensor, gradients: Tensor) -> None:
-        """Values (P,) and gradients (P, F) at the points of the last `ask`."""
+        """Take values (P,) and gradients (P, F) at the points of the latest `ask`."""
         good = torch.isfinite(values) & torch.isfinite(gradients).all(-1)
         good &= ~self.finished & ((values <= self.values + _ARMIJO * self._step * self._slope) | self.values.isinf())
         if bool(good.any()):
             self._accept(good, values, gradients)
         shorter = ~good & ~self.finished
-        # The minimum of the parabola through both values and the slope, kept within a tenth and a half.
+        # The minimum of the parabola through both values and the slope, limited to 0.1 to 0.5 of the step.
         rise = values - self.values - self._step * self._slope
         step = -0.5 * self._slope * self._step**2 / rise
         step = torch.where(torch.isfinite(step), step, 0.1 * self._step)
@@ -93,7 +93,7 @@ class BatchedBFGS:
         self.values[good], self.gradients[good] = values[good], gradients[good]
         direction = -(inverse @ gradients[good, :, None])[..., 0]
         slope = (direction * gradients[good]).sum(-1)
-        # No step goes farther than the first one, which alone has no curvature to be measured by.
+        # No step is longer than the first one, whose length is prescribed because there is no curvature yet.
         length = torch.linalg.vector_norm(direction, dim=-1).clamp(min=torch.finfo(direction.dtype).tiny)
         first = self._accepted[good] == 0
         scale = torch.where(first, self.first_step / length, (self.first_step / length).clamp(max=1))
@@ -104,7 +104,7 @@ class BatchedBFGS:
 
 
 def _updated(inverse: Tensor, s: Tensor, y: Tensor, first: Tensor) -> Tensor:
-    """BFGS update of inverse Hessians (P, F, F) by steps s and gradient changes y (P, F)."""
+    """Apply the BFGS update to inverse Hessians (P, F, F) for steps s and gradient changes y (P, F)."""
     sy, yy = (s * y).sum(-1), (y * y).sum(-1)
     curved = sy > 1e-10 * torch.sqrt((s * s).sum(-1) * yy)
     rho = torch.where(curved, 1 / sy, 0)

@@ -1,8 +1,7 @@
-"""Drawings of masks for the workshop: DXF and SVG, and DXF back again.
+"""Writing drawings of masks for the workshop, as DXF and SVG, and reading DXF.
 
-Drawings are in millimetres on the plate, `scale` millimetres for each metre of the pupil: 1000 is life-size, and a mask
-for a re-imaged pupil of 10 mm on an 8 m telescope has scale 10 / 8. They show the mask as the pupil coordinates do, x
-to the right and y up.
+Drawings are in millimetres on the plate, `scale` millimetres for each metre of the pupil: 1000 is full size, and a mask
+for a re-imaged pupil of 10 mm on an 8 m telescope has scale 10 / 8. As in the pupil, x is to the right and y up.
 """
 
 from __future__ import annotations
@@ -24,18 +23,20 @@ from torchmask.optics.shapes import outlined_shape
 
 LIFE_SIZE = 1000.0  # [mm on the plate for a metre of the pupil]
 _SCALE = "torchmask mm per m"
-_NANOMETRE = 1e-6  # [mm]: what rounding may change
+_NANOMETRE = 1e-6  # [mm], tolerance for rounding
 
 
 def save_dxf(path: str | Path, aperture: SparseAperture, scale: float = LIFE_SIZE) -> None:
-    """Write a DXF drawing: holes as circles or closed polylines on layer HOLES, the mask's rim on layer OUTLINE.
+    """Write a DXF drawing, with holes as circles or closed polylines on layer HOLES and the rim on layer OUTLINE.
 
     Parameters
     ----------
     path : str or Path
+        Name of the new file.
     aperture : SparseAperture
+        One mask.
     scale : float
-        Millimetres on the plate for one metre of the pupil; the drawing remembers it for `load_mask`.
+        Millimetres on the plate for one metre of the pupil; stored in the drawing for `load_mask`.
 
     Raises
     ------
@@ -67,10 +68,10 @@ def save_dxf(path: str | Path, aperture: SparseAperture, scale: float = LIFE_SIZ
 
 
 def save_svg(path: str | Path, aperture: SparseAperture, scale: float = LIFE_SIZE) -> None:
-    """Write an SVG drawing in true size: user units are millimetres, the rim and the holes are hairlines.
+    """Write an SVG drawing in true size, with the rim and the holes as hairlines. Its unit is the millimetre.
 
-    SVG's y axis points down, so y is written with its sign reversed and the picture shows y up. Same arguments and
-    errors as `save_dxf`.
+    SVG's y axis points down, so y is written with its sign reversed, and the picture shows y up. Arguments and errors
+    are those of `save_dxf`.
     """
     centers = require_one_mask(aperture).double() * require_scale(scale)
     width = 1.02 * scale * max(aperture.mask_diameter, 2 * aperture.reach)
@@ -99,12 +100,12 @@ def save_svg(path: str | Path, aperture: SparseAperture, scale: float = LIFE_SIZ
 
 
 def load_dxf(path: Path) -> SparseAperture:
-    """Read a mask that `save_dxf` wrote, as it is drawn: holes moved in a CAD program come back moved. float64.
+    """Read a mask, float64, from a drawing written by `save_dxf`, including changes made in a CAD program.
 
     Raises
     ------
     ValueError
-        If the file is damaged, or shows no mask that this library knows.
+        If the file is damaged, or does not show a mask of known, equal holes.
     """
     with extra("design"):
         import ezdxf
@@ -115,7 +116,7 @@ def load_dxf(path: Path) -> SparseAperture:
         raise ValueError(str(error) or "the drawing ends too early") from error
     noted = drawing.header.custom_vars.get(_SCALE)
     if noted is None:
-        raise ValueError("the drawing does not say how many millimetres stand for a metre of the pupil")
+        raise ValueError(f"the drawing does not give its scale: set its custom property {_SCALE!r}")
     scale = require_scale(float(noted))
     plate = drawing.modelspace()
     rims = list(plate.query('CIRCLE[layer=="OUTLINE"]'))
@@ -128,13 +129,13 @@ def load_dxf(path: Path) -> SparseAperture:
     shape, diameter = holes[0]
     if not all(_alike(holes[0], hole) for hole in holes):
         kinds = ", ".join(sorted({str(hole[0]) for hole in holes}))
-        raise ValueError(f"its holes differ by more than 1 nm or 1e-6 ({kinds}): one kind is needed, all equal")
+        raise ValueError(f"its holes differ by more than 1 nm or 1e-6 ({kinds}): all must be equal")
     centers = torch.tensor(np.stack([center for center, _ in outlines])) / scale
     return SparseAperture(centers, diameter / scale, 2 * rims[0].dxf.radius / scale, shape)
 
 
 def _drawn_holes(plate: Any) -> list[tuple[Array, list[Contour]]]:
-    """Centre [mm] and outline of each hole: what is drawn around one centre belongs to one hole."""
+    """Return centre [mm] and outline of each hole; contours with the same centre belong to one hole."""
     holes: list[tuple[Array, list[Contour]]] = []
     for entity in plate.query('CIRCLE LWPOLYLINE[layer=="HOLES"]'):
         center, contour = _measured(entity)
@@ -147,7 +148,7 @@ def _drawn_holes(plate: Any) -> list[tuple[Array, list[Contour]]]:
 
 
 def _measured(entity: Any) -> tuple[Array, Contour]:
-    """Centre [mm] of a drawn circle or polyline, and what it is around that."""
+    """Return the centre [mm] of a drawn circle or polyline, and its contour relative to it."""
     if entity.dxftype() == "CIRCLE":
         return np.array([entity.dxf.center.x, entity.dxf.center.y]), Circle(entity.dxf.radius)
     corners = np.array([corner[:2] for corner in entity.vertices()])
@@ -160,7 +161,7 @@ def _alike(hole: tuple[Shape, float], other: tuple[Shape, float]) -> bool:
 
 
 def require_one_mask(aperture: SparseAperture) -> Tensor:
-    """The centres (N, 2) of one mask, on the CPU. Raises TypeError or ValueError for anything else."""
+    """Return the centres (N, 2) of one mask, on the CPU. Raises TypeError or ValueError for anything else."""
     if not isinstance(aperture, SparseAperture):
         raise TypeError(f"a SparseAperture is needed, not {type(aperture).__name__}")
     if aperture.centers.ndim != 2:
@@ -171,7 +172,7 @@ def require_one_mask(aperture: SparseAperture) -> Tensor:
 
 
 def require_scale(scale: float) -> float:
-    """The scale itself [mm on the plate for a metre of the pupil]. Raises ValueError unless finite and positive."""
+    """Return `scale` [mm on the plate for a metre of the pupil]; raises ValueError unless finite and positive."""
     if not (math.isfinite(scale) and scale > 0):
         raise ValueError(
             f"scale is {scale}: it must be finite and positive, in mm on the plate for a metre of the pupil"

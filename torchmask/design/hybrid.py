@@ -1,4 +1,4 @@
-"""Descents from many random masks, then basin hopping on a pool of the best, all in one batch that never waits."""
+"""Quasi-Newton descents from many random masks, then basin hopping on a pool of the best, in one batch throughout."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from torchmask.design.merit import Criterion, Holes, Merit
 from torchmask.design.refine import Monitor
 from torchmask.design.starts import changed_mask, random_mask
 
-BATCH = 32  # masks in flight
+BATCH = 32  # masks that descend at a time
 POOL = 12
 FINALISTS = 8
-RANDOM_SHARE = 0.3  # of the budget goes to random starts before the pool is hopped on
-WEIGHT = 1e3  # of the squared overlaps: stiffer slows the descents, softer ranks by what the polish takes away
-TOLERANCE = 1e-3  # promised decrease of log MSE at which a descent ends; the pool is polished later
-SAME = 0.01  # masks whose sorted separations differ by less than this of the diameter (rms) are one optimum
+RANDOM_SHARE = 0.3  # share of the budget for random starts, before basin hopping
+WEIGHT = 1e3  # of the squared overlaps; more slows the descents, less ranks masks by gains that the polish removes
+TOLERANCE = 1e-3  # predicted decrease of log MSE at which a descent ends; the pool is polished later
+SAME = 0.01  # rms difference of sorted separations, in mask diameters, below which two masks are the same optimum
 
 
 class Pool:
@@ -31,7 +31,7 @@ class Pool:
         self.entries: list[tuple[float, Tensor, Tensor]] = []  # value, x, sorted separations
 
     def offer(self, x: Tensor, value: float) -> None:
-        """Keep x (F,) if it is among the best; of two that are the same optimum the better stays."""
+        """Keep x (F,) if it is among the best. Of two masks that are the same optimum only the better stays."""
         if not np.isfinite(value):
             return
         shape = torch.pdist(self.holes.aperture(x).centers).sort().values / self.holes.template.mask_diameter
@@ -45,7 +45,7 @@ class Pool:
 def basin_hopping(
     criterion: Criterion, holes: Holes, budget: int, rng: np.random.Generator, monitor: Monitor
 ) -> tuple[Tensor, int]:
-    """The best few local optima (n, F) found within `budget` evaluations of `criterion`, best first, and their cost."""
+    """Return the best few local optima (n, F), best first, and the number of evaluations used, at most `budget`."""
     merit = Merit(criterion, holes, WEIGHT)
     batch = max(1, min(BATCH, budget))
     pool = Pool(holes, POOL)
@@ -70,6 +70,6 @@ def basin_hopping(
 
 
 def coarse_criterion(criterion: Criterion) -> Criterion:
-    """`criterion` on a grid of 96 pixels, coarse enough for speed and not yet so coarse that a search games it."""
+    """Return `criterion` on a grid of 96 pixels, coarse for speed but too fine for a search to exploit its errors."""
     grid, on_grid = getattr(criterion, "grid", None), getattr(criterion, "on_grid", None)
     return criterion if grid is None or on_grid is None or min(grid.shape) <= 96 else on_grid(96)

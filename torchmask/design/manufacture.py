@@ -1,6 +1,6 @@
-"""Mask files: JSON for a record, FITS for programs that model optics from images, and drawings for the workshop.
+"""Mask files: JSON for archives, FITS for programs that model optics from images, and drawings for the workshop.
 
-JSON and FITS hold metres in the pupil; drawings (`torchmask.design.drawing`) millimetres on the plate.
+JSON and FITS files are in metres in the pupil, drawings (`torchmask.design.drawing`) in millimetres on the plate.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ _DTYPES = {"float64": torch.float64, "float32": torch.float32}
 
 
 def save_json(path: str | Path, aperture: SparseAperture, wavelength: float | None = None) -> None:
-    """Write a mask as JSON, in metres and radians; `load_mask` gives back every bit of it.
+    """Write a mask as JSON, in metres and radians; `load_mask` reads it back exactly.
 
-    `wavelength` [m] is the one that the mask was designed or measured at; `mask_wavelength` gives it back.
+    `wavelength` [m] is that for which the mask was designed or measured; `mask_wavelength` reads it back.
 
     Raises
     ------
@@ -56,14 +56,14 @@ def save_json(path: str | Path, aperture: SparseAperture, wavelength: float | No
 def save_fits(path: str | Path, aperture: SparseAperture, n_pixels: int = 512) -> None:
     """Write a FITS map of the transmitted amplitude, for programs that model optics from images.
 
-    Each of `n_pixels` x `n_pixels` pixels holds the open fraction of its area. The origin of the pupil is the centre of
-    pixel n_pixels // 2 (counted from 0), rows go up in y, and the linear coordinates of the header are metres. A table
-    HOLES holds the exact mask for `load_mask`.
+    Each of `n_pixels` x `n_pixels` pixels has the open fraction of its area. The origin of the pupil is the centre of
+    pixel n_pixels // 2 (counted from 0), y increases with the row, and the header's linear coordinates are in metres. A
+    table HOLES contains the exact mask for `load_mask`.
 
     Raises
     ------
     ValueError
-        As `save_json`, and if a hole is narrower than two pixels.
+        As `save_json` does, and if a hole is narrower than two pixels.
     """
     with extra("data"):
         from astropy.io import fits
@@ -96,7 +96,7 @@ def save_fits(path: str | Path, aperture: SparseAperture, n_pixels: int = 512) -
 
 
 def amplitude_map(aperture: SparseAperture, n_pixels: int) -> tuple[Tensor, float]:
-    """Open fraction of each pixel (n_pixels, n_pixels) of a square that holds mask and rim, and the pixel's size [m].
+    """Return the open fraction (n_pixels, n_pixels) of each pixel of a square around the mask, and the pixel size [m].
 
     Raises ValueError if a hole is narrower than two pixels.
     """
@@ -105,30 +105,30 @@ def amplitude_map(aperture: SparseAperture, n_pixels: int) -> tuple[Tensor, floa
     if n_pixels != int(n_pixels) or n_pixels < needed:
         raise ValueError(f"n_pixels is {n_pixels}: a hole must span two pixels, so at least {needed} are needed")
     step = width / (n_pixels - 2)
-    # The pupil raster of a field of twice the width: wide enough for any aperture's spatial frequencies.
+    # The pupil raster of a field of twice the width is wide enough for the spatial frequencies of any aperture.
     samples = aperture.samples(Grid(2 * n_pixels, 1 / (2 * n_pixels * step), 1.0))
     raster = torch.zeros(samples.raster, dtype=samples.weights.dtype, device=samples.weights.device)
     raster.view(-1).index_add_(0, samples.index.flatten(), samples.weights.detach().flatten())
     start = n_pixels - n_pixels // 2
     inner = torch.fft.fftshift(raster)[start : start + n_pixels, start : start + n_pixels]
-    return inner.clamp(max=1), step  # holes that overlap are open once
+    return inner.clamp(max=1), step  # overlapping holes are counted once
 
 
 def least_pixels(aperture: SparseAperture) -> int:
-    """Pixels a side that `save_fits` needs, so that a hole spans two."""
+    """Return the number of pixels a side that `save_fits` needs for a hole to span two."""
     return math.ceil(2 * max(aperture.mask_diameter, 2 * aperture.reach) / aperture.subaperture_diameter) + 2
 
 
 def load_mask(path: str | Path) -> SparseAperture:
-    """Read a mask that `save_json`, `save_fits` or `save_dxf` wrote; the suffix of `path` says which.
+    """Read a mask written by `save_json`, `save_fits` or `save_dxf`, depending on the suffix of `path`.
 
-    JSON and FITS come back with every bit. A drawing comes back to the rounding of its decimal numbers, far below a
-    nanometre, as float64, and as it is drawn: holes moved in a CAD program come back moved.
+    JSON and FITS files are read exactly. A drawing is read as float64, to the rounding of its decimal numbers, far
+    below a nanometre, and includes changes made in a CAD program.
 
     Raises
     ------
     ValueError
-        If the file is missing, damaged, of another kind, or describes no mask this library knows.
+        If the file is missing, damaged, of another kind, or does not describe a known kind of mask.
 
     Examples
     --------
@@ -145,22 +145,22 @@ def load_mask(path: str | Path) -> SparseAperture:
         ".fits": _read_fits,
     }
     if path.suffix.lower() not in readers:
-        raise ValueError(f"{path} is none of the mask files that can be read: {', '.join(readers)}")
+        raise ValueError(f"{path} is not a mask file that can be read: its name must end in {', '.join(readers)}")
     if not path.is_file():
         raise ValueError(f"there is no mask file {path}")
     try:
         return readers[path.suffix.lower()](path)
     except (ValueError, TypeError, LookupError, OSError) as error:
-        raise ValueError(f"{path} is no mask that can be read: {error}") from error
+        raise ValueError(f"{path} cannot be read as a mask: {error}") from error
 
 
 def mask_wavelength(path: str | Path) -> float | None:
-    """The wavelength [m] that a mask was written with; None if its file holds none, which only JSON can.
+    """Return the wavelength [m] in a mask file, or None if it has none; only JSON files can have one.
 
     Raises
     ------
     ValueError
-        If `load_mask` could not read the file, or what it holds is no wavelength.
+        If `load_mask` cannot read the file, or its wavelength is not a positive number.
 
     Examples
     --------
@@ -176,7 +176,7 @@ def mask_wavelength(path: str | Path) -> float | None:
         return None
     value = _json_record(path).get("wavelength")
     if value is not None and not (type(value) in (int, float) and math.isfinite(value) and value > 0):
-        raise ValueError(f"{path}: its wavelength is {value!r}, which is no length in m")
+        raise ValueError(f"{path}: its wavelength is {value!r}: it must be a positive number, in m")
     return value
 
 
@@ -193,7 +193,7 @@ def _read_json(path: Path) -> SparseAperture:
 def _json_record(path: Path) -> dict[str, Any]:
     record = json.loads(path.read_text(encoding="utf-8"))
     if not isinstance(record, dict) or record.get("format") != _FORMAT:
-        raise ValueError(f"it does not say {_FORMAT!r} under 'format'")
+        raise ValueError(f"its 'format' is not {_FORMAT!r}")
     return record
 
 
@@ -203,7 +203,7 @@ def _read_fits(path: Path) -> SparseAperture:
         from astropy.utils.exceptions import AstropyWarning
 
     with warnings.catch_warnings():
-        warnings.simplefilter("error", AstropyWarning)  # such as that of a truncated file
+        warnings.simplefilter("error", AstropyWarning)  # such as the warning about a truncated file
         try:
             with fits.open(io.BytesIO(path.read_bytes())) as content:
                 table, header = content["HOLES"].data, content["HOLES"].header  # type: ignore[attr-defined]

@@ -1,8 +1,8 @@
-"""What a mask samples: its baselines, their repetitions, the gaps between them, and the point-spread function.
+"""Analysis of a mask's u-v coverage: baselines, redundancy, gaps, and the point-spread function.
 
-All lengths are metres in the pupil, where a baseline stands for the frequency it transmits. Two holes of diameter d
-transmit a patch of frequencies around their baseline, the support of the autocorrelation of a hole: what the hole's
-outer edge holds, twice as large.
+All lengths are metres in the pupil, where a baseline stands for the frequency it transmits. Two holes transmit a patch
+of frequencies around their baseline, the support of the autocorrelation of a hole, which has the shape of the hole and
+twice its size.
 """
 
 from __future__ import annotations
@@ -20,28 +20,31 @@ from torchmask.design.psf_shape import Array, peak_side_lobe, psf_widths
 from torchmask.optics.pupil import Aperture
 from torchmask.optics.shape_base import Shape
 
-_LINES = 4096  # across half the u-v plane
-_BLOCK = 2**20  # array elements treated at a time
+_LINES = 4096  # lines across half the u-v plane
+_BLOCK = 2**20  # array elements processed at a time
 
 
 @dataclass(frozen=True)
 class RedundancyReport:
-    """How a mask samples the u-v plane; `print` shows it as a table.
+    """Report on the u-v coverage of a mask, which `print` shows as a table.
 
-    n_subapertures, n_baselines : N and N (N - 1) / 2
-    n_distinct : baselines left when those closer than the tolerance count as one
+    n_subapertures : number of holes, N
+    n_baselines : number of baselines, N (N - 1) / 2
+    n_distinct : number of baselines if those closer than the tolerance count as one
     nonredundant : whether all baselines are distinct, as points
-    strictly_nonredundant : whether not even their patches overlap, that of baseline zero included
-    strict_hole_diameter : the largest hole diameter for which that holds [m]
-    shortest_baseline, longest_baseline : [m]
-    uv_filling : area of the patches' union over that of the u-v disc of a full pupil of `mask_diameter`
-    gap_fraction : share of the disc out to the highest transmitted frequency that the union leaves out
-    largest_gap : radius of the largest circle, centred within the hull of all baselines, that no baseline enters [m];
+    strictly_nonredundant : whether their patches, including that of baseline zero, do not overlap either
+    strict_hole_diameter : largest hole diameter for which the patches do not overlap [m]
+    shortest_baseline : length of the shortest baseline [m]
+    longest_baseline : length of the longest baseline [m]
+    uv_filling : area of the union of patches over that of the u-v disc of a full pupil of `mask_diameter`
+    gap_fraction : fraction of the disc up to the highest transmitted frequency that the union does not cover
+    largest_gap : radius of the largest circle, centred within the hull of all baselines, that contains no baseline [m];
         frequencies are missing there if it exceeds the hole diameter
-    fwhm : full width at half maximum of the PSF [wavelength / mask_diameter], the diameter of a disc of the area where
-        the PSF exceeds 1/2 around its peak
-    fwhm_min, fwhm_max : the width in the narrowest and the widest direction, same unit
-    side_lobe : the highest maximum of the PSF besides the central one, relative to that
+    fwhm : full width at half maximum of the PSF [wavelength / mask_diameter], the diameter of a disc with the area
+        around the peak where the PSF exceeds half its maximum
+    fwhm_min : width in the narrowest direction, in the same unit
+    fwhm_max : width in the widest direction, in the same unit
+    side_lobe : highest maximum of the PSF besides the central one, relative to that
     """
 
     n_subapertures: int
@@ -86,20 +89,21 @@ def analyse_redundancy(aperture: Aperture, tolerance: float = 0.02) -> Redundanc
     Parameters
     ----------
     aperture : Aperture
-        One mask of at least two holes, centres (N, 2).
+        One mask of at least two holes, with centres (N, 2).
     tolerance : float
-        Baselines closer than this fraction of the shortest one count as the same.
+        Fraction of the shortest baseline below which two baselines count as the same.
 
     Raises
     ------
     ValueError
-        For a population of masks, fewer than two holes, holes at the same place, or a tolerance outside [0, 1).
+        If the aperture is a population or has fewer than two holes, two holes coincide, or the tolerance lies outside
+        [0, 1).
 
     Notes
     -----
-    Areas come from the chords of all patches along 4096 lines (relative error below 1e-4), the PSF from its closed
-    form: the transform of a hole times the sum of the holes' phasors. The side lobe is the highest within 2.5
-    wavelengths over hole diameter; beyond, the transform of a hole keeps any other below 0.42 % (disc), 0.92 %
+    Areas come from the chords of all patches along 4096 lines (relative error below 1e-4), and the PSF from its closed
+    form, the transform of a hole times the sum of the holes' phasors. The side lobe is the highest within 2.5
+    wavelengths over hole diameter; beyond that, the transform of a hole keeps others below 0.42 % (disc), 0.92 %
     (hexagon) or 1.62 % (square).
 
     Examples
@@ -114,7 +118,7 @@ def analyse_redundancy(aperture: Aperture, tolerance: float = 0.02) -> Redundanc
             f"centers has shape {tuple(aperture.centers.shape)}: one mask of at least two holes is needed, (N, 2)"
         )
     if not 0 <= tolerance < 1:
-        raise ValueError(f"tolerance is {tolerance}: it is a fraction of the shortest baseline, at least 0, below 1")
+        raise ValueError(f"tolerance is {tolerance}: it must be a fraction of the shortest baseline, in [0, 1)")
     centers = aperture.centers.numpy(force=True).astype(np.float64)
     first, second = np.triu_indices(len(centers), 1)
     half = centers[first] - centers[second]
@@ -148,7 +152,7 @@ def analyse_redundancy(aperture: Aperture, tolerance: float = 0.02) -> Redundanc
 
 
 def _smallest_separation(sites: Array, shape: Shape) -> float:
-    """The diameter at which the first two of equal holes at the sites would touch [m]."""
+    """Return the smallest diameter at which two equal holes at the sites touch [m]."""
     points, smallest = torch.from_numpy(sites), math.inf
     for rows in torch.arange(len(points)).split(max(1, _BLOCK // len(points))):
         separation = shape.separation(points[rows, None] - points)
@@ -158,25 +162,25 @@ def _smallest_separation(sites: Array, shape: Shape) -> float:
 
 
 def _count_distinct(baselines: Array, distance: float) -> int:
-    """Number of groups of baselines, of both signs, linked by steps of at most `distance`."""
+    """Return the number of groups of baselines, of both signs, linked by steps of at most `distance`."""
     pairs = KDTree(baselines).query_pairs(distance, output_type="ndarray")
     links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(baselines),) * 2)
     return int(connected_components(links, directed=False)[0])
 
 
 def _reach(sites: Array, shape: Shape, diameter: float) -> float:
-    """Radius of the disc that just holds every patch [m]."""
+    """Return the radius of the smallest disc around zero that contains every patch [m]."""
     return -float(shape.clearance(torch.from_numpy(sites), 2 * diameter, 0.0).min())
 
 
 def _covered_area(sites: Array, shape: Shape, diameter: float) -> float:
-    """Area of the union of all patches [m^2]: on each of many lines, the length of a union of intervals."""
-    top, turn = _reach(sites, shape, diameter), shape.askew  # lines along no side keep the chords continuous
+    """Return the area of the union of all patches [m^2], from the union of their chords on each of many lines."""
+    top, turn = _reach(sites, shape, diameter), shape.askew  # chords are continuous if no side is parallel to the lines
     sites = sites @ np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
     patch = shape.turned(turn)
     step = top / _LINES
     lines = (np.arange(_LINES) + 0.5) * step  # the other half of the plane is its point reflection
-    length = 0.0  # of the union, summed over lines
+    length = 0.0  # length of the union, summed over lines
     for y in np.array_split(lines, math.ceil(_LINES * len(sites) / _BLOCK)):
         left, right = patch.chords(y[:, None] - sites[:, 1], 2 * diameter)
         left, right = left + sites[:, 0], right + sites[:, 0]
@@ -189,12 +193,12 @@ def _covered_area(sites: Array, shape: Shape, diameter: float) -> float:
 
 
 def _largest_empty_circle(sites: Array) -> float:
-    """Radius of the largest circle that no site enters, with its centre in the convex hull of the sites.
+    """Return the radius of the largest circle without a site inside, centred in the convex hull of the sites.
 
-    Its centre is a vertex of the Voronoi diagram, or lies where an edge of the diagram crosses the hull.
+    Its centre is a vertex of the Voronoi diagram, or a point where an edge of the diagram crosses the hull.
     """
     singular, axes = np.linalg.svd(sites)[1:]
-    if singular[1] < 1e-9 * singular[0]:  # all sites in line
+    if singular[1] < 1e-9 * singular[0]:  # all sites are collinear
         return float(np.diff(np.sort(sites @ axes[0])).max()) / 2
     voronoi, hull = Voronoi(sites), ConvexHull(sites)
     inside = (voronoi.vertices @ hull.equations[:, :2].T + hull.equations[:, 2]).max(axis=1) <= 0

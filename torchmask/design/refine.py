@@ -1,4 +1,4 @@
-"""The gradient stage: quasi-Newton descents from given masks to feasible local optima."""
+"""The gradient stage of a search: quasi-Newton descents from given masks to feasible local optima."""
 
 from __future__ import annotations
 
@@ -15,27 +15,28 @@ from torchmask.design.merit import Criterion, Holes, Merit
 from torchmask.optics.aperture import SparseAperture
 from torchmask.record import Callback, Record
 
-PENALTY = 3e3  # weight of the squared shortfalls against log MSE, lengths in mask diameters
-TOLERANCE = 1e-9  # feasibility that results are held to, in mask diameters
+PENALTY = 3e3  # weight of the squared shortfalls, in mask diameters, relative to log MSE
+TOLERANCE = 1e-9  # largest shortfall of a result, in mask diameters
 
 
 @dataclass(frozen=True)
 class SearchResult:
-    """A mask, and how it was found.
+    """Result of a search.
 
     aperture : the mask, feasible to 1e-9 of its diameter
-    mse, relative_mse : the criterion at this very mask
-    evaluations : masks whose error was computed
-    history : for each stage, of its best masks in turn, (evaluations so far in all stages, relative MSE) (n, 2): of the
-        mask moved onto the rules, on the grid of the criterion, whatever grid and penalties it worked with. Masks
-        for which no such move was found are left out. These measurements are not among the evaluations.
+    mse : value of the criterion at this mask
+    relative_mse : relative value of the criterion at this mask
+    evaluations : number of masks whose error was computed
+    history : for each stage, an array (n, 2) of evaluations so far, in all stages, and relative MSE of the best mask.
+        The MSE is that of the mask projected onto the constraints, on the grid of the criterion, whatever grid and
+        penalty the stage used. Masks that could not be projected are left out. `evaluations` does not include these.
 
     Examples
     --------
     >>> aperture = SparseAperture([[-0.4, 0.0], [0.4, 0.0]], 0.2, 1.0)
     >>> history = {"design/hybrid": torch.tensor([[10.0, 0.4], [20.0, 0.3]])}
     >>> found = SearchResult(aperture, mse=3e9, relative_mse=0.3, evaluations=20, history=history)
-    >>> found  # prints what matters
+    >>> found
     SearchResult(aperture=SparseAperture((2, 2) disc, subaperture_diameter=0.2, mask_diameter=1), mse=3000000000.0, \
     relative_mse=0.3, evaluations=20)
     """
@@ -48,9 +49,9 @@ class SearchResult:
 
 
 class Monitor:
-    """Keeps the best masks of a stage and tells the callback, about a hundred times.
+    """Keeps track of the best masks of a stage, and calls the callback about a hundred times.
 
-    `before` counts the evaluations of earlier stages.
+    `before` is the number of evaluations of earlier stages.
     """
 
     stage: str
@@ -67,7 +68,7 @@ class Monitor:
         self._due = 0.0
 
     def update(self, evaluations: int, merits: Tensor, relative_mse: Tensor, x: Tensor) -> None:
-        """Take note of what was found at x (P, F): the best merit so far is the best mask."""
+        """Update the best mask, the one with the lowest merit, with the results at x (P, F)."""
         index = int(merits.nan_to_num(torch.inf).argmin())
         if float(merits[index]) < self._merit:
             self._merit, self._relative = float(merits[index]), float(relative_mse[index])
@@ -78,7 +79,7 @@ class Monitor:
             self._tell(evaluations, self._relative, self._centers)
 
     def conclude(self, evaluations: int, relative_mse: float, aperture: SparseAperture) -> None:
-        """Tell what the stage returns."""
+        """Record the mask that the stage returns."""
         self.rows.append((self.before + evaluations, aperture.centers))
         self._tell(evaluations, relative_mse, aperture.centers)
 
@@ -88,8 +89,8 @@ class Monitor:
             self.callback(Record(self.stage, step, self.budget, scalars, {"centers": centers.detach().clone()}))
 
     def history(self, criterion: Criterion) -> dict[str, Tensor]:
-        """The stage's entry in `SearchResult.history`."""
-        measured: dict[int, float] = {}  # by the identity of the centres: a mask is the best for many rows
+        """Return the entry of the stage in `SearchResult.history`."""
+        measured: dict[int, float] = {}  # by identity of the centres, because a mask is the best for many rows
         for _, centers in self.rows:
             if id(centers) not in measured:
                 measured[id(centers)] = self._measure(criterion, centers)
@@ -114,29 +115,32 @@ def refine_mask(
     budget: int = 1000,
     callback: Callback | None = None,
 ) -> SearchResult:
-    """Descend from a mask to the feasible local optimum of `criterion` beside it.
+    """Refine a mask by descent to a feasible local optimum of `criterion` nearby.
 
     Parameters
     ----------
-    criterion : AsymptoticMSE, or any differentiable error of masks like it
+    criterion : AsymptoticMSE or similar
+        Differentiable error of masks.
     aperture : SparseAperture
-        One mask; it need not be feasible.
+        One mask, which need not be feasible.
     constraints : sequence of Constraint
-        Rules beside the mask disc and the overlap, which always hold.
+        Constraints in addition to those on the mask disc and on overlaps, which always hold.
     budget : int
-        Evaluations of the criterion, each with its gradient.
+        Largest number of evaluations of the criterion with its gradient.
     callback : callable, optional
-        Gets a `Record` now and then; its centres may still break a rule by a little.
+        Receives a `Record` from time to time, whose centres may still violate a constraint slightly.
 
     Returns
     -------
     SearchResult
-        Feasible to 1e-9 of the mask's diameter.
+        Refined mask, feasible to 1e-9 of its diameter.
 
     Raises
     ------
     ValueError
-        For a population, a budget below 1, or if no feasible mask is found near the given one.
+        If the aperture is a population, the budget is below 1, or no feasible mask is found near the given one.
+    TypeError
+        If the aperture is not a `SparseAperture`, or `constraints` is not a sequence of constraints.
 
     Examples
     --------
@@ -173,13 +177,14 @@ def polish(
     monitor: Monitor,
     fallback: SparseAperture | None = None,
 ) -> tuple[SparseAperture, int]:
-    """The best feasible mask reached from x (P, F) within `budget` evaluations of `criterion`, and their number.
+    """Return the best feasible mask reached from x (P, F), and the number of evaluations used, at most `budget`.
 
-    The multipliers of the augmented Lagrangian let the descents come to rest on the rules, not beyond them; the
-    last step projects what is left. If no projection succeeds the mask is `fallback`; without one, raises `Infeasible`.
+    With the multipliers of the augmented Lagrangian, descents converge onto the constraints and not beyond them; a
+    projection removes the remaining shortfall. If no projection succeeds the result is `fallback`; without one,
+    `Infeasible` is raised.
     """
     merit = Merit(criterion, holes, PENALTY)
-    reserve = 2 * len(x)  # for the look at the multipliers that a round may take, and the comparison at the end
+    reserve = 2 * len(x)  # for one update of the multipliers and the comparison at the end
     descent = BatchedBFGS(x, first_step=0.003, tolerance=1e-8)
     multipliers: Tensor | float = 0.0
     while merit.evaluations + len(x) + reserve <= budget:
@@ -207,7 +212,7 @@ def polish(
 
 
 def _feasible(holes: Holes, x: Tensor) -> tuple[list[SparseAperture], Infeasible]:
-    """Those of x (P, F) that could be projected onto the rules, and why one of the others could not."""
+    """Return the masks at x (P, F) that could be projected onto the constraints, and the error of another one."""
     masks, failure = [], Infeasible("no mask to project")
     for point in x:
         try:
@@ -224,7 +229,7 @@ def conclude(
     evaluations: int,
     history: dict[str, Tensor],
 ) -> SearchResult:
-    """Check the mask and measure it."""
+    """Check the mask, measure it and return the result."""
     tolerance = TOLERANCE if aperture.centers.dtype == torch.float64 else 1e-6
     check_mask(aperture, tolerance, constraints)
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""Is there a mask at all that obeys the rules, and if not, how large may its holes be?"""
+"""Search for a first mask that satisfies all constraints, and advice if there is none."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from torchmask.record import Callback, Record
 _STARTS = 16
 _ROUNDS = 150
 _BISECTIONS = 14
-_SPECK = 1e-4  # of what is asked for: where no mask is found even so, it is not what hinders
+_SPECK = 1e-4  # smallest fraction of a request that is tried; if even that fails, the request is not the obstacle
 _NEAR = 1e-7  # sum of squared shortfalls from which a projection is tried, in mask diameters
 
 
@@ -34,18 +34,18 @@ def require_room(
     seed: int = 0,
     callback: Callback | None = None,
 ) -> tuple[Holes, SparseAperture]:
-    """The holes of a request with all their rules, and a first mask that obeys them.
+    """Return the holes of a request with all their constraints, and a first mask that satisfies them.
 
-    What no packing can hold is refused at once; the rest is tried, of which `callback` gets preparatory records.
+    Requests that no packing can satisfy are refused at once. Others are tried, with preparatory records for `callback`.
 
     Raises
     ------
     ValueError
-        If the holes cannot be packed: says how many could, and at which fill factor. If no mask that obeys
-        `constraints` is found: says the largest fill factor at which one was or, if there is none, how much a rule may
-        ask for at this one.
+        If the holes cannot be packed; the message says how many could, and at which fill factor. If no mask that
+        satisfies `constraints` is found; the message gives the largest fill factor at which one was or, failing that,
+        the values of single constraints at which one was.
     TypeError
-        If `constraints` is no sequence of rules.
+        If `constraints` is not a sequence of constraints.
     """
     hole_diameter(n_subapertures, mask_diameter, fill_factor)
     require_constraints(constraints)
@@ -73,10 +73,10 @@ def require_room(
 
 
 def _require_area(n: int, mask_diameter: float, fill_factor: float, constraints: Sequence[Constraint]) -> None:
-    """Raise `Infeasible` where there is too little area for N holes with their gaps beside the largest keep-out disc.
+    """Raise `Infeasible` if there is too little area for N holes with their gaps beside the largest keep-out disc.
 
-    Holes that are half a gap larger all around do not overlap, and lie in a mask that is half a gap larger all around.
-    What fits into the keep-out disc, made half a gap smaller, could stand there beside them.
+    Holes enlarged by half a gap all around do not overlap, and lie in a mask enlarged by half a gap all around. Holes
+    that would fit into the keep-out disc, reduced by half a gap all around, are lost.
     """
     width = mask_diameter - 2 * max((rule.margin for rule in constraints if isinstance(rule, RimMargin)), default=0.0)
     gap = max((rule.gap for rule in constraints if isinstance(rule, MinimumGap)), default=0.0)
@@ -85,7 +85,7 @@ def _require_area(n: int, mask_diameter: float, fill_factor: float, constraints:
     blocked = max((zone.diameter for zone in zones), default=0.0)
 
     def most(hole: float, gap: float) -> int:
-        """No more holes of this diameter [m] fit."""
+        """Return an upper limit on the number of holes of this diameter [m]."""
         cell = hole + gap
         return largest_number(max(0.0, width + gap) / cell) - certain_number(max(0.0, blocked - gap) / cell)
 
@@ -149,7 +149,7 @@ def _advice(
 
 
 def _largest(fits: Callable[[float], bool], limit: float) -> float:
-    """The largest value below `limit` that was found to fit, by bisection; 0 if not even a speck of it does."""
+    """Return the largest value below `limit` that was found to fit, by bisection; 0 if not even a tiny one fits."""
     largest, fails = 0.0, limit
     trial = _SPECK * limit
     for _ in range(_BISECTIONS):
@@ -160,7 +160,7 @@ def _largest(fits: Callable[[float], bool], limit: float) -> float:
         else:
             fails = trial
         trial = (largest + fails) / 2
-    # rounded down, so that the value that is stated fits
+    # Rounded down, so that the stated value fits.
     digit = 10.0 ** (math.floor(math.log10(largest)) - 3)
     return math.floor(largest / digit) * digit
 
@@ -172,7 +172,7 @@ def _holes(n: int, mask_diameter: float, fill_factor: float, constraints: Sequen
 
 
 def _first_mask(holes: Holes, rng: np.random.Generator, trials: _Trials) -> SparseAperture:
-    """Descend from random masks on the squared shortfalls alone; the first that can be projected is taken."""
+    """Minimise the squared shortfalls from random masks, and return the first mask that can be projected."""
     if not any(not isinstance(c, (InsideDisc, NoOverlap)) for c in holes.constraints):
         template = holes.template
         generator = torch.Generator().manual_seed(int(rng.integers(2**62)))

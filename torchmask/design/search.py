@@ -1,4 +1,4 @@
-"""The search for the best mask."""
+"""Search for the mask that minimises a criterion."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from torchmask.design.refine import Monitor, SearchResult, conclude, polish
 from torchmask.design.room import require_room
 from torchmask.record import Callback
 
-DEFAULT_BUDGETS = {"hybrid": 100_000, "cma": 20_000}  # evaluations, up to N = 11
+DEFAULT_BUDGETS = {"hybrid": 100_000, "cma": 20_000}  # evaluations for up to 11 holes
 METHODS = tuple(DEFAULT_BUDGETS)
-POLISH = 120  # evaluations of the gradient stage for each mask it starts from
+POLISH = 120  # evaluations of the gradient stage for each of its starting masks
 
 
 def search_mask(
@@ -32,41 +32,45 @@ def search_mask(
     constraints: Sequence[Constraint] = (),
     callback: Callback | None = None,
 ) -> SearchResult:
-    """Search the positions of N equal round holes, at fixed collecting area, that minimise a criterion.
+    """Search for the positions of N equal round holes that minimise a criterion at fixed collecting area.
 
     Parameters
     ----------
-    criterion : AsymptoticMSE, or any differentiable error of masks like it
+    criterion : AsymptoticMSE or similar
+        Differentiable error of masks.
     n_subapertures : int
         Number of holes, N.
     mask_diameter : float
-        D [m].
+        Diameter D of the mask [m].
     fill_factor : float
-        N d^2 / D^2, which sets the diameter d of the holes.
+        Fill factor N d^2 / D^2, which sets the diameter d of the holes.
     method : {"hybrid", "cma"}
-        "cma": CMA-ES with penalties, the published method. "hybrid": batched quasi-Newton descents from random
-        masks, then basin hopping on a pool of the best, on a coarse frequency grid; better at equal time.
+        "cma" is CMA-ES with penalties, the published method. "hybrid" makes batched quasi-Newton descents from random
+        masks, then basin hopping on a pool of the best, on a coarse frequency grid; it is better in the same time.
     refine : bool
-        End with a gradient stage on the grid of `criterion`. Without it the best mask of the search is only moved onto
-        the rules.
+        Whether to end with a gradient stage on the grid of `criterion`. Otherwise the best mask of the search is only
+        projected onto the constraints.
     seed : int
-        Same seed, same numbers (on the same machine and number of threads).
+        Random seed. The same seed gives the same result on the same machine with the same number of threads.
     budget : int, optional
-        Evaluations of the criterion (for "hybrid": on the coarse grid) before the gradient stage.
+        Evaluations of the criterion before the gradient stage, for "hybrid" on the coarse grid.
     constraints : sequence of Constraint
-        Rules beside the mask disc and the overlap, which always hold.
+        Constraints in addition to those on the mask disc and on overlaps, which always hold.
     callback : callable, optional
-        Gets a `Record` now and then, with the best centres so far, which may still break a rule by a little.
+        Receives a `Record` from time to time with the best centres so far, which may still violate a constraint
+        slightly.
 
     Returns
     -------
     SearchResult
-        Feasible to 1e-9 of the mask's diameter, its error measured on the grid of `criterion` at this very mask.
+        Best mask, feasible to 1e-9 of its diameter, with its error on the grid of `criterion`.
 
     Raises
     ------
     ValueError
-        For a request that no mask fulfils.
+        If an argument is out of range, or no mask that fulfils the request is found.
+    TypeError
+        If `constraints` is not a sequence of constraints.
 
     Examples
     --------
@@ -84,7 +88,7 @@ def search_mask(
     if method not in METHODS:
         raise ValueError(f"method is {method!r}: known methods are {', '.join(METHODS)}")
     if budget is None:
-        # the cost of an evaluation grows with N: about the same time for all
+        # The cost of an evaluation grows with N, and searches should take about the same time.
         budget = int(DEFAULT_BUDGETS[method] * min(1.0, 11 / n_subapertures)) if n_subapertures > 0 else 1
     if budget != int(budget) or budget < 1:
         raise ValueError(f"budget is {budget}: it must be a whole number of evaluations, at least 1")
@@ -97,7 +101,7 @@ def search_mask(
     working = criterion if method == "cma" else coarse_criterion(criterion)
     starts, used = explore(working, holes, budget, rng, monitor)
     history = monitor.history(criterion)
-    # One evaluation each is what it takes to compare the candidates once they are feasible: no gradient stage.
+    # Without a gradient stage, one evaluation of each candidate is needed to compare them once they are feasible.
     allowance = (POLISH if refine else 1) * len(starts)
     monitor = Monitor("design/refine", allowance, holes, callback, before=used)
     aperture, polished = polish(criterion, holes, starts, allowance, monitor, fallback)

@@ -1,8 +1,8 @@
-"""Many independent tasks on many cores, each on disk as soon as it is done, so that a killed sweep goes on.
+"""Independent tasks on many cores, with every result saved at once, so that an interrupted sweep can continue.
 
-A task is a mapping of plain values that says all that its result depends on. Its file is named after a digest of
-that mapping: the same task is never computed twice in one folder, and another sweep in the folder shares it.
-The process that starts the sweep writes the files, so that a cluster needs no common disk.
+A task is a mapping of plain values that contains everything its result depends on. Its file is named after a digest of
+that mapping, so a task is computed only once in a folder, and other sweeps in the folder share it. The process that
+starts the sweep writes the files, so a cluster needs no shared disk.
 """
 
 from __future__ import annotations
@@ -31,38 +31,38 @@ def run_tasks(
     n_workers: int | None = None,
     callback: Callback | None = None,
 ) -> list[dict[str, Any]]:
-    """`function(task)` of every task, in order; those whose file is in `folder` are read instead of computed.
+    """Return `function(task)` for every task, in order, reading results that are already in `folder`.
 
     Parameters
     ----------
     function : callable
-        Takes a task as JSON gives it back and returns a mapping that JSON can hold. Must be picklable.
+        Picklable function that takes a task, as read from JSON, and returns a mapping that JSON can represent.
     tasks : sequence of mappings
-        Equal tasks are computed once.
+        Tasks. Equal ones are computed once.
     folder : path
-        Made if needed. One file per finished task, "<stage>-<digest>.json", whole or absent.
+        Folder for one file per finished task, "<stage>-<digest>.json"; created if needed.
     stage : str
-        The kind of task, such as "design/table/search"; names the files and the records.
+        Kind of task, such as "design/table/search", used in the names of files and in records.
     backend : {"loky", "ray"}
-        Processes on this machine, or a Ray cluster: the one `ray.init` or RAY_ADDRESS says, or else a local one.
+        Processes on this machine, or a Ray cluster (that of `ray.init` or RAY_ADDRESS, or else a local one).
     n_workers : int, optional
-        How many tasks run at once, each on one torch thread; by default one per core (of the cluster). With 1 and
-        "loky" they run in this process.
+        Number of tasks that run at a time, each on one torch thread; by default one per core (of the cluster). With 1
+        and "loky" they run in this process.
     callback : callable, optional
-        Gets a Record after each task; its scalars are the numbers of the result.
+        Receives a `Record` after each task, whose scalars are the numbers of the result.
 
     Raises
     ------
     ValueError
-        Before any work: unknown backend, n_workers not a whole number of at least 1, folder is a file, missing joblib
-        or ray.
+        Before any work, if the backend is unknown or not installed, `n_workers` is not a whole number of at least 1, or
+        `folder` is a file.
     RuntimeError
-        If tasks failed, after all others are done; names the tasks and gives the first traceback.
+        If tasks failed, after all others are done; the message gives the first task that failed and its traceback.
 
     Warns
     -----
     RuntimeWarning
-        For a damaged file of a task, by name; the task is computed again.
+        If the file of a task is damaged; the task is computed again.
 
     Examples
     --------
@@ -100,19 +100,19 @@ def run_tasks(
 
 
 def _digest(value: Any) -> str:
-    """A name for what JSON holds, equal for equal values."""
+    """Return a hash of a value that JSON can represent."""
     text = json.dumps(to_json(value), sort_keys=True, allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()[:24]
 
 
 def _load(path: Path, task: Task) -> dict[str, Any] | None:
-    """The stored result of `task`; None, with a warning if there is a file, when it has to be computed."""
+    """Return the stored result of `task`, or None if it must be computed, with a warning if its file is damaged."""
     if not path.exists():
         return None
     try:
         stored = read_json(path)
         if stored["task"] != task or stored["sha256"] != _digest(stored["result"]):
-            raise ValueError(f"{path} does not hold what was written to it")
+            raise ValueError("its content does not match its task or checksum")
         return stored["result"]
     except (ValueError, KeyError, TypeError) as error:
         warnings.warn(f"the file {path} is damaged ({error}): its task is computed again", RuntimeWarning, stacklevel=3)

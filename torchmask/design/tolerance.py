@@ -1,9 +1,9 @@
-"""How well a mask must be machined: Monte Carlo of hole position and diameter errors.
+"""Machining tolerances of a mask, by Monte Carlo simulation of errors of hole positions and diameters.
 
-Positions err independently, hole by hole, by a Gaussian of the same rms on either axis. The diameter error is common to
-all holes of a mask and Gaussian from mask to mask: one tool or one etching cuts them all, and the criterion knows one
-diameter a mask. Independent errors of N diameters act through their mean to first order, so they do about sqrt(N)
-times less harm: the common error is the cautious choice.
+Position errors are independent for every hole and axis, and Gaussian. The diameter error is Gaussian and common to all
+holes of a mask, because one tool or one etching cuts them all and the criterion has one diameter per mask. Independent
+errors of N diameters act to first order through their mean and would do about sqrt(N) times less harm, so a common
+error is the cautious choice.
 """
 
 from __future__ import annotations
@@ -25,12 +25,13 @@ Kind = Literal["position", "diameter", "both"]
 
 @dataclass(frozen=True)
 class MachiningErrors:
-    """What machining errors of a given size do to the error of the restoration; `print` shows the main numbers.
+    """Effect of machining errors of a given size on the error of the restoration; `print` shows the main numbers.
 
-    position_rms, diameter_rms : rms error of each coordinate of a hole, and of the diameter common to all [m]
-    nominal_mse : of the mask as designed
-    mse : (n_draws,) of the masks as machined; the second half has the errors of the first with the sign reversed, so
-        that effects of first order leave the mean exactly
+    position_rms : rms error of each coordinate of a hole [m]
+    diameter_rms : rms error of the common diameter of the holes [m]
+    nominal_mse : MSE of the mask as designed
+    mse : (n_draws,) MSE of the masks as machined. The second half has the errors of the first half with opposite sign,
+        so that first-order effects cancel in the mean
     """
 
     position_rms: float
@@ -44,15 +45,15 @@ class MachiningErrors:
         return self.mse / self.nominal_mse - 1
 
     def mean(self) -> tuple[float, float]:
-        """Mean relative growth and its standard error."""
+        """Return the mean relative growth and its standard error."""
         pairs = self.growth.reshape(2, -1).mean(0)
         return float(pairs.mean()), float(pairs.std()) / math.sqrt(len(pairs))
 
     def quantile(self, level: float) -> tuple[float, float]:
-        """Relative growth that a fraction `level` of the masks stays below, and its standard error.
+        """Return the relative growth below which a fraction `level` of the masks stays, and its standard error.
 
-        The error is half the distance of the order statistics one binomial standard deviation to either side, the two
-        draws of a pair counted as one: cautious by up to sqrt(2) where the growth is of first order.
+        The error is half the difference of the order statistics one binomial standard deviation to either side. The two
+        draws of a pair count as one, which overestimates it by up to sqrt(2) if the growth is of first order.
         """
         if not 0 < level < 1:
             raise ValueError(f"the level of a quantile is {level}: it must lie between 0 and 1")
@@ -73,13 +74,13 @@ class MachiningErrors:
 
 @dataclass(frozen=True)
 class MachiningTolerance:
-    """The rms machining error that the MSE bears.
+    """The rms machining error that is tolerable.
 
-    rms : at which the MSE has grown by `growth` [m]; infinite if it has not at a tenth of the hole diameter
+    rms : rms error at which the MSE has grown by `growth` [m]; infinite if it has not at a tenth of the hole diameter
     error : statistical standard error of `rms` [m]
-    growth : relative growth of the MSE allowed
-    kind : what errs: "position", "diameter" or "both", with the same rms
-    quantile : the fraction of masks that is to stay below the growth; None: the mean of all masks is
+    growth : tolerated relative growth of the MSE
+    kind : quantity with errors, "position", "diameter" or "both" with the same rms
+    quantile : fraction of masks that must stay below `growth`; None if the mean of all masks must
     """
 
     rms: float
@@ -97,34 +98,35 @@ def machining_errors(
     n_draws: int = 128,
     generator: torch.Generator | None = None,
 ) -> MachiningErrors:
-    """Distribution of the MSE over masks machined with errors.
+    """Return the distribution of the MSE over masks machined with errors.
 
     Parameters
     ----------
     criterion : callable
-        aperture -> MSE (...), such as `AsymptoticMSE`, on a grid that resolves a sub-aperture's OTF: on a coarse one a
-        mask optimised there loses its place on the grid points and looks more delicate than it is.
+        Function from an aperture to its MSE (...), such as `AsymptoticMSE`. Its grid must resolve the OTF of a
+        sub-aperture: on a coarse grid, a mask optimised on that grid looks more sensitive than it is.
     aperture : SparseAperture
-        One mask, centres (N, 2).
+        One mask, with centres (N, 2).
     position_rms : float
-        Rms error of each coordinate of each hole [m].
+        Rms error of each coordinate of each hole [m], at most a tenth of the hole diameter.
     diameter_rms : float
-        Rms error of the diameter, common to all holes of a mask [m], at most a tenth of it. The criterion keeps its
-        number of photons; that of light through the hole is not in it.
+        Rms error of the common diameter of the holes [m], at most a tenth of it. The number of photons in the criterion
+        does not change with it.
     n_draws : int
-        Masks drawn, an even number of at least 16.
+        Number of masks to draw, even and at least 16.
     generator : torch.Generator, optional
+        Source of randomness.
 
     Raises
     ------
     ValueError
-        For a population of masks, sizes of errors that are negative, not finite or too large, and too few draws.
+        If the aperture is a population, an rms error is out of range, or `n_draws` is odd or too small.
     """
     _check(aperture, n_draws)
     limit = aperture.subaperture_diameter / 10
     for name, value in (("position_rms", position_rms), ("diameter_rms", diameter_rms)):
         if not (math.isfinite(value) and 0 <= value <= limit * (1 + 1e-9)):
-            raise ValueError(f"{name} is {value}: it lies between 0 and a tenth of the hole diameter, {limit:.4g} m")
+            raise ValueError(f"{name} is {value}: it must be between 0 and a tenth of the hole diameter, {limit:.4g} m")
     errors = _draw(aperture, n_draws, generator)
     return _machined(criterion, aperture, position_rms, diameter_rms, *errors)
 
@@ -139,25 +141,24 @@ def machining_tolerance(
     n_draws: int = 128,
     generator: torch.Generator | None = None,
 ) -> MachiningTolerance:
-    """The rms machining error at which the MSE has grown by `growth`.
+    """Return the rms machining error at which the MSE has grown by `growth`.
 
-    The same draws, scaled, serve every size of error that is tried, so their growth is a smooth function of it.
+    The same draws are scaled to every size of error that is tried, so the growth is a smooth function of it. For
+    `criterion`, `aperture`, `n_draws` and `generator` see `machining_errors`.
 
     Parameters
     ----------
-    criterion, aperture, n_draws, generator
-        As for `machining_errors`.
     growth : float
-        Relative, positive.
+        Tolerated relative growth of the MSE, positive.
     kind : {"both", "position", "diameter"}
-        What errs: positions (each coordinate), the common diameter, or both with the same rms.
+        Quantity with errors: each coordinate of the positions, the common diameter, or both with the same rms.
     quantile : float, optional
-        Between 0 and 1: let this fraction of the masks stay below the growth rather than their mean.
+        Fraction of the masks, in (0, 1), that must stay below `growth`. By default their mean must.
 
     Raises
     ------
     ValueError
-        As `machining_errors`, and for a growth that is not positive, an unknown kind or a quantile outside (0, 1).
+        As `machining_errors` does, and if `growth` is not positive, `kind` is unknown or `quantile` is not in (0, 1).
 
     Examples
     --------
@@ -203,7 +204,7 @@ def _check(aperture: SparseAperture, n_draws: int) -> None:
 
 
 def _draw(aperture: SparseAperture, n_draws: int, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
-    """Errors of unit rms, in pairs of either sign: of positions (n_draws, N, 2), of the common diameter (n_draws,)."""
+    """Draw errors of unit rms, in pairs of opposite sign, of positions (n_draws, N, 2) and diameters (n_draws,)."""
     like = {"dtype": aperture.centers.dtype, "device": aperture.centers.device, "generator": generator}
     position = torch.randn(n_draws // 2, *aperture.centers.shape, **like)
     diameter = torch.randn(n_draws // 2, **like)
@@ -223,7 +224,7 @@ def _machined(
         centers = aperture.centers + position_rms * position
         if diameter_rms == 0:
             mse = criterion(aperture.replace(centers=centers))
-        else:  # an aperture has one diameter for its whole population
+        else:  # a population has a single diameter, so masks are evaluated one by one
             diameters = (aperture.subaperture_diameter + diameter_rms * diameter).tolist()
             masks = [aperture.replace(c, d) for c, d in zip(centers, diameters, strict=True)]
             mse = torch.stack([criterion(mask) for mask in masks])

@@ -1,4 +1,4 @@
-"""Independent calls side by side: on the cores of this machine, or on a Ray cluster."""
+"""Parallel execution of independent calls, on the cores of this machine or on a Ray cluster."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Key = TypeVar("Key")
 
 @dataclass(frozen=True)
 class Outcome(Generic[Key]):
-    """What one call came to: its value, or the error that it ended with and where that was raised."""
+    """Outcome of one call: its value, or the error that it raised and its traceback."""
 
     key: Key
     value: Any = None
@@ -26,7 +26,7 @@ class Outcome(Generic[Key]):
 
 
 def require_backend(backend: str, n_workers: int | None) -> None:
-    """Raise ValueError unless `run_side_by_side` can work there."""
+    """Raise ValueError unless `run_side_by_side` can use this backend with this number of workers."""
     if backend not in BACKENDS:
         raise ValueError(f"backend is {backend!r}: known backends are {', '.join(BACKENDS)}")
     if n_workers is not None and (n_workers != int(n_workers) or n_workers < 1):
@@ -45,22 +45,23 @@ def require_backend(backend: str, n_workers: int | None) -> None:
 def run_side_by_side(
     function: Callable[[Any], Any], arguments: Mapping[Key, Any], backend: str = "loky", n_workers: int | None = None
 ) -> Iterator[Outcome[Key]]:
-    """`function(argument)` of every argument, each on one torch thread; outcomes come as calls end.
+    """Yield the outcome of `function(argument)` for every argument as it finishes, each on one torch thread.
 
     Parameters
     ----------
     function : callable
-        Must be picklable, as must arguments and values.
+        Function to call. It must be picklable, and so must its arguments and values.
     arguments : mapping
-        From any name of a call to its argument.
+        Argument of each call, with any name for the call as its key.
     backend : {"loky", "ray"}
-        Processes on this machine, or a Ray cluster: the one `ray.init` or RAY_ADDRESS says, or else a local one.
+        Processes on this machine, or a Ray cluster (that of `ray.init` or RAY_ADDRESS, or else a local one).
     n_workers : int, optional
-        How many calls run at once; by default one per core (of the cluster). With 1 and "loky" they run in this
+        Number of calls that run at a time; by default one per core (of the cluster). With 1 and "loky" they run in this
         process.
 
-    An error ends the call that raised it and no other; if a process dies, all calls that have not ended have that as
-    their error.
+    Notes
+    -----
+    An error ends only the call that raised it. If a process dies, all unfinished calls have that as their error.
 
     Examples
     --------
@@ -75,7 +76,7 @@ def run_side_by_side(
     left = set(arguments)
     with _registered(backend) as cores:
         n_jobs = min(n_workers or cores, len(arguments))
-        # one call at a time: a batch would come back as a whole
+        # Without batches, because a batch would be returned only as a whole.
         options: dict[str, Any] = {"batch_size": 1, "pre_dispatch": "n_jobs", "return_as": "generator_unordered"}
         parallel: Any = joblib.Parallel(n_jobs, backend=backend, **options)
         try:
@@ -88,11 +89,11 @@ def run_side_by_side(
             yield from (Outcome(key, None, error, traceback.format_exc()) for key in arguments if key in left)
 
 
-_DEATHS = ("TerminatedWorkerError", "BrokenProcessPool", "RayActorError", "ActorDiedError")  # of a worker's process
+_DEATHS = ("TerminatedWorkerError", "BrokenProcessPool", "RayActorError", "ActorDiedError")  # a worker process died
 
 
 def _guarded(function: Callable[[Any], Any], key: Key, argument: Any) -> Outcome[Key]:
-    """One call on one thread; a failure travels as a value, so that it does not end the others."""
+    """Make one call on one thread, and return an error as a value so that it does not end the others."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -104,7 +105,7 @@ def _guarded(function: Callable[[Any], Any], key: Key, argument: Any) -> Outcome
 
 
 def _that_travels(error: Exception) -> Exception:
-    """The error itself, or one with its words where it cannot go from process to process."""
+    """Return the error itself, or one with the same message if it cannot be pickled."""
     try:
         pickle.loads(pickle.dumps(error))
     except Exception:
@@ -114,7 +115,7 @@ def _that_travels(error: Exception) -> Exception:
 
 @contextmanager
 def _registered(backend: str) -> Iterator[int]:
-    """The number of cores behind a backend, made known to joblib."""
+    """Register a backend with joblib and yield its number of cores."""
     import joblib
 
     if backend == "loky":
@@ -124,8 +125,8 @@ def _registered(backend: str) -> Iterator[int]:
     from ray.util.joblib.ray_backend import RayBackend
 
     class Backend(RayBackend):
-        # joblib takes this from its parent, a pool of local processes that may wait for ever for one that died.
-        # Ray's actors report their death.
+        # joblib inherits False from a pool of local processes, which may wait for ever for one that died, but Ray's
+        # actors report their death.
         supports_return_generator = True
 
     joblib.register_parallel_backend("ray", Backend)
