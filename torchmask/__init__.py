@@ -33,6 +33,8 @@ from torchmask.optics.geometry import MaskGeometry
 from torchmask.optics.otf import OTF
 from torchmask.optics.psf import PSF
 from torchmask.optics.zernike import ZernikePhase
+from torchmask.planning.plan import plan_observation
+from torchmask.planning.result import ObservationPlan
 from torchmask.restoration.baselines import average_psf, shift_and_add
 from torchmask.restoration.many import restore_many
 from torchmask.restoration.myopic import MyopicDeconvolution
@@ -68,6 +70,7 @@ __all__ = [
     "NoisePSD",
     "Observables",
     "Observation",
+    "ObservationPlan",
     "PowerLawPSD",
     "RestorationResult",
     "RunLogger",
@@ -95,6 +98,7 @@ __all__ = [
     "map_companions",
     "multiframe_wiener",
     "named_layers",
+    "plan_observation",
     "read_observation",
     "refine_mask",
     "restore_many",

@@ -11,6 +11,7 @@ from torchmask import __version__
 from torchmask.cli.program import exit_status, parse
 
 COMMANDS = {
+    "plan": "predict how many holes, of what size, and what exposure an observation needs",
     "design": "search the mask with the smallest error of the restored image",
     "simulate": "draw short exposures of a scene through a mask and turbulence",
     "restore": "restore the image behind a stack of short exposures (.npz or FITS)",

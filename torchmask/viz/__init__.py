@@ -10,6 +10,7 @@ from torchmask.viz.figures import (
     stretch,
     uv_coverage_figure,
 )
+from torchmask.viz.planning import plan_figure
 
 __all__ = [
     "comparison_figure",
@@ -17,6 +18,7 @@ __all__ = [
     "history_figure",
     "mask_figure",
     "mtf_figure",
+    "plan_figure",
     "psf_figure",
     "stretch",
     "uv_coverage_figure",

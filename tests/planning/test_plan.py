@@ -1,0 +1,221 @@
+"""The plan of an observation: its numbers are the criterion's, its optimum lies between read-out and turbulence."""
+
+import dataclasses
+import functools
+import json
+
+import matplotlib.figure
+import pytest
+import torch
+
+import torchmask.planning.plan
+from torchmask.cli.main import main
+from torchmask.design.constraints import KeepOutDisc, check_mask
+from torchmask.design.criterion import AsymptoticMSE
+from torchmask.design.manufacture import load_mask
+from torchmask.design.observed import change_light, instrument_criterion
+from torchmask.design.turbulent import TurbulentMSE
+from torchmask.instrument.instrument import Instrument
+from torchmask.instrument.parts import Camera, Site, Source, Telescope
+from torchmask.optics.aperture import FullAperture, SparseAperture
+from torchmask.optics.pixel import SquarePixel
+from torchmask.planning.plan import plan_observation
+from torchmask.planning.result import Choice, ObservationPlan
+from torchmask.spectra import NoisePSD, PowerLawPSD
+from torchmask.viz.planning import plan_figure
+
+MASK = SparseAperture.from_catalog("golay6", 1.0, 0.05)
+TINY = {"n_frequencies": 32, "budget": 64}
+
+
+def make(**changes):
+    known = {
+        "telescope": Telescope(diameter=1.0, throughput=0.5),
+        "source": Source(photon_rate=3e8),
+        "site": Site(r0=0.15, wind=10.0, sky=18.0),
+        "camera": Camera(n_pixels=64, readout_noise=3.0, readout_time=1e-3, pixel_fill=1.0),
+        "wavelength": 550e-9,
+        "width": 20e-9,
+        "exposure": 4e-3,
+        "observing_time": 0.5,
+    }
+    return Instrument(**(known | changes))
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Without the tables of turbulence, which take seconds each."""
+    still = functools.partial(instrument_criterion, turbulence=False)
+    monkeypatch.setattr(torchmask.planning.plan, "instrument_criterion", still)
+
+
+@pytest.fixture(scope="module")
+def plan():
+    with pytest.MonkeyPatch.context() as patch:
+        still = functools.partial(instrument_criterion, turbulence=False)
+        patch.setattr(torchmask.planning.plan, "instrument_criterion", still)
+        axes = {"n_subapertures": (3, 7), "hole_diameters": (0.09, 0.15, 0.35), "exposures": (2e-3, 6e-3)}
+        return plan_observation(make(), **axes, **TINY)
+
+
+def test_points_have_the_light_of_their_area(plan):
+    for choice in plan.choices:
+        mask = plan.masks[choice.n_subapertures, choice.hole_diameter]
+        photons = 3e8 * 0.5 * float(mask.area) * choice.exposure
+        assert choice.photons == pytest.approx(photons, rel=1e-12)
+        assert choice.frames == int(0.5 / (choice.exposure + 1e-3) + 1e-9)
+        criterion = AsymptoticMSE(make().grid(32), PowerLawPSD(1.5, photons), NoisePSD(photons), choice.frames)
+        floor = float(criterion.floor(1.0) / criterion.object_psd.mean())
+        assert choice.relative_mse - choice.above_floor == pytest.approx(floor, rel=1e-10)
+
+
+@pytest.mark.slow  # tables of turbulence for two exposures, twice
+def test_points_are_the_criterion_under_turbulence_pixels_and_sky():
+    other = SparseAperture.from_catalog("golay6", 1.0, 0.05).replace(0.9 * MASK.centers)
+    found = plan_observation(make(), aperture=other, exposures=(2e-3, 6e-3), n_frequencies=32)
+    for choice in found.choices:
+        criterion = TurbulentMSE(
+            make().grid(32),
+            PowerLawPSD(1.5, choice.photons),
+            NoisePSD(choice.photons, 3.0, 64**2),
+            choice.frames,
+            r0=0.15,
+            outer_scale=20.0,
+            exposure=choice.exposure,
+            wind=10.0,
+            pixel=SquarePixel(1.0),
+            sky=choice.sky,
+        )
+        assert choice.relative_mse == pytest.approx(float(criterion.relative(other)), rel=1e-10)
+
+
+def test_a_change_of_light_is_the_criterion_of_that_light():
+    criterion = instrument_criterion(make(), 0.05, 32, turbulence=False)
+    change_light(criterion, make(), 0.02)
+    torch.testing.assert_close(
+        criterion(MASK), instrument_criterion(make(), 0.02, 32, turbulence=False)(MASK), rtol=1e-14, atol=0
+    )
+
+
+def test_masks_are_those_of_the_axes_and_what_does_not_fit_is_told(plan):
+    assert sorted(plan.masks) == [(3, 0.09), (3, 0.15), (3, 0.35), (7, 0.09), (7, 0.15)]
+    for (n, hole), mask in plan.masks.items():
+        check_mask(mask, 1e-9)
+        assert (mask.n_subapertures, mask.subaperture_diameter) == (n, pytest.approx(hole, rel=1e-12))
+    assert plan.left_out == ("7 holes of 0.35 m do not fit: at most 0.3333 m",)
+    assert len(plan.choices) == 10
+
+
+def test_masks_keep_clear_of_the_obstruction(quick):
+    blocked = make(telescope=Telescope(diameter=1.0, central_obstruction=0.3))
+    found = plan_observation(blocked, n_subapertures=(3,), hole_diameters=(0.15,), exposures=(2e-3,), **TINY)
+    check_mask(found.mask, 1e-9, [KeepOutDisc(0.3)])
+
+
+def test_the_best_point_and_the_edges_of_the_map(plan):
+    best = plan.best
+    assert best.relative_mse == min(choice.relative_mse for choice in plan.choices)
+    assert plan.mask is plan.masks[best.n_subapertures, best.hole_diameter]
+    assert (best.n_subapertures, best.hole_diameter) == (3, 0.35)  # pistons alone: the most light wins
+    assert plan.at_edge("hole_diameter")
+    text = str(plan)
+    assert "The best hole diameter is at the edge of the map" in text
+    assert text.count("\n| 3 |") == 6
+    assert "do not fit" in text
+
+
+@pytest.mark.slow
+def test_an_exposure_between_read_out_and_turbulence_is_best():
+    """At 3 electrons per pixel short frames drown in read-out noise; in long ones the fringes are gone."""
+    tau0 = make().seeing.tau0
+    exposures = [factor * tau0 for factor in (0.1, 1.5, 6.0)]
+    found = plan_observation(
+        make(source=Source(photon_rate=3e10)), aperture=MASK, exposures=exposures, n_frequencies=32
+    )
+    assert not found.at_edge("exposure")
+    assert exposures[0] < found.best_exposure < exposures[-1]
+    assert found.masks == {(6, MASK.subaperture_diameter): MASK}
+
+
+def test_the_best_exposure_is_the_vertex_of_a_parabola_of_logarithms():
+    def error(exposure):
+        return 0.3 * 10 ** (0.2 * (torch.tensor(exposure / 5e-3).log10()) ** 2)
+
+    choices = tuple(
+        Choice(3, 0.1, exposure, 10, 1e3, 0.0, float(error(exposure)), 0.1) for exposure in (2e-3, 4e-3, 9e-3)
+    )
+    plan = ObservationPlan(make(), choices, {(3, 0.1): MASK})
+    assert plan.best_exposure == pytest.approx(5e-3, rel=1e-5)
+    edge = ObservationPlan(make(), choices[:2], {(3, 0.1): MASK})
+    assert edge.best_exposure == 4e-3
+    assert edge.at_edge("exposure")
+
+
+def test_exposures_longer_than_the_observation_are_left_out(quick):
+    found = plan_observation(make(), aperture=MASK, exposures=(2e-3, 0.8), n_frequencies=32)
+    assert [choice.exposure for choice in found.choices] == [2e-3]
+    assert found.left_out[0].startswith("observing_time is 0.5 s, but one frame takes 0.801 s")
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"n_subapertures": ()}, "n_subapertures are"),
+        ({"n_subapertures": (1,)}, "at least 2"),
+        ({"n_subapertures": (6, 6)}, "none twice"),
+        ({"hole_diameters": (0.0,)}, "in m"),
+        ({"exposures": (-1e-3,)}, "in s"),
+        ({"exposures": (2.0,)}, "no exposure is short enough: observing_time is 0.5 s"),
+        (
+            {"n_subapertures": (20,), "hole_diameters": (0.3,)},
+            "no point .*: 20 holes of 0.3 m do not fit: at most 0.1952",
+        ),
+    ],
+)
+def test_maps_without_a_point_are_refused(settings, said):
+    with pytest.raises(ValueError, match=said):
+        plan_observation(make(), **settings, **TINY)
+
+
+def test_the_picture_shows_the_map_and_the_exposures(plan):
+    figure = plan_figure(plan)
+    assert isinstance(figure, matplotlib.figure.Figure)
+    titles = [ax.get_title(loc="left") for ax in figure.axes[:2]]
+    assert titles == [f"at {1e3 * plan.best.exposure:.3g} ms", f"holes of {plan.best.hole_diameter:.3g} m"]
+    texts = {text.get_text() for text in figure.axes[0].texts}
+    assert f"{plan.best.relative_mse:.3f}" in texts
+    assert "does not fit" in texts
+    best = plan.best
+    alone = plan_figure(dataclasses.replace(plan, masks={(best.n_subapertures, best.hole_diameter): MASK}))
+    assert len(alone.axes) == 1
+
+
+def test_the_command_writes_plan_mask_and_instrument(quick, tmp_path, capsys):
+    known = "--telescope.diameter 1 --source.photon-rate 3e8 --site.r0 0.15 --site.wind 10 --wavelength 550e-9"
+    known += " --width 2e-8 --exposure 4e-3 --n-frames 20 --n-subapertures 3 --hole-diameters 0.15"
+    known += " --exposures 0.002 0.004 --n-frequencies 32 --budget 64"
+    assert main(["plan", *known.split(), "--out", str(tmp_path / "plan")]) == 0
+    numbers = json.loads((tmp_path / "plan/plan.json").read_text())
+    assert numbers["best"] in numbers["map"]
+    assert len(numbers["map"]) == 2
+    mask = load_mask(tmp_path / "plan/mask.json")
+    assert mask.n_subapertures == 3
+    instrument = Instrument.load(tmp_path / "plan/instrument.json")
+    assert instrument.exposure == numbers["best"]["exposure"]
+    assert numbers["best"]["photons"] == pytest.approx(instrument.photons(float(mask.area)))
+    assert (tmp_path / "plan/plan.png").stat().st_size > 10_000
+    assert "Least predicted error" in capsys.readouterr().out
+    again = ["plan", "--config", str(tmp_path / "plan/config.yaml"), "--mask", "golay6", "--fill-factor", "0.05"]
+    assert main([*again, "--out", str(tmp_path / "again")]) == 0
+    assert load_mask(tmp_path / "again/mask.json").n_subapertures == 6
+
+
+@pytest.mark.slow
+def test_a_full_pupil_is_planned_without_a_mask(tmp_path):
+    known = "--telescope.diameter 1 --source.photon-rate 3e8 --site.r0 0.15 --site.wind 10 --wavelength 550e-9"
+    known += " --width 2e-8 --exposure 4e-3 --n-frames 20 --mask full --exposures 0.004 --n-frequencies 32"
+    assert main(["plan", *known.split(), "--out", str(tmp_path / "plan")]) == 0
+    numbers = json.loads((tmp_path / "plan/plan.json").read_text())
+    assert 0 < numbers["best"]["relative_mse"] < 0.5
+    assert numbers["best"]["photons"] == pytest.approx(3e8 * 4e-3 * float(FullAperture(1.0).area))
+    assert not (tmp_path / "plan/mask.json").exists()

@@ -1,0 +1,109 @@
+"""`torchmask plan`: how many holes, of what size, and what exposure."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from torchmask.cli.options import FULL, CatalogOptions, MaskOptions, RunOptions, load_aperture
+from torchmask.cli.run import new_run
+from torchmask.design.manufacture import save_json
+from torchmask.instrument.instrument import Instrument
+from torchmask.optics import catalog
+from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.pupil import Aperture
+from torchmask.planning.plan import plan_observation
+from torchmask.planning.result import ObservationPlan
+from torchmask.viz.figures import mask_figure
+from torchmask.viz.planning import plan_figure
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(Instrument, CatalogOptions, RunOptions):
+    """Plan an observation: how many holes, of what size, and what exposure restore the best image.
+
+    For every number of holes and hole diameter a mask is searched, quickly; for each of them and every exposure the
+    error of the restored image is predicted from magnitude, band, telescope, site, camera and time. Writes the map and
+    its least point (plan.md, plan.json, plan.png), that mask (mask.json) and the observation as one file for other
+    commands (instrument.json) to a new folder. Takes minutes.
+    """
+
+    mask: Annotated[Path | None, tyro.conf.arg(metavar="FILE|NAME|full")] = None
+    """A mask that exists, or the full pupil: then the exposure alone is planned. None: masks are searched."""
+    n_subapertures: tuple[int, ...] = (6, 9, 12, 16)
+    """Numbers of holes to compare."""
+    hole_diameters: tuple[float, ...] = ()
+    """To compare [m]; none: 0.5, 0.8 and 1.2 r0."""
+    exposures: tuple[float, ...] = ()
+    """To compare [s]; none: 0.25, 0.5, 1, 2, 4 and 8 times the coherence time tau0."""
+    n_frequencies: int = 128
+    """Frequency grid of the criterion, per side."""
+    budget: int = 1000
+    """Evaluations of the criterion in each search."""
+    seed: int = 0
+    """Of the searches."""
+
+
+def instrument_of(options: Instrument) -> Instrument:
+    """The instrument among the options."""
+    return Instrument(**{item.name: getattr(options, item.name) for item in dataclasses.fields(Instrument)})
+
+
+def existing_mask(options: Options) -> Aperture | None:
+    """What --mask names; a pattern without a size of its own, and a full pupil, are as wide as the telescope."""
+    if options.mask is None:
+        return None
+    telescope, name = options.telescope, str(options.mask)
+    diameter = options.mask_diameter
+    if diameter is None and (name == FULL or (name in catalog.names() and catalog.entry(name).pupil_diameter is None)):
+        diameter = telescope.diameter
+    return load_aperture(
+        MaskOptions(
+            mask=options.mask,
+            mask_diameter=diameter,
+            fill_factor=options.fill_factor,
+            mirrored=options.mirrored,
+            allow_overlap=options.allow_overlap,
+            central_obstruction=telescope.central_obstruction if name == FULL else 0.0,
+        )
+    )
+
+
+def run(options: Options) -> None:
+    """Plan, and write map, picture, mask and instrument."""
+    instrument, aperture = instrument_of(options), existing_mask(options)
+    with new_run("plan", options, options.seed) as output:
+        plan = plan_observation(
+            instrument,
+            n_subapertures=options.n_subapertures,
+            hole_diameters=options.hole_diameters or None,
+            exposures=options.exposures or None,
+            aperture=aperture,
+            n_frequencies=options.n_frequencies,
+            budget=options.budget,
+            seed=options.seed,
+            callback=output.callback,
+        )
+        best = instrument.with_exposure(plan.best.exposure)
+        table = best.describe(float(plan.mask.area))
+        output.report("plan", numbers(plan), f"{plan}\n\n{table}\n", plan_figure(plan))
+        best.save(output.directory / "instrument.json")
+        if isinstance(plan.mask, SparseAperture):
+            save_json(output.directory / "mask.json", plan.mask, best.mean_wavelength)
+            output.logger.figure("plan_mask", mask_figure(plan.mask))
+        output.summary.extend([*str(plan).split("\n\n", 1)[0].splitlines(), table])
+
+
+def numbers(plan: ObservationPlan) -> dict[str, object]:
+    """What plan.json says: the best point, the whole map, what is missing from it."""
+    return {
+        "best": plan.best,
+        "best_exposure": plan.best_exposure,
+        "at_edge": {name: plan.at_edge(name) for name in ("n_subapertures", "hole_diameter", "exposure")},
+        "map": plan.choices,
+        "left_out": plan.left_out,
+    }

@@ -1,0 +1,203 @@
+"""Planning an observation: the error over the number of holes, their size and the exposure, and where it is least."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from torchmask.design.constraint_base import Constraint, Infeasible
+from torchmask.design.constraints import KeepOutDisc
+from torchmask.design.observed import change_light, instrument_criterion
+from torchmask.design.search import search_mask
+from torchmask.instrument.instrument import Instrument
+from torchmask.optics.packing import largest_fill_factor
+from torchmask.optics.pupil import Aperture
+from torchmask.planning.result import AXES, Choice, ObservationPlan
+from torchmask.record import Callback, Record
+
+_HOLES = (0.5, 0.8, 1.2)  # in r0: wider holes hold aberrations that a blind restoration has to find
+_EXPOSURES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # in tau0
+
+
+def plan_observation(
+    instrument: Instrument,
+    *,
+    n_subapertures: Sequence[int] = (6, 9, 12, 16),
+    hole_diameters: Sequence[float] | None = None,
+    exposures: Sequence[float] | None = None,
+    aperture: Aperture | None = None,
+    constraints: Sequence[Constraint] = (),
+    n_frequencies: int = 128,
+    budget: int = 1000,
+    seed: int = 0,
+    callback: Callback | None = None,
+) -> ObservationPlan:
+    """The predicted error of an observation over the number of holes, their size and the exposure, and its least point.
+
+    The error is `TurbulentMSE` with the photons, the sky, the frames and the read-out noise that follow from the
+    instrument at each point. It supposes that every transfer function is known: see the manual's page on planning for
+    what that leaves out. Each mask is searched for its number and size of holes by `AsymptoticMSE` (hybrid, `budget`
+    evaluations) at the light of the instrument's own exposure, and kept for all exposures.
+
+    Parameters
+    ----------
+    instrument : Instrument
+        Its own exposure is that of the searches.
+    n_subapertures : sequence of int
+        Numbers of holes N.
+    hole_diameters : sequence of float, optional
+        [m]; None: 0.5, 0.8 and 1.2 r0.
+    exposures : sequence of float, optional
+        [s]; None: 0.25, 0.5, 1, 2, 4 and 8 tau0.
+    aperture : Aperture, optional
+        A mask that exists, or a full pupil, in place of the searches: only the exposure is planned then.
+    constraints : sequence of Constraint
+        Rules of the searches; the central obstruction of the telescope is one already.
+    n_frequencies : int
+        Of the criterion's grid, per side.
+    budget : int
+        Evaluations of each search.
+    seed : int
+        Of the searches.
+    callback : callable, optional
+        Gets a Record after each search and each point.
+
+    Raises
+    ------
+    ValueError
+        For an axis that is empty or holds what cannot be, and if no point can be built: says why.
+
+    Examples
+    --------
+    >>> from torchmask.optics.aperture import SparseAperture
+    >>> from torchmask.instrument.parts import Camera, Site, Source, Telescope
+    >>> instrument = Instrument(
+    ...     telescope=Telescope(diameter=1.0),
+    ...     source=Source(photon_rate=1e9),
+    ...     site=Site(r0=0.15, wind=10.0),
+    ...     camera=Camera(readout_noise=1.0, readout_time=1e-3),
+    ...     wavelength=550e-9,
+    ...     width=10e-9,
+    ...     exposure=2e-3,
+    ...     observing_time=1.0,
+    ... )
+    >>> mask = SparseAperture.from_catalog("golay6", 1.0, 0.1)
+    >>> plan = plan_observation(instrument, aperture=mask, exposures=(6e-3,), n_frequencies=32)
+    >>> plan.best.frames
+    142
+    """
+    lengths = _positive("exposures", _default(exposures, _EXPOSURES, instrument.seeing.tau0), "s")
+    left_out: list[str] = []
+    exposed = _exposed(instrument, lengths, left_out)
+    if not exposed:
+        raise ValueError(f"no exposure is short enough: {left_out[0]}")
+    if aperture is None:
+        masks = _search(
+            instrument,
+            tuple(
+                itertools.product(
+                    _whole(n_subapertures),
+                    _positive("hole_diameters", _default(hole_diameters, _HOLES, instrument.site.r0), "m"),
+                )
+            ),
+            _rules(instrument, constraints),
+            {"budget": budget, "seed": seed, "n_frequencies": n_frequencies},
+            left_out,
+            callback,
+        )
+    else:
+        masks = {(aperture.n_subapertures, aperture.subaperture_diameter): aperture}
+    if not masks:
+        raise ValueError(f"no point of the map can be built: {'; '.join(left_out)}")
+    choices = tuple(_measure(exposed, masks, n_frequencies, callback))
+    return ObservationPlan(instrument, choices, masks, tuple(left_out))
+
+
+def _default(given: Sequence[float] | None, factors: Sequence[float], unit: float) -> tuple[float, ...]:
+    return tuple(factor * unit for factor in factors) if given is None else tuple(given)
+
+
+def _positive(name: str, values: tuple[float, ...], unit: str) -> tuple[float, ...]:
+    if not values or not all(math.isfinite(value) and value > 0 for value in values) or len(set(values)) < len(values):
+        raise ValueError(f"{name} are {values}: at least one is needed, none twice, all finite and positive, in {unit}")
+    return tuple(sorted(float(value) for value in values))
+
+
+def _whole(values: Sequence[int]) -> tuple[int, ...]:
+    if not values or not all(value == int(value) and value >= 2 for value in values) or len(set(values)) < len(values):
+        raise ValueError(f"n_subapertures are {tuple(values)}: at least one is needed, none twice, whole, at least 2")
+    return tuple(sorted(int(value) for value in values))
+
+
+def _exposed(instrument: Instrument, lengths: Sequence[float], left_out: list[str]) -> list[Instrument]:
+    """The instrument at each exposure for which there is time."""
+    found = []
+    for exposure in lengths:
+        try:
+            found.append(instrument.with_exposure(exposure))
+        except ValueError as error:
+            left_out.append(str(error))
+    return found
+
+
+def _rules(instrument: Instrument, constraints: Sequence[Constraint]) -> tuple[Constraint, ...]:
+    blocked = instrument.telescope.central_obstruction
+    return (*constraints, *([KeepOutDisc(blocked)] if blocked else []))
+
+
+def _search(
+    instrument: Instrument,
+    points: Sequence[tuple[int, float]],
+    rules: tuple[Constraint, ...],
+    settings: dict[str, Any],
+    left_out: list[str],
+    callback: Callback | None,
+) -> dict[tuple[int, float], Aperture]:
+    """A mask for each number of holes and hole diameter, where one can be built."""
+    diameter, masks = instrument.telescope.diameter, {}
+    for step, (n, hole) in enumerate(points, 1):
+        fill, most = n * (hole / diameter) ** 2, largest_fill_factor(n)
+        if fill > most:
+            left_out.append(f"{n} holes of {hole:.4g} m do not fit: at most {diameter * math.sqrt(most / n):.4g} m")
+            continue
+        area = n * math.pi / 4 * hole**2
+        criterion = instrument_criterion(instrument, area, settings["n_frequencies"], turbulence=False)
+        try:
+            found = search_mask(
+                criterion, n, diameter, fill, budget=settings["budget"], seed=settings["seed"], constraints=rules
+            )
+        except Infeasible as error:
+            left_out.append(f"{n} holes of {hole:.4g} m: {error}")
+            continue
+        masks[n, hole] = found.aperture
+        _tell(callback, "plan/search", step, len(points), found.relative_mse)
+    return masks
+
+
+def _measure(
+    exposed: Sequence[Instrument],
+    masks: dict[tuple[int, float], Aperture],
+    n_frequencies: int,
+    callback: Callback | None,
+) -> list[Choice]:
+    """The predicted error at every point; masks with holes of one size share what is known of the turbulence."""
+    choices, n_steps = [], len(exposed) * len(masks)
+    for instrument in exposed:
+        criterion = None
+        for (n, hole), mask in sorted(masks.items(), key=lambda item: item[0][1]):
+            area = float(mask.area)
+            criterion = criterion or instrument_criterion(instrument, area, n_frequencies)
+            change_light(criterion, instrument, area)
+            error = float(criterion.relative(mask))
+            floor = float(criterion.floor(instrument.telescope.diameter) / criterion.object_psd.mean())
+            photons, sky = instrument.photons(area), instrument.sky(area)
+            choices.append(Choice(n, hole, instrument.exposure, instrument.frames, photons, sky, error, error - floor))
+            _tell(callback, "plan/map", len(choices), n_steps, error)
+    return sorted(choices, key=lambda choice: tuple(getattr(choice, name) for name in AXES))
+
+
+def _tell(callback: Callback | None, stage: str, step: int, n_steps: int, relative_mse: float) -> None:
+    if callback is not None:
+        callback(Record(stage, step, n_steps, {"relative_mse": relative_mse}))

@@ -1,0 +1,148 @@
+"""A plan: the map of the predicted error, and its least point."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchmask.instrument.instrument import Instrument
+from torchmask.optics.pupil import Aperture
+
+AXES = ("n_subapertures", "hole_diameter", "exposure")
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One point of a plan's map.
+
+    hole diameter in metres, exposure in seconds, photons and sky in electrons per frame (of the sky, per pixel)
+    """
+
+    n_subapertures: int
+    hole_diameter: float
+    exposure: float
+    frames: int
+    photons: float
+    sky: float
+    relative_mse: float
+    above_floor: float
+
+
+@dataclass(frozen=True)
+class ObservationPlan:
+    """The map of the predicted error, and its least point; `print` shows both as Markdown.
+
+    instrument : what was planned for
+    choices : every point that can be built
+    masks : by number of holes and hole diameter [m]
+    left_out : why points of the axes are missing
+
+    Examples
+    --------
+    >>> from torchmask.instrument.parts import Site, Source, Telescope
+    >>> from torchmask.optics.aperture import SparseAperture
+    >>> from torchmask.planning.plan import plan_observation
+    >>> instrument = Instrument(
+    ...     telescope=Telescope(diameter=1.0),
+    ...     source=Source(photon_rate=1e9),
+    ...     site=Site(r0=0.15, wind=10.0),
+    ...     wavelength=550e-9,
+    ...     width=10e-9,
+    ...     exposure=2e-3,
+    ...     n_frames=20,
+    ... )
+    >>> mask = SparseAperture.from_catalog("golay6", 1.0, 0.1)
+    >>> plan = plan_observation(instrument, aperture=mask, exposures=(2e-3,), n_frequencies=32)
+    >>> plan.mask is mask, len(plan.choices)
+    (True, 1)
+    """
+
+    instrument: Instrument
+    choices: tuple[Choice, ...]
+    masks: dict[tuple[int, float], Aperture]
+    left_out: tuple[str, ...] = ()
+
+    @property
+    def best(self) -> Choice:
+        """Where the predicted error is least."""
+        return min(self.choices, key=lambda choice: choice.relative_mse)
+
+    @property
+    def mask(self) -> Aperture:
+        """The aperture of the best point."""
+        return self.masks[self.best.n_subapertures, self.best.hole_diameter]
+
+    def axis(self, name: str) -> list[Choice]:
+        """The points that differ from the best one in `name` alone, in order."""
+        others = [other for other in AXES if other != name]
+        best = self.best
+        line = [c for c in self.choices if all(getattr(c, other) == getattr(best, other) for other in others)]
+        return sorted(line, key=lambda choice: getattr(choice, name))
+
+    def at_edge(self, name: str) -> bool:
+        """Whether the best point is the first or last along an axis, so that the optimum may lie beyond."""
+        line = self.axis(name)
+        return len(line) > 1 and getattr(self.best, name) in (getattr(line[0], name), getattr(line[-1], name))
+
+    @property
+    def best_exposure(self) -> float:
+        """The exposure [s] of the least error, between those of the map: by a parabola through the three around it.
+
+        At an edge of the axis, the edge.
+        """
+        line = self.axis("exposure")
+        place = line.index(self.best)
+        if place in (0, len(line) - 1):
+            return self.best.exposure
+        x, y = np.log([[c.exposure, c.relative_mse] for c in line[place - 1 : place + 2]]).T
+        curvature, slope, _ = np.polyfit(x - x[1], y, 2)
+        return self.best.exposure * math.exp(-slope / (2 * curvature))
+
+    def __str__(self) -> str:
+        best, told = self.best, self.instrument
+        seeing = told.with_exposure(best.exposure).seeing
+        lines = [
+            f"Least predicted error: {best.relative_mse:.4g}, {best.above_floor:.4g} above what no mask of this "
+            f"diameter can avoid, with {best.n_subapertures} holes of {best.hole_diameter:.4g} m "
+            f"({best.hole_diameter / told.site.r0:.2g} r0), {best.frames} frames of {1e3 * best.exposure:.4g} ms "
+            f"({best.exposure / seeing.tau0:.2g} tau0) and {best.photons:.4g} photons in each.",
+            f"Best exposure between those of the map: {1e3 * self.best_exposure:.4g} ms.",
+            *(
+                f"The best {_WORDS[name]} is at the edge of the map: beyond may be better."
+                for name in AXES
+                if self.at_edge(name)
+            ),
+            "",
+            "| " + " | ".join(_HEADINGS) + " |",
+            "|" + "---|" * len(_HEADINGS),
+            *("| " + " | ".join(_cells(choice)) + " |" for choice in self.choices),
+        ]
+        return "\n".join([*lines, *(["", *(f"- {reason}" for reason in self.left_out)] if self.left_out else [])])
+
+
+_WORDS = {"n_subapertures": "number of holes", "hole_diameter": "hole diameter", "exposure": "exposure"}
+_HEADINGS = (
+    "N",
+    "hole [m]",
+    "exposure [ms]",
+    "frames",
+    "photons/frame",
+    "sky/pixel",
+    "relative MSE",
+    "above the floor",
+)
+
+
+def _cells(choice: Choice) -> list[str]:
+    return [
+        str(choice.n_subapertures),
+        f"{choice.hole_diameter:.4g}",
+        f"{1e3 * choice.exposure:.4g}",
+        str(choice.frames),
+        f"{choice.photons:.4g}",
+        f"{choice.sky:.4g}",
+        f"{choice.relative_mse:.4f}",
+        f"{choice.above_floor:.4f}",
+    ]

@@ -1,0 +1,75 @@
+"""Figures of plans."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from torchmask.planning.result import ObservationPlan
+from torchmask.viz import style as drawing
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+@drawing.styled
+def plan_figure(plan: ObservationPlan) -> Figure:
+    """The predicted error over number and size of holes at the best exposure, and over the exposure for each number.
+
+    Of one mask, the exposures alone. The best point is marked with a ring.
+    """
+    several = len(plan.masks) > 1
+    figure, axes = drawing.row_of_axes([1.25, 1.5] if several else [1.7], height=3.6)
+    if several:
+        _draw_map(figure, axes[0], plan)
+    _draw_exposures(axes[-1], plan)
+    return figure
+
+
+def _draw_map(figure: Figure, ax: Axes, plan: ObservationPlan) -> None:
+    best, r0 = plan.best, plan.instrument.site.r0
+    numbers = sorted({n for n, _ in plan.masks})
+    holes = sorted({hole for _, hole in plan.masks})
+    errors = np.full((len(numbers), len(holes)), np.nan)
+    for choice in plan.choices:
+        if choice.exposure == best.exposure:
+            errors[numbers.index(choice.n_subapertures), holes.index(choice.hole_diameter)] = choice.relative_mse
+    ax.imshow(errors, origin="lower", cmap="viridis", aspect="auto")
+    middle = (np.nanmin(errors) + np.nanmax(errors)) / 2
+    for (row, column), error in np.ndenumerate(errors):
+        text, color = ("does not fit", drawing.FAINT) if np.isnan(error) else (f"{error:.3f}", "white")
+        ax.text(column, row, text, ha="center", va="center", fontsize=8, color="black" if error > middle else color)
+    place = holes.index(best.hole_diameter), numbers.index(best.n_subapertures)
+    ax.plot(*place, "o", markersize=34, fillstyle="none", color=drawing.COLORS[1])
+    ax.set_xticks(range(len(holes)), [f"{hole:.3g}\n{hole / r0:.2g} r0" for hole in holes])
+    ax.set_yticks(range(len(numbers)), [str(n) for n in numbers])
+    ax.set(xlabel="hole diameter [m]", ylabel="number of holes", title=f"at {1e3 * best.exposure:.3g} ms")
+    drawing.colorbar(figure, [ax], "relative MSE")
+
+
+def _draw_exposures(ax: Axes, plan: ObservationPlan) -> None:
+    best = plan.best
+    for color, n in zip(drawing.colors(), sorted({n for n, _ in plan.masks}), strict=False):
+        line = [c for c in plan.choices if c.n_subapertures == n and c.hole_diameter == best.hole_diameter]
+        line.sort(key=lambda choice: choice.exposure)
+        if line:
+            ax.plot(
+                [1e3 * c.exposure for c in line],
+                [c.relative_mse for c in line],
+                "o-",
+                color=color,
+                label=f"{n} holes",
+                markersize=4,
+            )
+    ax.plot(1e3 * best.exposure, best.relative_mse, "o", markersize=13, fillstyle="none", color=drawing.COLORS[1])
+    tau0 = plan.instrument.with_exposure(best.exposure).seeing.tau0
+    ax.axvline(1e3 * tau0, color=drawing.FAINT, linestyle="--", linewidth=1)
+    ax.annotate("tau0", (1e3 * tau0, 1), xycoords=("data", "axes fraction"), fontsize=8, ha="left", va="top")
+    ax.set_xscale("log")
+    times = sorted({1e3 * choice.exposure for choice in plan.choices})
+    ax.set_xticks(times, [f"{time:.3g}" for time in times])
+    ax.minorticks_off()
+    ax.set(xlabel="exposure [ms]", ylabel="relative MSE", title=f"holes of {best.hole_diameter:.3g} m")
+    ax.legend()
