@@ -126,7 +126,7 @@ def test_a_checkpoint_of_version_0_1_is_refused(tmp_path):
     old |= {"costs": [2.0, 1.0], "n_evaluations": 3, "relocations": 0, "starts": 1, "began": 0}
     old |= {"rival_message": "", "message": "", "fingerprint": "0" * 64}
     np.savez(tmp_path / "old.npz", **old)
-    with pytest.raises(ValueError, match=r"or of another version: give another name or remove it"):
+    with pytest.raises(ValueError, match=r"or of another version: give another name or delete it"):
         Checkpoint(tmp_path / "old.npz", "1" * 64).load(CPU)
 
 

@@ -1,4 +1,4 @@
-"""The aberrations of every frame as linear functions of parameters that are white under their prior."""
+"""Bases of the aberrations, which are linear in parameters that are white noise under their prior."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from torch import Tensor, nn
 from torchmask.atmosphere.von_karman import modal_covariance
 from torchmask.optics.aperture import Aperture
 
-_STRENGTH_RANGE = (0.05, 20.0)  # of the turbulence against its first guess, in (1/r0)^(5/3)
+_STRENGTH_RANGE = (0.05, 20.0)  # limits of the turbulence's strength relative to its first guess, in (1/r0)^(5/3)
 _LEAST_ERROR = 1e-3  # rad
-_ROUNDING = 1e-6  # of a covariance that may come from float32
+_ROUNDING = 1e-6  # relative rounding error of a covariance that may come from float32
 
 
 class AberrationBasis(nn.Module):
-    """Zernike coefficients a = mixing z of all sub-apertures of a frame, from its K parameters z.
+    """Linear map from the K parameters z of a frame to the Zernike coefficients a = mixing z of its sub-apertures.
 
     Parameters
     ----------
     mixing : (N J, K) tensor
-        Sub-aperture by sub-aperture, in rad. Its last `n_common` columns are aberrations common to all frames: whoever
-        fits the parameters keeps those equal in every frame.
+        Matrix [rad], ordered by sub-aperture. Its last `n_common` columns are aberrations common to all frames, whose
+        parameters a fit must keep equal in every frame.
     n_modes : int
-        J, Zernike modes per sub-aperture, Noll 1 to J.
+        Number of Zernike modes per sub-aperture, J, from Noll mode 1.
     n_common : int
         How many of the K parameters are common to all frames.
 
@@ -45,12 +45,12 @@ class AberrationBasis(nn.Module):
 
     @property
     def n_subapertures(self) -> int:
-        """N."""
+        """Number of sub-apertures, N."""
         return len(self.mixing) // self.n_modes
 
     @property
     def n_parameters(self) -> int:
-        """K, the number of parameters of a frame."""
+        """Number of parameters of a frame, K."""
         return self.mixing.shape[1]
 
     @property
@@ -63,9 +63,9 @@ class AberrationBasis(nn.Module):
         return (z @ self.mixing.to(z).T).unflatten(-1, (self.n_subapertures, self.n_modes))
 
     def parameters_of(self, coefficients: Tensor) -> Tensor:
-        """The parameters (T, K) whose coefficients come closest to (T, N, J): exact but for the mean piston.
+        """Return the parameters (T, K) whose coefficients are closest to (T, N, J), exact except for the mean piston.
 
-        What all frames share goes to the common parameters as far as those reach, which makes them equal.
+        The mean over the frames goes to the common parameters, as far as they can represent it.
         """
         own, common = self.mixing.double().tensor_split([self.n_own], dim=1)
         flat = coefficients.to(own).flatten(1)
@@ -74,41 +74,41 @@ class AberrationBasis(nn.Module):
         return torch.cat([z, shared.expand(len(z), -1)], dim=1)
 
     def with_common_of(self, z: Tensor, other: Tensor) -> Tensor:
-        """z (..., T, K) whose common parameters are those of `other` (..., T or 1, K)."""
+        """Return z (..., T, K) with the common parameters of `other` (..., T or 1, K)."""
         if not self.n_common:
             return z
         return torch.cat([z[..., : self.n_own], other[..., self.n_own :].expand(*z.shape[:-1], -1)], dim=-1)
 
     def mean_common(self, z: Tensor) -> Tensor:
-        """z (..., T, K) whose common parameters are replaced by their mean over the frames."""
+        """Return z (..., T, K) with its common parameters replaced by their mean over the frames."""
         return self.with_common_of(z, z.mean(-2, keepdim=True))
 
     def draw(self, like: Tensor, rms: float, generator: torch.Generator) -> Tensor:
-        """Random parameters (T, K) of the given rms; the common ones are the same in every frame."""
+        """Draw parameters (T, K) of the given rms; the common ones are the same in every frame."""
         z = rms * torch.randn(like.shape, dtype=like.dtype, device="cpu", generator=generator).to(like)
         return self.with_common_of(z, z[:1])
 
     def unwrapped(self, z: Tensor, centre: Tensor) -> Tensor:
-        """z (T, K) with full waves taken off the pistons where that brings it closer to `centre` (T, K).
+        """Return z (T, K) with whole waves subtracted from pistons where that brings it closer to `centre` (T, K).
 
-        Frames of one wavelength do not change by it; those of several would.
+        This leaves monochromatic frames unchanged, but not those of several wavelengths.
         """
-        if self.n_subapertures == 1:  # its piston is that of all
+        if self.n_subapertures == 1:  # its piston is the mean piston, which is not visible
             return z
         own = self.n_own
         waves = 2 * math.pi * torch.linalg.pinv(self.mixing[:, :own].to(z))[:, :: self.n_modes]  # (own, N)
         z = z.clone()
-        for _ in range(2):  # a wave off one hole may ask for one off its neighbour
+        for _ in range(2):  # a wave subtracted from one hole may require one from its neighbour
             for wave in waves.T:
                 away = z[:, :own] - centre[:, :own]
                 z[:, :own] -= (away @ wave / wave.square().sum()).round()[:, None] * wave
         return z
 
     def turbulence_strength(self, z: Tensor) -> float | None:
-        """Variance of the frames' own aberrations (T, K) over that of the prior: (r0 of the prior / r0)^(5/3).
+        """Return the variance of the frames' own aberrations (T, K) over that of the prior: (prior r0 / r0)^(5/3).
 
-        From tips and tilts relative to their mean over the sub-apertures, which are seen best and depend least on the
-        outer scale; from defocus to Noll 10 for a single aperture. None where there are no such modes.
+        It is measured from tip and tilt relative to their means over the sub-apertures, which are best determined and
+        depend least on the outer scale, or from defocus to Noll mode 10 for a single aperture. None without such modes.
         """
         n_sub, n_modes = self.n_subapertures, self.n_modes
         low, high = (1, 3) if n_sub > 1 else (3, 10)
@@ -127,7 +127,7 @@ class AberrationBasis(nn.Module):
 
 
 def plain_basis(aperture: Aperture, n_modes: int) -> AberrationBasis:
-    """The basis whose parameters are the Zernike coefficients themselves."""
+    """Return the basis whose parameters are the Zernike coefficients themselves."""
     identity = torch.eye(aperture.n_subapertures * n_modes, dtype=aperture.centers.dtype, device="cpu")
     return AberrationBasis(identity, n_modes)
 
@@ -135,10 +135,11 @@ def plain_basis(aperture: Aperture, n_modes: int) -> AberrationBasis:
 def turbulent_basis(
     aperture: Aperture, n_modes: int, common_modes: int, r0: float, outer_scale: float, *, whitened: bool = True
 ) -> AberrationBasis:
-    """The basis of turbulence, with aberrations common to all frames beside those of each.
+    """Return the basis for turbulence in each frame, with aberrations common to all frames.
 
-    `n_modes` are those of each frame, `common_modes` those common to all (0: none), whose prior is turbulence as strong
-    as a sub-aperture is wide. r0 and outer_scale [m]. With `whitened` false the parameters are the coefficients.
+    Each frame has `n_modes` modes of its own and `common_modes` (0 for none) that are common to all, whose prior is
+    turbulence with an r0 of one sub-aperture diameter. `r0` and `outer_scale` are in m. If `whitened` is false the
+    parameters are the coefficients.
     """
     total = max(n_modes, common_modes)
 
@@ -156,9 +157,9 @@ def turbulent_basis(
 
 
 def estimated_basis(aperture: Aperture, n_modes: int, covariance: Tensor) -> AberrationBasis:
-    """The basis in which the errors of estimated coefficients, of `covariance` (N J, N J) [rad^2], are white.
+    """Return the basis in which errors of coefficients with `covariance` (N J, N J) [rad^2] are white.
 
-    Raises ValueError if the covariance has another shape or is not one.
+    Raises ValueError if the matrix has another shape or is not a covariance.
     """
     n_sub, size = aperture.n_subapertures, aperture.n_subapertures * n_modes
     if tuple(covariance.shape) != (size, size):
@@ -186,15 +187,15 @@ def whitening(aperture: Aperture, n_modes: int, r0: float, outer_scale: float) -
 
 
 def root(covariance: Tensor) -> Tensor:
-    """Symmetric square root R (K, K) [rad] of a covariance (K, K) [rad^2], whose least error is taken as 1 mrad.
+    """Return the symmetric square root (K, K) [rad] of a covariance (K, K) [rad^2], with errors of at least 1 mrad.
 
     Raises ValueError if the covariance is not finite, not symmetric or has negative eigenvalues.
     """
     if not bool(torch.isfinite(covariance).all()):
-        raise ValueError("covariance holds values that are not finite")
+        raise ValueError("covariance holds values that are not finite: replace them")
     largest = float(covariance.abs().max())
     if float((covariance - covariance.T).abs().max()) > _ROUNDING * largest:
-        raise ValueError("covariance is not symmetric")
+        raise ValueError("covariance is not symmetric: average it with its transpose")
     values, vectors = torch.linalg.eigh(covariance)
     if float(values[0]) < -_ROUNDING * largest * len(values):
         raise ValueError(f"covariance has an eigenvalue of {float(values[0]):.3g} rad^2: none may be negative")

@@ -1,4 +1,4 @@
-"""How far a restoration has come, on disk, so that it can go on after an interruption."""
+"""Progress of a restoration on disk, so that it can continue after an interruption."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from torchmask.restoration.traits import Refinement
 
 
 class Status(Enum):
-    """Whether a restoration goes on, and why it ended if not."""
+    """Whether a restoration is running, or why it ended."""
 
     RUNNING = "running"
     CONVERGED = "converged"
@@ -32,9 +32,11 @@ class Status(Enum):
 
 @dataclass(frozen=True)
 class Ending:
-    """Where one start of a restoration ended, and why.
+    """Final state of one start of a restoration, and why it ended.
 
-    decrease : fraction by which the last segment lowered the cost; None where the iterations were spent
+    state : object, aberrations and calibration
+    status : why the start ended
+    decrease : fraction by which the last segment lowered the cost; None if the iterations were used up
     """
 
     state: State
@@ -44,16 +46,20 @@ class Ending:
 
 @dataclass
 class Progress:
-    """Everything a later segment of a restoration depends on.
+    """Everything on which a later segment of a restoration depends.
 
-    candidates : the state, with several candidates for each frame while a tournament goes on
-    status, decrease : of the present start, as in `Ending`
-    escapes : how often lost frames and the object's place have been looked for in this start
-    starts : how many there were, with the present one; began : iterations before it
-    rival : where the best of the earlier starts ended
-    alike : whether the last two starts ended alike
-    refinement : whether the mask's place is found too, or will be if the frames ask for it
-    integrated : whether the aberrations have been integrated out, which is done at the end and not kept on disk
+    candidates : the state, with several candidates for each frame during a tournament
+    costs : cost after each iteration, of all starts
+    n_evaluations : number of evaluations of cost and gradient
+    status : status of the present start
+    decrease : last decrease of the cost in the present start, as in `Ending`
+    escapes : number of attempts in this start to escape from a local minimum
+    starts : number of starts, including the present one
+    began : number of iterations before the present start
+    rival : final state of the best earlier start
+    alike : whether the last two starts ended in the same result
+    refinement : whether the position of the mask is fitted too, or will be if the frames require it
+    integrated : whether the aberrations have been integrated out, which is done at the end and not stored
     """
 
     candidates: Candidates
@@ -80,24 +86,25 @@ class Progress:
 
     @property
     def ending(self) -> Ending:
-        """Where the present start has come to."""
+        """Present state as the ending of the present start."""
         return Ending(self.state, self.status, self.decrease)
 
     @property
     def iterations(self) -> int:
-        """Of the present start."""
+        """Number of iterations of the present start."""
         return len(self.costs) - self.began
 
 
 _NUMBERS = ("n_evaluations", "escapes", "starts", "began", "alike")
-_NEEDED = ("image", "z", "geometry", "status", *(item.name for item in fields(Calibration)))  # of an ending
+_NEEDED = ("image", "z", "geometry", "status", *(item.name for item in fields(Calibration)))  # arrays of an ending
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """The .npz file that a restoration writes its progress to.
+    """The .npz file to which a restoration writes its progress.
 
-    fingerprint : says which frames, priors and settings it belongs to
+    path : name of the file
+    fingerprint : hash of the frames, priors and settings to which it belongs
     """
 
     path: Path
@@ -113,21 +120,21 @@ class Checkpoint:
         save_npz(self.path, arrays, replace=True)
 
     def load(self, device: torch.device) -> Progress | None:
-        """What was saved, None where there is no file. Raises ValueError if it is damaged or of another fingerprint."""
+        """Read the file; None if there is none. Raises ValueError if it is damaged or has another fingerprint."""
         if not self.path.exists():
             return None
         stored = load_npz(self.path, required=("fingerprint",))
         if stored["fingerprint"].item() != self.fingerprint:
             raise ValueError(
                 f"{self.path} is the checkpoint of other frames or settings, or of another version: give another name "
-                "or remove it"
+                "or delete it"
             )
         has_rival = any(name.startswith("rival_") for name in stored)
         prefixes = ("", "rival_") if has_rival else ("",)
         endings = [prefix + name for prefix in prefixes for name in _NEEDED]
         missing = [name for name in ("costs", "n_candidates", "refinement", *_NUMBERS, *endings) if name not in stored]
         if missing:
-            raise ValueError(f"{self.path} has no {', '.join(missing)}: it is damaged, remove it to begin anew")
+            raise ValueError(f"{self.path} has no {', '.join(missing)}: it is damaged, delete it to start again")
         now = _ending(stored, "", device)
         return Progress(
             Candidates(now.state, stored["n_candidates"].item()),
@@ -141,7 +148,7 @@ class Checkpoint:
 
 
 def fingerprint_of(objective: MyopicObjective, settings: Sequence[object], known: Sequence[Tensor | None]) -> str:
-    """Tells whether a checkpoint belongs to these frames, priors and settings, and to what is known besides."""
+    """Return a hash of the frames, priors, settings and further known tensors, to recognise their checkpoint."""
     prior, model = objective.prior, objective.model
     digest = hashlib.sha256(repr((*settings, objective.free, model.background, repr(prior))).encode())
     tensors = [objective.frames, objective.precision, *model.pupil.samples(), model.response]

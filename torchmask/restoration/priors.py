@@ -1,4 +1,4 @@
-"""What a restoration assumes of the object: a penalty on images, with what a minimiser wants to know of it."""
+"""Priors on the object: penalties on images, with the gradients and curvatures that a minimiser needs."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-_PROBES = 8  # draws for the diagonal of a Hessian that is known by its action only
+_PROBES = 8  # random vectors that estimate the diagonal of a Hessian
 _SEED = 0
 
 
 class ObjectPrior(nn.Module):
-    """A penalty on the object: `forward(image)` (H', W') -> scalar, the lower the likelier.
+    """A penalty on the object: `forward(image)` maps an image (H', W') to a scalar that is lower for likelier objects.
 
-    Images are in units of the stack's mean pixel and lie on the object's field, somewhat wider than the frames. A
-    subclass need write `forward` only, by operations of PyTorch: `gradient` and `curvature` follow by differentiation.
-    One that knows them in closed form overrides them, which saves time.
+    Images are in units of the stack's mean pixel and cover the object's field, which is slightly wider than the frames.
+    A subclass needs only `forward`, written with operations of PyTorch; gradient and curvature follow by
+    differentiation. To save time, it may override them with closed forms.
     """
 
     def forward(self, image: Tensor) -> Tensor:
-        raise TypeError(f"{type(self).__name__} has no forward(image) that returns a scalar: write one")
+        raise TypeError(f"{type(self).__name__} has no method forward(image): define one that returns a scalar")
 
     def value_and_gradient(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """The penalty of `image` (H', W') and its gradient (H', W')."""
+        """Return the penalty of `image` (H', W') and its gradient (H', W')."""
         with torch.enable_grad():
             leaf = image.detach().requires_grad_()
             value = self(leaf)
@@ -32,16 +32,17 @@ class ObjectPrior(nn.Module):
         return value.detach(), slope
 
     def curvature(self, image: Tensor) -> Tensor:
-        """About the diagonal of the Hessian at `image` (H', W'), or of a quadratic that majorises it; not negative.
+        """Return the approximate diagonal (H', W') of the Hessian at `image`, or of a majorising quadratic, at least 0.
 
-        By Hessian-vector products with random signs (Bekas, Kokiopoulou & Saad, Appl. Numer. Math. 57, 1214, 2007).
+        It is estimated from Hessian-vector products with random signs (Bekas, Kokiopoulou & Saad, Appl. Numer.
+        Math. 57, 1214, 2007).
         """
         generator = torch.Generator().manual_seed(_SEED)
         diagonal = torch.zeros_like(image)
         with torch.enable_grad():
             leaf = image.detach().requires_grad_()
             (slope,) = torch.autograd.grad(self(leaf), leaf, create_graph=True)
-            if not slope.requires_grad:  # linear: no curvature
+            if not slope.requires_grad:  # a linear penalty has no curvature
                 return diagonal
             for _ in range(_PROBES):
                 signs = torch.randint(2, image.shape, generator=generator, device="cpu").to(image) * 2 - 1
@@ -51,17 +52,17 @@ class ObjectPrior(nn.Module):
 
 
 class TotalVariation(ObjectPrior):
-    """weight * sum of sqrt(dx^2 + dy^2 + epsilon^2) - epsilon over the pixels: edges are few.
+    """Total variation, which favours few edges: weight * sum over pixels of sqrt(dx^2 + dy^2 + epsilon^2) - epsilon.
 
-    Isotropic and smoothed, forward differences that are periodic at the border (Rudin, Osher & Fatemi, Physica D 60,
-    259, 1992).
+    It is isotropic and smoothed, with forward differences that are periodic at the border (Rudin, Osher & Fatemi,
+    Physica D 60, 259, 1992).
 
     Parameters
     ----------
     weight : float
-        mu, in units of frames of mean 1.
+        Weight mu of the penalty, for frames of mean 1.
     epsilon : float
-        Slopes below it, in mean pixels, count as noise rather than as edges.
+        Slope, in mean pixels, below which differences count as noise rather than as edges.
 
     Raises
     ------
@@ -71,7 +72,7 @@ class TotalVariation(ObjectPrior):
     Examples
     --------
     >>> image = torch.zeros(4, 4, dtype=torch.float64); image[1:3, 1:3] = 1.0
-    >>> round(float(TotalVariation(epsilon=1e-9)(image)), 6)  # six straight slopes, one over a corner
+    >>> round(float(TotalVariation(epsilon=1e-9)(image)), 6)  # six straight slopes and a diagonal one
     7.414214
     """
 
@@ -102,18 +103,19 @@ class TotalVariation(ObjectPrior):
 
 
 class EdgePreserving(ObjectPrior):
-    """weight * threshold^2 * sum of |g| / threshold - log(1 + |g| / threshold): quadratic in slopes, linear in edges.
+    """Penalty that is quadratic in small slopes and linear in edges, so smooth shading remains smooth.
 
-    g is the slope of a pixel as for `TotalVariation`. Slopes well below the threshold are penalised by their square,
-    as noise, edges well above it by their height (Mugnier, Fusco & Conan, J. Opt. Soc. Am. A 21, 1841, 2004): an object
-    may be shaded smoothly, where total variation makes steps.
+    It is weight * threshold^2 * sum over pixels of |g| / threshold - log(1 + |g| / threshold), with g the slope as in
+    `TotalVariation` (Mugnier, Fusco & Conan, J. Opt. Soc. Am. A 21, 1841, 2004). Slopes well below the threshold are
+    penalised by their square, as noise, and edges well above it by their height. Total variation, in contrast, turns
+    smooth shading into steps.
 
     Parameters
     ----------
     weight : float
-        In units of frames of mean 1; multiplies half the square of small slopes.
+        Weight of the penalty, for frames of mean 1, which multiplies half the square of small slopes.
     threshold : float
-        Between the two, in mean pixels per pixel.
+        Slope between small slopes and edges [mean pixels per pixel].
 
     Raises
     ------
@@ -123,7 +125,7 @@ class EdgePreserving(ObjectPrior):
     Examples
     --------
     >>> image = torch.zeros(4, 4, dtype=torch.float64); image[1, 1] = 1e-3
-    >>> round(float(EdgePreserving(weight=1.0)(image)) / (0.5 * 4e-6), 2)  # half the squares of four small slopes
+    >>> round(float(EdgePreserving(weight=1.0)(image)) / (0.5 * 4e-6), 2)  # half the sum of squares of small slopes
     1.0
     """
 
@@ -148,7 +150,7 @@ class EdgePreserving(ObjectPrior):
     def _slopes(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         dy, dx = gradient(image)
         squared = dy**2 + dx**2
-        flat = squared == 0  # where a square root has no derivative, and none is needed
+        flat = squared == 0  # where the square root has no derivative, and none is needed
         return dy, dx, torch.where(flat, 0.0, torch.where(flat, 1.0, squared).sqrt()) / self.threshold
 
     def extra_repr(self) -> str:
@@ -156,7 +158,7 @@ class EdgePreserving(ObjectPrior):
 
 
 class FunctionPrior(ObjectPrior):
-    """A penalty that is any function or module of an image, with its gradient and curvature where it has them.
+    """A penalty given by any function or module of an image.
 
     `function.gradient(image)` and `function.curvature(image)`, both (H', W') -> (H', W'), are used if they exist.
     """
@@ -182,12 +184,12 @@ class FunctionPrior(ObjectPrior):
     def __repr__(self) -> str:
         if isinstance(self.function, nn.Module):
             return repr(self.function)
-        named = getattr(self.function, "__qualname__", None)  # the repr of a function holds an address
+        named = getattr(self.function, "__qualname__", None)  # the repr of a function contains its address
         return f"{self.function.__module__}.{named}" if named else repr(self.function)
 
 
 def as_prior(prior: Callable[[Tensor], Tensor]) -> ObjectPrior:
-    """An `ObjectPrior` of whatever maps an image to a scalar. Raises TypeError for what cannot be called."""
+    """Return an `ObjectPrior` for any function from an image to a scalar. Raises TypeError if it is not callable."""
     if not callable(prior):
         raise TypeError(f"prior is {prior!r}: it must be a function or module that maps an image to a scalar")
     return prior if isinstance(prior, ObjectPrior) else FunctionPrior(prior)
@@ -206,7 +208,7 @@ def check_prior(prior: ObjectPrior, image: Tensor) -> None:
     if not math.isfinite(float(value.detach())):
         raise ValueError(f"the prior {prior!r} is {float(value.detach())} at the mean frame: it must be finite there")
     if not value.requires_grad:
-        raise ValueError(f"the prior {prior!r} does not depend on the image by operations that PyTorch differentiates")
+        raise ValueError(f"the prior {prior!r} is not differentiable in the image: use operations of PyTorch only")
     slope = prior.value_and_gradient(image)[1]
     if slope.shape != image.shape or not bool(torch.isfinite(slope).all()):
         raise ValueError(
@@ -216,12 +218,12 @@ def check_prior(prior: ObjectPrior, image: Tensor) -> None:
 
 
 def gradient(image: Tensor) -> tuple[Tensor, Tensor]:
-    """Forward differences of (..., H, W), periodic, along rows and columns."""
+    """Return the periodic forward differences of (..., H, W) along the rows' axis (dy) and the columns' axis (dx)."""
     return image.roll(-1, -2) - image, image.roll(-1, -1) - image
 
 
 def divergence(dy: Tensor, dx: Tensor) -> Tensor:
-    """The adjoint of `gradient`."""
+    """Return the adjoint of `gradient`."""
     return dy.roll(1, -2) - dy + dx.roll(1, -1) - dx
 
 

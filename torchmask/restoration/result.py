@@ -1,4 +1,4 @@
-"""What a restoration found, how well it fits, and how it came to an end."""
+"""The result of a restoration: object, aberrations, quality of the fit, and why it ended."""
 
 from __future__ import annotations
 
@@ -20,28 +20,30 @@ from torchmask.restoration.verdict import Verdict
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RestorationResult(Brief):
-    """A restored object and everything that was found with it.
+    """A restored object, with its aberrations and the quality of the fit.
 
-    object : (H, W) electrons per frame and pixel, on the pixels of the frames
-    extended_object : (H', W') the same with the margin around the field, rows and columns beyond H and W
+    object : (H, W) on the pixels of the frames [electrons per pixel and frame]
+    extended_object : (H', W') object with a margin beyond the field, in rows and columns after H and W
     coefficients : (T, N, J) Zernike coefficients [rad rms]
-    transmission : (T,) of each frame, 1 on average
-    model : (T, H, W) the frames that object and coefficients make [electrons]
+    transmission : (T,) transmission of each frame, 1 on average
+    model : (T, H, W) frames computed from object and coefficients [electrons]
     residuals : (T, H, W) (frames - model) / noise, 0 where a pixel is not valid
     chi_square : (T,) mean square of the residuals
-    prior : the prior on the object, as it describes itself; weights are in units of frames of mean 1
-    r0 : Fried parameter of the prior on the aberrations [m], NaN without prior or where they are known
-    noise : electrons rms per pixel, averaged over the stack
-    cost : (iterations,) what was minimised, one start after the other
-    converged, message : whether and why it stopped
-    n_evaluations : of cost and gradient
-    seconds : wall time
-    object_std : (H, W) standard deviation of the object below the diffraction limit [electrons], its position and
-        brightness, which frames cannot tell, taken as found; None unless samples were asked for
-    coefficients_std : (N, J) that of the coefficients of a frame [rad rms], or None
-    background : (T,) mean light of a pixel of each frame that is not the object's [electrons]; None in files of 0.1
-    rotation, magnification : of the mask against what was told, [rad] from x to y; 0 and 1 where it was taken as told
-    geometry_std : (2,) standard deviations of both, as the noise leaves them, or None
+    prior : description of the prior on the object; weights are for frames of mean 1
+    r0 : Fried parameter of the prior on the aberrations [m]; NaN without such a prior or for known aberrations
+    noise : rms noise of a pixel, averaged over the stack [electrons]
+    cost : (iterations,) cost after each iteration, of all starts in succession
+    converged : whether the restoration converged
+    message : why it stopped
+    n_evaluations : number of evaluations of cost and gradient
+    seconds : wall time [s]
+    object_std : (H, W) standard deviation of the object below the diffraction limit [electrons], for fixed position and
+        brightness, which frames do not determine; None unless samples were requested
+    coefficients_std : (N, J) standard deviation of the coefficients of a frame [rad rms], or None
+    background : (T,) mean background of a pixel in each frame [electrons]; None in files of version 0.1
+    rotation : fitted rotation of the mask from x to y [rad]; 0 if it was not fitted
+    magnification : fitted magnification of the mask; 1 if it was not fitted
+    geometry_std : (2,) standard deviations of rotation and magnification due to noise, or None
     verdict : whether all this explains the frames; None in files of 0.1
 
     Examples
@@ -84,16 +86,16 @@ class RestorationResult(Brief):
 
     @property
     def geometry(self) -> MaskGeometry:
-        """How the mask lies against what was told, as far as the restoration has looked for it."""
+        """Fitted geometry of the mask relative to the nominal one."""
         return MaskGeometry(self.rotation, self.magnification, self.magnification)
 
     @property
     def sky(self) -> float:
-        """Mean light of a pixel that is not the object's [electrons]; NaN in files of 0.1."""
+        """Mean background of a pixel [electrons]; NaN in files of version 0.1."""
         return math.nan if self.background is None else float(self.background.mean())
 
     def save(self, path: str | Path) -> None:
-        """Write everything to a new .npz file, without pickle. Errors as in `torchmask.io.save_npz`."""
+        """Write everything to a new .npz file, without pickle. Raises the errors of `torchmask.io.save_npz`."""
         values = {item.name: getattr(self, item.name) for item in fields(self)}
         if self.verdict is not None:
             values["verdict"] = json.dumps(self.verdict.to_json())
@@ -101,15 +103,15 @@ class RestorationResult(Brief):
 
     @classmethod
     def load(cls, path: str | Path) -> RestorationResult:
-        """Read what `save` wrote, version 0.1 included; tensors on the CPU.
+        """Read a file written by `save`, also by version 0.1, with tensors on the CPU.
 
-        Raises ValueError for a missing, damaged or foreign file.
+        Raises ValueError if the file is missing, damaged or of another kind.
         """
         stored = _as_of_now(load_npz(path, required=("object", "coefficients", "chi_square")))
         needed = [item.name for item in fields(cls) if item.default is MISSING]
         missing = [name for name in needed if name not in stored]
         if missing:
-            raise ValueError(f"{path} has no {', '.join(missing)}: it is no saved restoration, or a damaged one")
+            raise ValueError(f"{path} has no {', '.join(missing)}: it is not a saved restoration, or is damaged")
         names = [item.name for item in fields(cls) if item.name in stored]
         values: dict[str, Any] = {name: torch.from_numpy(stored[name]) for name in names if stored[name].ndim}
         values.update({name: stored[name].item() for name in names if not stored[name].ndim})
@@ -118,7 +120,7 @@ class RestorationResult(Brief):
         return cls(**values)
 
     def summary(self) -> str:
-        """A few lines for people, the last one the verdict."""
+        """Return a summary of a few lines, the last of which is the verdict."""
         n_frames, n_sub, n_modes = self.coefficients.shape
         chi = self.chi_square
         lines = [
@@ -140,7 +142,7 @@ class RestorationResult(Brief):
 
 
 def _as_of_now(stored: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The arrays of a file under today's names: version 0.1 knew one prior and called transmissions gains."""
+    """Return the arrays of a file under their present names; version 0.1 had one prior, and gains as transmission."""
     if "gains" not in stored or "tv_weight" not in stored:
         return stored
     described = f"TotalVariation(weight={stored['tv_weight'].item():g}, epsilon=0.01)"
