@@ -32,7 +32,7 @@ from torchmask.optics.overlaps import check_overlaps
 from torchmask.record import Callback, Record
 from torchmask.restoration.wiener import multiframe_wiener
 from torchmask.simulation.dataset import StackDataset, StackRanges
-from torchmask.viz import figures as viz
+from torchmask.viz.comparison import comparison_figure
 
 DIAMETER = 1.0  # of the mask [m]
 WAVELENGTH = 550e-9
@@ -204,7 +204,7 @@ def restorer(options: Options, output: Run) -> dict[str, float]:
         torch.save(network.state_dict(), file)
     exposure, truth = data["frames"][options.n_train, 0], data["object"][options.n_train]
     pictures = {"Wiener": (exposure, held_out[0][0, 0]), "network": (exposure, restored[0])}
-    output.logger.figure("comparison", viz.comparison_figure(truth, pictures, cutoff, grid.pixel_scale))
+    output.logger.figure("comparison", comparison_figure(truth, pictures, cutoff, grid.pixel_scale))
     table = compare(restored, held_out, cutoff, output.logger.scalar)
     write_json(output.directory / "scores.json", table)
     return table

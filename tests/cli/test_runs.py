@@ -15,6 +15,7 @@ from torchmask.cli.main import main
 from torchmask.cli.program import NOT_EXPLAINED
 from torchmask.cli.report import draw_zones
 from torchmask.cli.restore import Options
+from torchmask.cli.view import view_path
 from torchmask.design.constraints import KeepOutDisc, KeepOutSegment, MinimumGap, check_mask
 from torchmask.design.criterion import AsymptoticMSE
 from torchmask.design.manufacture import load_mask
@@ -171,6 +172,15 @@ def test_a_fits_cube_restores_to_the_same_image_with_its_sky(runs, cube, tmp_pat
     assert "score" not in json.loads((tmp_path / "restore/metrics.json").read_text())
 
 
+def test_a_restored_image_is_viewed_with_the_directions_of_the_file_beside_it(runs, tmp_path, sky_cards):
+    (unknown,) = view_path(runs / "restore/restored.npz").figures.values()
+    assert not unknown.axes[0].texts
+    (tmp_path / "restored.npz").write_bytes((runs / "restore/restored.npz").read_bytes())
+    fits.PrimaryHDU(np.ones((32, 32)), fits.Header(sky_cards(0.3, 1e-7))).writeto(tmp_path / "restored.fits")
+    (shown,) = view_path(tmp_path / "restored.npz").figures.values()
+    assert {"E", "N"} <= {text.get_text() for text in shown.axes[0].texts}
+
+
 def test_errors_of_a_cube_and_the_sky_are_those_of_the_library_call(runs, cube, tmp_path, capsys):
     observation = Observation.load(runs / "simulate/stack.npz")
     errors = (observation.frames.clamp(min=0) + 4.0).sqrt()
@@ -263,6 +273,36 @@ def test_files_of_several_kinds_are_not_mixed(tmp_path, capsys):
     for other, message in (("b", "mix filters"), ("c", "mix pixel scales")):
         files = [tmp_path / "a.fits", tmp_path / f"{other}.fits"]
         refused(["restore", *files, "--join", *full], tmp_path, capsys, message)
+
+
+@pytest.mark.filterwarnings("default:frames .* have less than half the light")
+def test_a_cloud_is_told_by_all_that_a_restoration_leaves(runs, tmp_path, capsys):
+    stack = Observation.load(runs / "simulate/stack.npz")
+    dim = torch.tensor([1.0, 0.2, 1.0])[:, None, None]
+    dataclasses.replace(stack, frames=dim * stack.frames).save(tmp_path / "cloudy.npz")
+    run("restore", tmp_path / "cloudy.npz", "--max-iterations", "2", "--out", tmp_path / "run")
+    streams = capsys.readouterr()
+    assert "frames [1] have less than half the light of the others, as through a cloud; --skip" in streams.out
+    for name in ("metrics.json", "status.json"):
+        assert json.loads((tmp_path / "run" / name).read_text())["clouded_frames"] == [1]
+    header = fits.getheader(tmp_path / "run/restored.fits")
+    assert (header["NCLOUD"], header["CLOUDED"]) == (1, "1")
+    assert json.loads((runs / "restore/metrics.json").read_text())["clouded_frames"] == []
+    clear = fits.getheader(runs / "restore/restored.fits")
+    assert clear["NCLOUD"] == 0
+    assert "CLOUDED" not in clear
+
+
+def test_a_band_that_the_pixels_undersample_is_refused_before_any_work(runs, tmp_path, capsys):
+    stack = runs / "simulate/stack.npz"
+    given = ["restore", stack, "--wavelengths", "8e-7", "1e-6", "1.2e-6"]
+    refused(given, tmp_path, capsys, r"undersamples an aperture .* at 8e-07 m")
+    refused(
+        ["simulate", "--mask", runs / "design/mask.json", "--wavelength", "8e-7", "--pixel-scale-arcsec", "0.1"],
+        tmp_path,
+        capsys,
+        r"\(0\.1 arcsec\) undersamples",
+    )
 
 
 def test_impossible_requests_are_refused_and_leave_nothing(tmp_path, capsys):

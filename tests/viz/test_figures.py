@@ -24,6 +24,7 @@ from torchmask.optics.otf import OTF, analytic_otf
 from torchmask.optics.psf import PSF
 from torchmask.viz import figures as viz
 from torchmask.viz import style as drawing
+from torchmask.viz.comparison import comparison_figure
 
 GRID = Grid.nyquist(diameter=1.0, wavelength=550e-9, n_pixels=64)
 CENTERS = torch.tensor([[0.3, 0.1], [-0.35, 0.2], [0.05, -0.37]], dtype=torch.float64)
@@ -216,7 +217,7 @@ def test_comparison_shows_what_is_scored():
     restored = 3 * truth.roll((2, 5), (0, 1)) + 0.2 * torch.rand(32, 32, generator=generator)
     peak = np.percentile(lowpass(truth, 0.3), 99.5)
 
-    figure = viz.comparison_figure(truth, {"mask": (frame, restored), "full": (frame, truth)}, 0.3, pixel_scale=1e-7)
+    figure = comparison_figure(truth, {"mask": (frame, restored), "full": (frame, truth)}, 0.3, pixel_scale=1e-7)
     *axes, bar = figure.axes
     panels = {ax.get_title(loc="left"): ax.images[0].norm(np.asarray(ax.images[0].get_array())) for ax in axes}
     assert list(panels) == [
@@ -244,8 +245,8 @@ def test_comparison_shows_what_is_scored():
     assert [ax.images[0].get_clim() for ax in axes] == [(0, pytest.approx(peak))] * 6
     assert bar.get_ylim() == (0, pytest.approx(peak))
     assert axes[0].texts[0].get_text() == "200 mas"  # a third of 32 pixels of 20.6 mas is 220
-    assert len(viz.comparison_figure(truth, {"mask": (frame, restored)}, 0.3).axes) == 5  # with the bar
-    assert len(viz.comparison_figure(truth, dict.fromkeys("abc", (frame, restored)), 0.3).axes) == 9
+    assert len(comparison_figure(truth, {"mask": (frame, restored)}, 0.3).axes) == 5  # with the bar
+    assert len(comparison_figure(truth, dict.fromkeys("abc", (frame, restored)), 0.3).axes) == 9
 
 
 @pytest.mark.parametrize(
@@ -258,10 +259,10 @@ def test_comparison_shows_what_is_scored():
         (lambda: viz.psf_figure({}, GRID), "nothing to draw"),
         (lambda: viz.mtf_figure({}, GRID), "nothing to draw"),
         (lambda: viz.history_figure({}, "cost"), "nothing to draw"),
-        (lambda: viz.comparison_figure(torch.ones(4, 4), {}, 0.3), "nothing to draw"),
+        (lambda: comparison_figure(torch.ones(4, 4), {}, 0.3), "nothing to draw"),
         (lambda: viz.frames_figure(torch.ones(4, 4)), r"shape \(4, 4\): a stack"),
         (lambda: viz.frames_figure(torch.ones(0, 4, 4)), "a stack"),
-        (lambda: viz.comparison_figure(torch.ones(4, 4), {"a": (torch.ones(4, 4), torch.ones(5, 4))}, 0.3), "shape"),
+        (lambda: comparison_figure(torch.ones(4, 4), {"a": (torch.ones(4, 4), torch.ones(5, 4))}, 0.3), "shape"),
     ],
 )
 def test_bad_input(call, message):
@@ -320,11 +321,17 @@ def test_the_callers_style_and_pyplot_are_left_alone(tmp_path):
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.5, 2.0])
+@pytest.mark.parametrize("compared", [False, True])
 @pytest.mark.parametrize("mirrored", [False, True])
-def test_arrows_point_north_and_east_as_the_sky_says(sky_matrix, angle, mirrored):
+def test_arrows_point_north_and_east_as_the_sky_says(sky_matrix, angle, mirrored, compared):
     """Along each arrow the sky's coordinates change in its own direction alone, whatever the turn and the parity."""
     matrix = sky_matrix(angle, 1e-7, mirrored)
-    ax = viz.frames_figure(np.ones((2, 24, 32)), pixel_scale=1e-7, sky=matrix).axes[2]
+    if compared:
+        truth = np.ones((24, 32))
+        ax = comparison_figure(truth, {"mask": (truth, truth)}, 0.5, 1e-7, matrix).axes[0]
+        ax.texts[0].remove()  # of the scale bar
+    else:
+        ax = viz.frames_figure(np.ones((2, 24, 32)), pixel_scale=1e-7, sky=matrix).axes[2]
     tips = [text for text in ax.texts if not text.get_text()]
     assert [text.get_text() for text in ax.texts if text.get_text()] == ["E", "N"]
     for arrow, expected in zip(tips, np.eye(2), strict=True):
@@ -341,7 +348,7 @@ def test_images_have_a_bar_that_names_unit_and_stretch():
     labels = {
         "frames": viz.frames_figure(frames, unit="adu").axes[-1].get_ylabel(),
         "unknown": viz.frames_figure(frames, unit="").axes[-1].get_ylabel(),
-        "comparison": viz.comparison_figure(frames[0], {"mask": (frames[1], frames[2])}, 0.5).axes[-1].get_ylabel(),
+        "comparison": comparison_figure(frames[0], {"mask": (frames[1], frames[2])}, 0.5).axes[-1].get_ylabel(),
         "psf": viz.psf_figure({"a": frames[0]}, Grid(16, 1e-7, 1e-6)).axes[-1].get_ylabel(),
     }
     assert labels == {

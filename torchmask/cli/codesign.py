@@ -37,6 +37,7 @@ from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
 from torchmask.spectra import NoisePSD
 from torchmask.viz import figures as viz
+from torchmask.viz.comparison import comparison_figure
 
 
 @dataclass(frozen=True)
@@ -234,7 +235,7 @@ def codesign(
         pictures[f"{name}, {table[name]['photons_per_frame']:.1e} photons"] = (observation.frames[0], result.object)
         arrays |= {f"{name}_object": result.object, f"{name}_coefficients": result.coefficients}
         arrays |= {f"{name}_frames": observation.frames}
-    logger.figure("comparison", viz.comparison_figure(scene, pictures, cutoff, image_grid(options).pixel_scale))
+    logger.figure("comparison", comparison_figure(scene, pictures, cutoff, image_grid(options).pixel_scale))
     logger.table("comparison/table", [{"instrument": name, **row} for name, row in table.items()])
     save_npz(logger.directory / "result.npz", {**arrays, "scene": scene})
     logger.conclude(verdicts={name: verdict and verdict.to_json() for name, verdict in verdicts.items()})

@@ -16,23 +16,19 @@ from torchmask.cli.calibrate import pixel_response, read_star, write_calibration
 from torchmask.cli.config import stored
 from torchmask.cli.oifits import OIFITSOptions, measure_frames, write_frames
 from torchmask.cli.options import BandOptions, RunOptions, WorkerOptions
+from torchmask.cli.outcome import log_outcome, summarise_outcome, write_outcome
 from torchmask.cli.program import NOT_EXPLAINED
-from torchmask.cli.report import restored_figure
 from torchmask.cli.run import CHECKPOINT, new_run
 from torchmask.cli.stacks import StackOptions, group_files, read_stack
-from torchmask.data.restored import save_restored
 from torchmask.interferometry.calibration import MaskCalibration
 from torchmask.interferometry.observables import Observables
 from torchmask.io import new_folder, write_json
-from torchmask.metrics import relative_error, ssim
 from torchmask.observation import Observation
 from torchmask.restoration.background import Background
 from torchmask.restoration.many import restore_in_turn
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.priors import TotalVariation
 from torchmask.restoration.result import RestorationResult
-from torchmask.tracking import RunLogger
-from torchmask.viz import figures as viz
 
 REFINEMENTS = {"if-seen": None, "yes": True, "no": False}
 SKIES = {"if-seen": Background.IF_SEEN, "per-frame": Background.PER_FRAME, "none": Background.NONE}
@@ -135,10 +131,10 @@ def restore_one(files: Sequence[Path], options: Options, star: MaskCalibration |
         )
         if star is not None and options.star is not None:
             write_calibration(output, star, [options.star], observation.grid.wavelength)
-        table = write(output.directory, files, observation, result, options)
-        log(observation, result, table, output.logger)
-        output.logger.conclude(verdict=table["verdict"])
-        output.summary.append(result.summary())
+        table = write_outcome(output.directory, observation, result, history(files, result, options))
+        log_outcome(observation, result, table, output.logger)
+        output.logger.conclude(verdict=table["verdict"], clouded_frames=table["clouded_frames"])
+        output.summary.append(summarise_outcome(result, table))
     return 0 if table["verdict"]["explained"] else NOT_EXPLAINED
 
 
@@ -174,12 +170,13 @@ def restore_several(stacks: Mapping[str, Sequence[Path]], options: Options, star
                 failures[name] = result
                 continue
             folder = new_folder(output.directory / name)
-            tables[name] = write(folder, stacks[name], seen[number], result, options)
+            tables[name] = write_outcome(folder, seen[number], result, history(stacks[name], result, options))
             output.summary.extend(write_frames(folder, observables[name], seen[number], options))
-            log(seen[number], result, tables[name], output.logger, f"{name}/")
-            output.summary.append(f"{name}: {result.summary()}")
+            log_outcome(seen[number], result, tables[name], output.logger, f"{name}/")
+            output.summary.append(f"{name}: {summarise_outcome(result, tables[name])}")
         verdicts = {name: table["verdict"] for name, table in tables.items()}
-        output.logger.conclude(verdicts=verdicts)
+        clouded = {name: table["clouded_frames"] for name, table in tables.items()}
+        output.logger.conclude(verdicts=verdicts, clouded_frames=clouded)
         lacking = [name for name, verdict in verdicts.items() if not verdict["explained"]]
         told = f"{len(verdicts) - len(lacking)} of {len(stacks)} stacks are explained"
         output.summary.append(told + (f"; not explained: {', '.join(lacking)}" if lacking else ""))
@@ -219,66 +216,6 @@ def deconvolution(observation: Observation, options: Options) -> MyopicDeconvolu
 def known_sky(options: Options) -> float:
     """What --sky says of its light [electrons per pixel]; 0 where it is to be found."""
     return 0.0 if isinstance(options.sky, str) else options.sky
-
-
-def write(
-    folder: Path, files: Sequence[Path], observation: Observation, result: RestorationResult, options: Options
-) -> dict[str, Any]:
-    """The result, the image on the sky, and the numbers, which come back."""
-    result.save(folder / "restored.npz")
-    save_restored(folder / "restored.fits", result, observation, history(files, result, options))
-    table = metrics(observation, result)
-    write_json(folder / "metrics.json", table)
-    return table
-
-
-def metrics(observation: Observation, result: RestorationResult) -> dict[str, Any]:
-    """What metrics.json says: the fit, the search, and the score where the truth is known."""
-    table: dict[str, Any] = {
-        "chi_square": float(result.chi_square.mean()),
-        "worst_frame_chi_square": float(result.chi_square.max()),
-        "noise": result.noise,
-        "sky": result.sky,
-        "r0": result.r0,
-        "rotation": result.rotation,
-        "magnification": result.magnification,
-        "photons_per_frame": float(result.object.sum()),
-        "cost": float(result.cost[-1]),
-        "iterations": len(result.cost),
-        "evaluations": result.n_evaluations,
-        "converged": result.converged,
-        "verdict": None if result.verdict is None else result.verdict.to_json(),
-        "seconds": result.seconds,
-    }
-    if observation.object is not None:
-        cutoff = observation.grid.cutoff(observation.aperture.mask_diameter)
-        table["score"] = relative_error(result.object, observation.object, cutoff)
-        table["ssim"] = ssim(result.object, observation.object, cutoff)
-        table["mean_frame_score"] = relative_error(observation.frames.mean(0), observation.object, cutoff)
-    return table
-
-
-def log(
-    observation: Observation, result: RestorationResult, table: Mapping[str, Any], logger: RunLogger, prefix: str = ""
-) -> None:
-    """Figures, and the final metrics for TensorBoard; `prefix` tells stacks apart."""
-    scale = observation.grid.pixel_scale
-    logger.figure(
-        f"{prefix}restored",
-        restored_figure(
-            *(result.object, observation.frames, result.residuals, scale),
-            deviation=result.object_std,
-            sky=observation.sky_matrix,
-        ),
-    )
-    logger.figure(f"{prefix}cost", viz.history_figure({"restoration": result.cost.tolist()}, "cost"))
-    if observation.object is not None:
-        cutoff = observation.grid.cutoff(observation.aperture.mask_diameter)
-        pictures = {"stack": (observation.frames[0], result.object)}
-        logger.figure(f"{prefix}comparison", viz.comparison_figure(observation.object, pictures, cutoff, scale))
-    for name, value in table.items():
-        if name != "verdict":
-            logger.scalar(f"comparison/{prefix}restored/{name}", float(value))
 
 
 def history(files: Sequence[Path], result: RestorationResult, options: Options) -> list[str]:

@@ -24,6 +24,7 @@ from torchmask.optics.aperture import SparseAperture
 from torchmask.restoration.result import RestorationResult
 from torchmask.tracking import read_metrics
 from torchmask.viz import figures as viz
+from torchmask.viz.comparison import comparison_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -121,7 +122,8 @@ def _view_npz(path: Path) -> View:
     stored = load_npz(path)
     if {"object", "residuals", "coefficients"} <= stored.keys():
         result = RestorationResult.load(path)
-        return View(result.summary(), {"": restored_figure(result.object, residuals=result.residuals)})
+        figure = restored_figure(result.object, residuals=result.residuals, sky=_orientation_beside(path))
+        return View(result.summary(), {"": figure})
     if "frames" in stored:
         return _stack_view(Observation.load(path))
     if {"scene", "mask_object", "full_object"} <= stored.keys():
@@ -134,6 +136,12 @@ def _view_npz(path: Path) -> View:
         )
     text = "\n".join(f"{name}: {array.dtype} {array.shape}" for name, array in stored.items())
     return View(f"arrays that no figure is known for\n{text}", {})
+
+
+def _orientation_beside(path: Path) -> Any | None:
+    """Return the matrix from pixels to the sky of the FITS file beside an .npz file; None if none tells it."""
+    image = path.with_suffix(".fits")
+    return pixel_matrix(read_fits(image).header) if image.is_file() else None
 
 
 def _stack_view(observation: Observation) -> View:
@@ -162,7 +170,7 @@ def _codesign_view(stored: dict[str, Any]) -> View:
     names = ("mask", "full")
     pictures = {name: (stored[f"{name}_frames"][0], stored[f"{name}_object"]) for name in names}
     text = f"relative MSE of the mask {stored['relative_mse']:.5g}"
-    return View(text, {"": viz.comparison_figure(stored["scene"], pictures, _NYQUIST)})
+    return View(text, {"": comparison_figure(stored["scene"], pictures, _NYQUIST)})
 
 
 def _view_run(folder: Path) -> View:

@@ -9,6 +9,9 @@ import warnings
 from collections.abc import Sequence
 
 import numpy as np
+import torch
+
+from torchmask.observation import Observation
 
 _UNLIT = 0.05  # fraction of the usual light below which a frame is unlit; an uneven dark may leave some
 _CLEAR = 5.0  # signal-to-noise ratio of the usual light that allows a comparison
@@ -46,6 +49,13 @@ def usable_frames(frames: np.ndarray, valid: np.ndarray, skip: Sequence[int] = (
             stacklevel=3,
         )
     return kept
+
+
+def clouded_frames(observation: Observation) -> list[int]:
+    """Return the numbers of an observation's frames that seem to have been taken through a cloud."""
+    frames = observation.frames
+    valid = torch.isfinite(frames) if observation.valid is None else observation.valid.expand_as(frames)
+    return np.flatnonzero(find_clouds(frames.numpy(force=True), valid.numpy(force=True))).tolist()
 
 
 def _leave_out(kept: np.ndarray, bad: np.ndarray, why: str) -> np.ndarray:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
 
+from torchmask.data.light import clouded_frames
 from torchmask.grid import ARCSEC
 from torchmask.io import as_array, atomic_write, extra
 from torchmask.observation import Observation
@@ -42,7 +43,8 @@ def save_restored(
     -----
     The image is in electrons per pixel and frame (BUNIT). CHISQ is the mean square residual in units of the noise,
     averaged over frames, and CHISQMAX that of the worst frame. CONVERGD says whether the restoration converged, and
-    EXPLAIND whether object and aberrations explain the frames, that is whether CHISQRED is at most CHISQLIM. If the
+    EXPLAIND whether object and aberrations explain the frames, that is whether CHISQRED is at most CHISQLIM. NCLOUD
+    counts the frames that seem to have been taken through a cloud, and CLOUDED names them, counted from 0. If the
     restoration computed standard deviations, they are in an extension ERR.
 
     Examples
@@ -98,6 +100,10 @@ def save_restored(
             "CHISQLIM": (verdict.limit, "up to which the frames are explained"),
             "NLOST": (len(verdict.frames), "frames that are not explained"),
         }
+    clouded = clouded_frames(observation)
+    cards["NCLOUD"] = (len(clouded), "frames with less than half the usual light")
+    if clouded:
+        cards["CLOUDED"] = (",".join(map(str, clouded)), "their numbers")
     for name, (value, comment) in cards.items():
         if not isinstance(value, float) or math.isfinite(value):  # FITS cards cannot hold NaN
             hdu.header[name] = (value, comment)

@@ -1,7 +1,8 @@
 """Figures: masks, frequency coverage, transfer functions, images and curves."""
 
+from torchmask.viz.companion import companion_figure
+from torchmask.viz.comparison import comparison_figure
 from torchmask.viz.figures import (
-    comparison_figure,
     frames_figure,
     history_figure,
     mask_figure,
@@ -13,6 +14,7 @@ from torchmask.viz.figures import (
 from torchmask.viz.planning import plan_figure
 
 __all__ = [
+    "companion_figure",
     "comparison_figure",
     "frames_figure",
     "history_figure",

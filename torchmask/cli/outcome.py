@@ -1,0 +1,89 @@
+"""What a restoration leaves in its folder: the image, its numbers, figures and what is told of clouds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from torchmask.cli.report import restored_figure
+from torchmask.data.light import clouded_frames
+from torchmask.data.restored import save_restored
+from torchmask.io import write_json
+from torchmask.metrics import relative_error, ssim
+from torchmask.observation import Observation
+from torchmask.restoration.result import RestorationResult
+from torchmask.tracking import RunLogger
+from torchmask.viz import figures as viz
+from torchmask.viz.comparison import comparison_figure
+
+
+def write_outcome(
+    folder: Path, observation: Observation, result: RestorationResult, history: Sequence[str]
+) -> dict[str, Any]:
+    """Write restored.npz, restored.fits and metrics.json; return the numbers of the last.
+
+    `history` says in restored.fits what was done.
+    """
+    result.save(folder / "restored.npz")
+    save_restored(folder / "restored.fits", result, observation, history)
+    table = metrics(observation, result)
+    write_json(folder / "metrics.json", table)
+    return table
+
+
+def metrics(observation: Observation, result: RestorationResult) -> dict[str, Any]:
+    """Return what metrics.json says: the fit, the search, clouds, and the score where the truth is known."""
+    table: dict[str, Any] = {
+        "chi_square": float(result.chi_square.mean()),
+        "worst_frame_chi_square": float(result.chi_square.max()),
+        "noise": result.noise,
+        "sky": result.sky,
+        "r0": result.r0,
+        "rotation": result.rotation,
+        "magnification": result.magnification,
+        "photons_per_frame": float(result.object.sum()),
+        "cost": float(result.cost[-1]),
+        "iterations": len(result.cost),
+        "evaluations": result.n_evaluations,
+        "converged": result.converged,
+        "clouded_frames": clouded_frames(observation),
+        "verdict": None if result.verdict is None else result.verdict.to_json(),
+        "seconds": result.seconds,
+    }
+    if observation.object is not None:
+        cutoff = observation.grid.cutoff(observation.aperture.mask_diameter)
+        table["score"] = relative_error(result.object, observation.object, cutoff)
+        table["ssim"] = ssim(result.object, observation.object, cutoff)
+        table["mean_frame_score"] = relative_error(observation.frames.mean(0), observation.object, cutoff)
+    return table
+
+
+def log_outcome(
+    observation: Observation, result: RestorationResult, table: Mapping[str, Any], logger: RunLogger, prefix: str = ""
+) -> None:
+    """Draw the figures, and hand the final metrics to TensorBoard; `prefix` tells stacks apart."""
+    scale, sky = observation.grid.pixel_scale, observation.sky_matrix
+    logger.figure(
+        f"{prefix}restored",
+        restored_figure(
+            *(result.object, observation.frames, result.residuals, scale),
+            deviation=result.object_std,
+            sky=sky,
+        ),
+    )
+    logger.figure(f"{prefix}cost", viz.history_figure({"restoration": result.cost.tolist()}, "cost"))
+    if observation.object is not None:
+        cutoff = observation.grid.cutoff(observation.aperture.mask_diameter)
+        pictures = {"stack": (observation.frames[0], result.object)}
+        logger.figure(f"{prefix}comparison", comparison_figure(observation.object, pictures, cutoff, scale, sky))
+    for name, value in table.items():
+        if name not in ("verdict", "clouded_frames"):
+            logger.scalar(f"comparison/{prefix}restored/{name}", float(value))
+
+
+def summarise_outcome(result: RestorationResult, table: Mapping[str, Any]) -> str:
+    """Return what is printed of a restoration: clouds, and the summary of the result, which ends in its verdict."""
+    clouded = table["clouded_frames"]
+    told = f"frames {clouded} have less than half the light of the others, as through a cloud; --skip leaves them out\n"
+    return (told if clouded else "") + result.summary()
