@@ -17,6 +17,7 @@ from torchmask.design.tolerance import machining_errors
 from torchmask.design.turbulent import TurbulentMSE
 from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture, SparseAperture
+from torchmask.optics.band import Band
 from torchmask.optics.pixel import SquarePixel
 from torchmask.spectra import NoisePSD, PowerLawPSD
 
@@ -73,6 +74,44 @@ def test_masks_agree_with_the_general_integral(n, ratio, outer_scale, tau, wind,
     assert (found - exact)[~counts].abs().max() < 0.002 / n**2
 
 
+@pytest.mark.parametrize(
+    ("n", "ratio", "width", "most"), [(6, 0.4, 0.2, 0.03), pytest.param(11, 0.8, 0.1, 0.03, marks=pytest.mark.slow)]
+)
+def test_bands_agree_with_the_general_integral(n, ratio, width, most):
+    mask, band = mask_of(n), Band.top_hat(550e-9, width * 550e-9, 3)
+    r0 = mask.subaperture_diameter / ratio
+    row, column, nu = some_frequencies(mask, GRID, 24, 0.1)
+    criterion = criterion_of(r0=r0, wavelengths=band.wavelengths, weights=band.shares)
+    found = criterion.expected_power(mask)[row, column]
+    exact = mean_square_otf(mask, GRID, nu, Seeing(r0), band)
+    counts = exact > 0.02 / n**2
+    assert int(counts.sum()) >= 8
+    assert (found / exact - 1)[counts].abs().max() < most
+    assert abs(float((found / exact - 1)[counts].mean())) < 0.01
+    alone = criterion_of(r0=r0).expected_power(mask)[row, column]
+    assert (alone / exact - 1)[counts].abs().max() > 0.2  # what leaving the band out would cost
+
+
+def test_a_band_of_one_wavelength_is_that_wavelength():
+    """Elsewhere than at the reference: r0 goes with the wavelength to the 6/5, and a grid of it has the same period."""
+    mask, wavelength = mask_of(5), 600e-9
+    far = Grid(GRID.n_pixels, GRID.pixel_scale, wavelength)
+    found = criterion_of(r0=0.2, wavelengths=[wavelength]).expected_power(mask)
+    alone = criterion_of(far, r0=0.2 * (600 / 550) ** 1.2).expected_power(mask)
+    assert (found - alone).abs().max() < 0.02 * float(alone[0, 4:].max())
+    here = criterion_of(r0=0.2, wavelengths=[550e-9]).expected_power(mask)
+    torch.testing.assert_close(here, criterion_of(r0=0.2).expected_power(mask), rtol=1e-12, atol=0)
+
+
+def test_full_pupils_with_a_band_agree_with_the_general_integral():
+    band = Band.top_hat(550e-9, 110e-9, 3)
+    row, column, nu = some_frequencies(SparseAperture([[0.5, 0.0], [-0.5, 0.0]], 0.3, 1.0), GRID, 9, 0.05)
+    exact = mean_square_otf(FullAperture(1.0), GRID, nu, Seeing(0.3), band)
+    criterion = criterion_of(r0=0.3, wavelengths=band.wavelengths, weights=band.shares)
+    found = criterion.expected_power(FullAperture(1.0))[row, column]
+    assert (found / exact - 1)[exact > 1e-4].abs().max() < 0.02
+
+
 def test_holes_that_overlap_agree_with_the_general_integral():
     mask = SparseAperture([[0.3, 0.0], [0.2, 0.05], [-0.3, 0.1]], 0.16, 1.0)
     row, column, nu = some_frequencies(mask, GRID, 24, 0.1)
@@ -106,7 +145,7 @@ def test_without_r0_it_is_mse_a(shape):
     assert float(ours.relative(mask)) == pytest.approx(float(asymptotic.relative(mask)), rel=1e-10)
     with pytest.raises(ValueError, match="TurbulentMSE with the r0"):
         ours(FullAperture(1.0))
-    for turbulence in ({"exposure": 1e-3, "wind": 10.0}, {"outer_scale": 20.0}):
+    for turbulence in ({"exposure": 1e-3, "wind": 10.0}, {"outer_scale": 20.0}, {"wavelengths": [5e-7, 6e-7]}):
         with pytest.raises(ValueError, match="give its r0 in m"):
             criterion_of(**turbulence)
     with pytest.raises(ValueError, match="r0 is None"):
@@ -207,6 +246,15 @@ def test_gradients(layout):
     torch.autograd.gradcheck(lambda x: criterion.relative(SparseAperture(x, 0.2, 1.0)), centers, eps=1e-6, atol=1e-6)
 
 
+def test_gradients_through_a_band():
+    criterion = criterion_of(Grid.nyquist(1.0, 550e-9, 24), r0=0.25, wavelengths=[500e-9, 550e-9, 600e-9])
+    centers = torch.tensor(CENTERS["coincident"], dtype=torch.float64, requires_grad=True)
+    torch.autograd.gradcheck(lambda x: criterion.relative(SparseAperture(x, 0.2, 1.0)), centers, eps=1e-6, atol=1e-6)
+    single = SparseAperture(centers.detach().float(), 0.2, 1.0)
+    double = SparseAperture(centers.detach(), 0.2, 1.0)
+    assert float(criterion.relative(single)) == pytest.approx(float(criterion.relative(double)), rel=1e-4)
+
+
 @pytest.mark.slow
 def test_turning_everything_changes_little():
     """Criterion and wind turned by 90 degrees: the same but for rounding. Turned alone, the mask differs."""
@@ -240,6 +288,8 @@ def test_search_refinement_and_machining_take_it():
 def test_coarser_grids_and_copies_keep_everything():
     exposed = criterion_of(r0=0.2, exposure=5e-3, wind=10.0)
     assert exposed.on_grid(40).seeing == exposed.seeing
+    broad = criterion_of(r0=0.2, wavelengths=[500e-9, 600e-9], weights=[1.0, 3.0])
+    assert broad.on_grid(40).band == broad.band
     turbulence = {"r0": 0.2, "outer_scale": 5.0, "pixel": SquarePixel()}
     criterion = criterion_of(**turbulence, sky=1.0)
     mask, coarse = mask_of(5), criterion.on_grid(40)
@@ -266,6 +316,15 @@ def _with_centers(centers):
     mask = SparseAperture(torch.zeros_like(centers), 0.19, 1.0)
     mask.centers.copy_(centers)
     return mask
+
+
+def test_a_band_that_cannot_be_is_refused():
+    with pytest.raises(ValueError, match="give both"):
+        criterion_of(r0=0.2, weights=[1.0])
+    with pytest.raises(ValueError, match="finite and positive"):
+        criterion_of(r0=0.2, wavelengths=[-5e-7])
+    with pytest.raises(ValueError, match="shortest wavelength"):
+        criterion_of(r0=0.2, wavelengths=[5e-8, 5e-7])(mask_of(3))
 
 
 @pytest.mark.parametrize("sky", [-1.0, math.nan])

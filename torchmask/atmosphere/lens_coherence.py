@@ -1,13 +1,13 @@
-"""What turbulence leaves of the overlap of two equal holes, as a few products: one factor for the baseline, one for
-the place in the overlap.
+"""What turbulence leaves of the overlap of two equal holes, as a short sum with factors that tables hold.
 
 Two holes of a pupil let a baseline b through where b differs from their own by u, less than a hole: their overlap is
 then a lens, whatever the holes' places. Of its |OTF|^2 turbulence and exposure keep the part
 
     c(b, u) = < exp(-Q(b, s) / 2) >,   Q(b, s) = 2 D(b) + 2 D(s) - D(s + b) - D(s - b),
 
-the mean over pairs of points of the lens, s apart. It is smooth in both, so c(b, u) = sum over r of a_r(b) f_r(u)
-converges fast: the singular value decomposition of a table of c finds the factors.
+the mean over pairs of points of the lens, s apart. The length of a thin lens goes with the cube root of its
+transmission T(u), and it loses about (length / r0)^(5/3), T^(5/9): so c is nearly straight in T^(1/2), and a cubic in
+that with what the direction of u adds is c to one or two per cent.
 """
 
 from __future__ import annotations
@@ -31,8 +31,9 @@ _PLACES = (12, 16)  # distances and directions (of half a turn) of places in the
 _BASELINES = (16, 16)  # of baselines
 _SHARED_BASELINES = (9, 12)  # below a hole, of lenses of holes with themselves
 _SEPARATIONS = (28, 12)  # of these holes
-_TOLERANCE = 1e-3  # of c, in its norm
-_FAINT = 0.1  # errors of c count in proportion to the overlap and this: thin lenses carry little
+_TOLERANCE = 1e-3  # of the lenses that holes share, in the norm of the table
+_FAINT = 0.05  # errors of c count in proportion to T^(1/2) and this: thin lenses carry little
+_STRENGTH = 9 / 5  # phases that are a times as large act like a lens with a^(9/5) times the root of T
 
 
 class PolarTable:
@@ -69,49 +70,69 @@ class PolarTable:
         return torch.from_numpy(np.stack(found)).reshape(*leading, len(points))
 
 
-class LensCoherence(NamedTuple):
-    """c(b, u) = sum over r of by_baseline[r] at b times by_place[r] at u [m]."""
+class SharedCoherence(NamedTuple):
+    """A function of the baseline and of the separation of two holes, as the sum of products of one of either."""
 
     by_baseline: PolarTable
     by_place: PolarTable
 
 
-def lens_coherence(shape: Shape, diameter: float, seeing: Seeing, longest: float) -> LensCoherence:
-    """The factors of c for holes of one shape and baselines up to `longest` [m]."""
+def lens_functions(root: Tensor, x: Tensor, y: Tensor) -> list[Tensor]:
+    """The functions whose sum with the factors of `lens_coherence` is c: each of the shape of all three.
+
+    root is the square root of T, times that of `strength_of`; x and y are u over the holes' outer diameter
+    """
+    return [torch.ones_like(root), root, root * root, root * (x * x - y * y), root * (2 * x * y)]
+
+
+def strength_of(scale: Tensor | float) -> Tensor:
+    """What the root of T is multiplied by for light whose phases are `scale` times those of the reference."""
+    return torch.as_tensor(scale) ** _STRENGTH
+
+
+def lens_coherence(
+    shape: Shape, diameter: float, seeing: Seeing, longest: float, scales: tuple[float, ...] = (1.0,)
+) -> PolarTable:
+    """The factors of c by the baseline, up to `longest` [m], for holes of one shape and phases that are `scales` times
+    those of the seeing."""
     reach = shape.outer_diameter(diameter)
-    places = PolarTable.nodes(_PLACES, reach, 1.0)
-    drift, shares = _drift(seeing)
+    nodes = PolarTable.nodes(_PLACES, reach, 1.0)
+    places = nodes.flatten(0, 1)
+    drift, shares = lens_drift(seeing)
     fewest = _PER_HOLE if len(drift) == 1 else _PER_HOLE * 3 // 5  # the drift smooths
     per_hole = max(fewest, math.ceil(_PER_R0 * diameter / seeing.r0))
-    separations, densities = _lens_densities(shape, diameter, places.flatten(0, 1), per_hole)
-
-    def coherence(baselines: Tensor) -> Tensor:
-        total = torch.zeros(len(baselines), len(separations), dtype=torch.float64)
-        for step, share in zip(drift, shares, strict=True):
-            total += share * _kernel(structure, baselines[:, None], separations + step)
-        return total @ densities.T
-
+    separations, densities = lens_densities(shape, diameter, places, per_hole)
     structure = seeing.structure(longest + 2 * reach + float(drift.norm(dim=-1).max()))
     baselines = PolarTable.nodes(_BASELINES, longest, 2.0)
-    weight = shape.otf(places, diameter).flatten() + _FAINT
-    table = _table(coherence, baselines, _PLACES, shape.is_round and seeing.is_isotropic)
-    rows, columns = _factors(table * weight)
-    columns = columns / weight
-    by_baseline = PolarTable(rows.unflatten(-1, _BASELINES), longest, 2.0)
-    return LensCoherence(by_baseline, PolarTable(columns.unflatten(-1, _PLACES), reach, 1.0))
+    root = shape.otf(places, diameter).sqrt()
+    weight = root + _FAINT
+    rows, tables = [], []
+    for scale in scales:
+
+        def coherence(baselines: Tensor, scale: float = scale) -> Tensor:
+            total = torch.zeros(len(baselines), len(separations), dtype=torch.float64)
+            for step, share in zip(drift, shares, strict=True):
+                total += share * _kernel(structure, baselines[:, None], separations + step) ** scale**2
+            return total @ densities.T
+
+        functions = torch.stack(lens_functions(root * strength_of(scale), *(places / reach).unbind(-1)), -1)
+        rows.append(functions * weight[:, None])
+        tables.append(_table(coherence, baselines, _PLACES, shape.is_round and seeing.is_isotropic) * weight)
+    factors = torch.linalg.lstsq(torch.cat(rows), torch.cat(tables, -1).T).solution
+    return PolarTable(factors.unflatten(-1, _BASELINES), longest, 2.0)
 
 
-def shared_coherence(shape: Shape, diameter: float, seeing: Seeing, longest: float) -> LensCoherence:
+def shared_coherence(shape: Shape, diameter: float, seeing: Seeing, longest: float) -> SharedCoherence:
     """The factors of what the lenses of two holes with themselves share, by the baseline u, below a hole, and the
     separation of the holes, up to `longest` [m]: <exp(-Q(u, c + t) / 2)>, t between two points of one lens."""
     reach = shape.outer_diameter(diameter)
     between = PolarTable.nodes(_SEPARATIONS, longest, 1.5).flatten(0, 1)[:, None]
-    drift, shares = _drift(seeing)
+    drift, shares = lens_drift(seeing)
     per_hole = _PER_SHARED if len(drift) == 1 else _PER_SHARED * 3 // 5
     structure = seeing.structure(longest + 4 * reach + float(drift.norm(dim=-1).max()))
 
     def coherence(baselines: Tensor) -> Tensor:
-        separations, densities = _lens_densities(shape, diameter, baselines, per_hole)
+        separations, densities = lens_densities(shape, diameter, baselines, per_hole)
         total = torch.zeros(len(baselines), len(between), dtype=torch.float64)
         for step, share in zip(drift, shares, strict=True):
             for points in (between + step + separations, between + step - separations):
@@ -123,7 +144,7 @@ def shared_coherence(shape: Shape, diameter: float, seeing: Seeing, longest: flo
     baselines = PolarTable.nodes(_SHARED_BASELINES, reach, 1.5)
     rows, columns = _factors(_table(coherence, baselines, _SEPARATIONS, shape.is_round and seeing.is_isotropic))
     by_baseline = PolarTable(rows.unflatten(-1, _SHARED_BASELINES), reach, 1.5)
-    return LensCoherence(by_baseline, PolarTable(columns.unflatten(-1, _SEPARATIONS), longest, 1.5))
+    return SharedCoherence(by_baseline, PolarTable(columns.unflatten(-1, _SEPARATIONS), longest, 1.5))
 
 
 def _table(function: Callable[[Tensor], Tensor], baselines: Tensor, others: tuple[int, int], isotropic: bool) -> Tensor:
@@ -136,7 +157,7 @@ def _table(function: Callable[[Tensor], Tensor], baselines: Tensor, others: tupl
     return torch.stack(turned, 1).flatten(2).flatten(0, 1)
 
 
-def _drift(seeing: Seeing) -> tuple[Tensor, list[float]]:
+def lens_drift(seeing: Seeing) -> tuple[Tensor, list[float]]:
     """Displacements (L, 2) [m] during the exposure, each with its opposite, and their shares."""
     if seeing.exposure == 0:
         return torch.zeros(1, 2, dtype=torch.float64), [1.0]
@@ -160,7 +181,7 @@ def _factors(table: Tensor) -> tuple[Tensor, Tensor]:
     return (left[:, :rank] * root).T, root[:, None] * right[:rank]
 
 
-def _lens_densities(shape: Shape, diameter: float, places: Tensor, per_hole: int) -> tuple[Tensor, Tensor]:
+def lens_densities(shape: Shape, diameter: float, places: Tensor, per_hole: int) -> tuple[Tensor, Tensor]:
     """Separations (S, 2) [m] of half the plane, and how often the points of the lens at `places` (U, 2) are so far
     apart, (U, S) of unit sum. A lens of no extent keeps everything: separation 0."""
     step = diameter * shape.fineness / per_hole

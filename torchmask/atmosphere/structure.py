@@ -70,9 +70,9 @@ class StructureFunction:
         # The offset, a billionth of r0 squared, keeps the derivative finite at 0.
         unit = squared / self.r0**2 + 1e-18
         if math.isinf(self.outer_scale):
-            return STRUCTURE_CONSTANT * torch.exp(5 / 6 * torch.log(unit))
+            return STRUCTURE_CONSTANT * unit ** (5 / 6)
         longest = min(self.reach, _SATURATED * self.outer_scale)
-        root = torch.exp(torch.log(unit.clamp(max=(longest / self.r0) ** 2)) / 6)  # (r / r0)^(1/3)
+        root = unit.clamp(max=(longest / self.r0) ** 2) ** (1 / 6)  # (r / r0)^(1/3)
         series = _series(longest / self.outer_scale)
         position = root * (2 / (longest / self.r0) ** (1 / 3)) - 1
         return STRUCTURE_CONSTANT * root**5 * _clenshaw(series, position)

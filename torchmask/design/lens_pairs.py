@@ -12,6 +12,7 @@ off. The lenses of holes with themselves, at baseline 0, take part; there are N 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -19,24 +20,13 @@ from torch import Tensor
 
 from torchmask.atmosphere.seeing import Seeing
 from torchmask.atmosphere.structure import StructureFunction
-from torchmask.design.overlap import Geometry, PatchPlan
+from torchmask.design.lens_patches import Lenses
+from torchmask.design.overlap import Geometry
 
-_SMALLEST = 3e-3  # products T T' exp(-Q / 2) below, as estimated from above, are left out
+_SMALLEST = 5e-4  # products T T' exp(-Q / 2) below, as estimated, are left out
+_RICH = 0.005  # of those that are never larger the coherence is taken to be constant
+_WINDOWS = (0.65, 0.85, 1.0)  # sizes of patches, of that of a lens
 _NODE = 0.7  # of the hole's reach: where the parabolas are fixed
-
-
-class Lenses(NamedTuple):
-    """The lenses (B, L) of masks: L - 1 pairs of holes after those of the holes with themselves.
-
-    values (B, L, rows, columns) T on the pixels of each one's patch, `baseline`, `corner` (B, L, 2) [pixels] with
-    nu_y >= 0 (sign (B, L, 1) times that of the pair), `middle` (B, L, 2) [m] between the holes
-    """
-
-    values: Tensor
-    baseline: Tensor
-    corner: Tensor
-    sign: Tensor
-    middle: Tensor
 
 
 class Entries(NamedTuple):
@@ -54,14 +44,15 @@ class Entries(NamedTuple):
 
 
 class LensPairs:
-    """What the pairs of lenses of masks share, for holes of one geometry under one turbulence."""
+    """What the pairs of lenses of masks share, for holes of one geometry under one turbulence.
 
-    geometry: Geometry
-    seeing: Seeing
-    pixel: Tensor
+    pixel : (2,) [m]; scales : the least and largest phases of the band's light, over those at the reference wavelength
+    """
 
-    def __init__(self, geometry: Geometry, seeing: Seeing, longest: float, pixel: Tensor) -> None:
-        self.geometry, self.seeing, self.pixel = geometry, seeing, pixel
+    def __init__(
+        self, geometry: Geometry, seeing: Seeing, longest: float, pixel: Tensor, scales: tuple[float, float]
+    ) -> None:
+        self.geometry, self.pixel, self.scales = geometry, pixel, scales
         reach = geometry.reach
         points, weights = geometry.shape.quadrature(4, geometry.diameter)
         self.variance: float = float((weights @ points**2).mean())  # of the points of a hole, along either axis [m^2]
@@ -72,39 +63,90 @@ class LensPairs:
 
     def far(self, baselines: Tensor) -> Tensor:
         """A factor (...) that follows exp(-D), the coherence of far lenses, where that is not small."""
-        d = self.structure(baselines)
+        return self._far(*baselines.unbind(-1))
+
+    def _far(self, x: Tensor, y: Tensor) -> Tensor:
+        d = self.structure.of_square(x * x + y * y)
         return torch.exp(-d / (1 + d / 3))
 
-    def __call__(self, lenses: Lenses, centers: Tensor, plan: PatchPlan) -> tuple[Tensor, Tensor, Tensor] | None:
-        """What lenses share over `far`, as patches: their mask (S,), corner (S, 2) [pixels] and values (S, rows,
-        columns); each counts once more at the opposite frequencies. None if they share nothing."""
+    def __call__(self, lenses: Lenses, centers: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
+        """What lenses share over `far`, as patches of some sizes: their mask (S,), corner (S, 2) [pixels] and values
+        (S, rows, columns); each counts once more at the opposite frequencies."""
         baselines = lenses.baseline * self.pixel
         with torch.no_grad():
-            entries = self._select(lenses, baselines, centers)
+            entries, largest = self._select(lenses, baselines, centers)
         if len(entries.mask) == 0:
-            return None
-        mask = entries.mask
+            return []
         sign = entries.sign[:, None]
-        first, second = baselines[mask, entries.first], sign * baselines[mask, entries.second]
+        first, second = baselines[entries.mask, entries.first], sign * baselines[entries.mask, entries.second]
         separation = self._middles(lenses, centers, entries, 0) - self._middles(lenses, centers, entries, 1)
-        nodes = self._coherence(first, second, separation)  # (E, 3, 3)
+        middle = (first + second) / 2
+        step = _NODE * (self.geometry.reach + (self.scales[1] - self.scales[0]) / 2 * middle.abs())
         n_slots = int(entries.slot.max()) + 1
-        nodes = nodes.new_zeros(n_slots, 3, 3).index_add(0, entries.slot, nodes)
-        one = torch.zeros(n_slots, dtype=torch.long, device=mask.device)
-        one[entries.slot] = torch.arange(len(mask), device=mask.device)  # an entry of each slot
-        mask, a, b, sign = mask[one], entries.first[one], entries.second[one], entries.sign[one]
-        corner = lenses.corner[mask, a]
-        mirrors = a == b  # are their own opposite
-        shared = lenses.values[mask, a] * _at_the_pixels_of(lenses, mask, a, b, sign)
-        shared = shared * self._parabola(nodes, corner, (first[one] + second[one]) / 2, plan)
-        return mask, corner, shared * torch.where(mirrors, 1.0, 2.0).to(shared)[:, None, None]
+        nodes = middle.new_zeros(n_slots, 9)
+        for some, n in ((largest > _RICH, 3), (largest <= _RICH, 1)):
+            found = self._coherence(first[some], second[some], separation[some], step[some], n).flatten(1)
+            nodes = nodes.index_add(0, entries.slot[some], found.expand(-1, 9))
+        one = torch.zeros(n_slots, dtype=torch.long, device=sign.device)
+        one[entries.slot] = torch.arange(len(sign), device=sign.device)  # an entry of each slot
+        pairs = Entries(*(part[one] for part in entries))
+        own = pairs.first == pairs.second  # their own opposite
+        nodes = (nodes * torch.where(own, 1.0, 2.0).to(nodes)[:, None]).unflatten(1, (3, 3))
+        between = (first - second).detach()[one].norm(dim=-1)
+        return [
+            (pairs.mask[some], *self._patches(lenses, Entries(*(part[some] for part in pairs)), nodes[some], *places))
+            for some, places in self._windows(lenses, pairs, largest[one], between, middle[one], step[one])
+        ]
 
-    def _select(self, lenses: Lenses, baselines: Tensor, centers: Tensor) -> Entries:
+    def _windows(
+        self, lenses: Lenses, pairs: Entries, largest: Tensor, between: Tensor, middle: Tensor, step: Tensor
+    ) -> Iterator[tuple[Tensor, tuple[Tensor, Tensor, Tensor, int, int]]]:
+        """Pairs by the size of the window beyond which they share nothing: which they are, the windows' first
+        pixels, and what the parabolas need."""
+        rows, columns = lenses.values.shape[-2:]
+        if lenses.scale is not None:  # the lenses of a band are as wide as they are
+            every = torch.arange(len(largest), device=middle.device)
+            yield every, (lenses.corner[pairs.mask, pairs.first], middle, step, rows, columns)
+            return
+        needed = (1 - (between / (2 * self.geometry.reach)) ** 2).clamp(min=0).sqrt()
+        needed = torch.where(pairs.first == 0, 1.0, needed)
+        smallest = 0.0
+        for size in _WINDOWS:
+            some = ((needed > smallest) & (needed <= size)).nonzero()[:, 0]
+            smallest = size
+            if len(some) == 0:
+                continue
+            reach = size * self.geometry.reach / self.pixel
+            n_columns, n_rows = (2 * reach + 1).long().tolist()
+            corner = (middle[some].detach() / self.pixel - reach).ceil()
+            yield some, (corner, middle[some], step[some], min(n_rows, rows), min(n_columns, columns))
+
+    def _patches(
+        self,
+        lenses: Lenses,
+        pairs: Entries,
+        nodes: Tensor,
+        corner: Tensor,
+        middle: Tensor,
+        step: Tensor,
+        n_rows: int,
+        n_columns: int,
+    ) -> tuple[Tensor, Tensor]:
+        """Corner (S, 2) and values (S, rows, columns) of what pairs share, from their coherence at the nodes."""
+        size = (n_rows, n_columns)
+        first = _at_pixels(lenses, pairs.mask, pairs.first, torch.ones_like(pairs.sign), corner, size)
+        second = _at_pixels(lenses, pairs.mask, pairs.second, pairs.sign, corner, size)
+        start = (corner * self.pixel - middle) / step
+        return corner, (first * second).sum(1) * _parabola(nodes, start, self.pixel / step, *size)
+
+    def _select(self, lenses: Lenses, baselines: Tensor, centers: Tensor) -> tuple[Entries, Tensor]:
+        """The pairs that share something, and about the most that each gives anywhere."""
         n, count = centers.shape[1], baselines.shape[1]
         upper = torch.ones(count, count, dtype=torch.bool, device=centers.device).triu(1)
-        limit, found = 2 * self.geometry.reach, []
+        limit, found = (2 * self.geometry.reach) ** 2, []
+        x, y = baselines.unbind(-1)
         for sign in (1, -1):
-            distance = (sign * baselines[:, None] - baselines[:, :, None]).norm(dim=-1)
+            distance = (sign * x[:, None] - x[:, :, None]) ** 2 + (sign * y[:, None] - y[:, :, None]) ** 2
             allowed = upper if sign > 0 else upper | torch.eye(count, dtype=torch.bool, device=centers.device)
             allowed = allowed.clone()
             if sign < 0:
@@ -122,10 +164,12 @@ class LensPairs:
         entries.append(torch.cat([each, which, which], 1))
         rows = torch.cat(entries)
         result = Entries(rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3], rows[:, 4:], rows[:, 0])
-        rows = rows[self._largest(result, lenses, baselines, centers) > _SMALLEST]
+        largest = self._largest(result, lenses, baselines, centers)
+        counts = largest > _SMALLEST
+        rows, largest = rows[counts], largest[counts]
         key = ((rows[:, 0] * count + rows[:, 1]) * count + rows[:, 2]) * 2 + (rows[:, 3] > 0)
         slot = torch.unique(key, return_inverse=True)[1]
-        return Entries(rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3], rows[:, 4:], slot)
+        return Entries(rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3], rows[:, 4:], slot), largest
 
     def _largest(self, entries: Entries, lenses: Lenses, baselines: Tensor, centers: Tensor) -> Tensor:
         """About the most that each entry gives anywhere (E,)."""
@@ -134,10 +178,11 @@ class LensPairs:
         separation = self._middles(lenses, centers, entries, 0) - self._middles(lenses, centers, entries, 1)
         reach = self.geometry.reach
         lens = self.geometry.shape.otf((first - second) / 2, self.geometry.diameter) ** 2
-        near = [
-            vector * (1 - reach / 2 / vector.norm(dim=-1, keepdim=True)).clamp(min=0)
-            for vector in ((first + second) / 2, separation)
-        ]
+        near = []
+        for x, y in (((first + second) / 2).unbind(-1), separation.unbind(-1)):
+            shrunk = (1 - reach / 2 * torch.rsqrt(x * x + y * y)).clamp(min=0)
+            near += [shrunk * x, shrunk * y]
+        near = [vector.nan_to_num(0.0) for vector in near]
         return lens * self._kernel(*near)
 
     def _middles(self, lenses: Lenses, centers: Tensor, entries: Entries, which: int) -> Tensor:
@@ -146,75 +191,97 @@ class LensPairs:
         hole = centers[entries.mask, entries.holes[:, which]]
         return torch.where((lens == 0)[:, None], hole, lenses.middle[entries.mask, lens])
 
-    def _kernel(self, baseline: Tensor, separation: Tensor) -> Tensor:
-        """exp(-Q / 2) (...)."""
-        structure = self.structure
-        crossed = structure(separation + baseline) + structure(separation - baseline)
-        return torch.exp(crossed / 2 - structure(baseline) - structure(separation))
+    def _kernel(self, bx: Tensor, by: Tensor, sx: Tensor, sy: Tensor, square: Tensor | float = 1.0) -> Tensor:
+        """exp(-Q / 2) (...) to the power `square` of the phases' scale."""
+        structure = self.structure.of_square
+        crossed = structure((sx + bx) ** 2 + (sy + by) ** 2) + structure((sx - bx) ** 2 + (sy - by) ** 2)
+        return torch.exp(square * (crossed / 2 - structure(bx * bx + by * by) - structure(sx * sx + sy * sy)))
 
-    def _coherence(self, first: Tensor, second: Tensor, separation: Tensor) -> Tensor:
-        """The mean of exp(-Q / 2) over `far` at 3 x 3 baselines around that midway (E, rows, columns)."""
-        step = _NODE * self.geometry.reach * torch.arange(-1.0, 2.0, dtype=first.dtype, device=first.device)
-        offsets = torch.stack(torch.meshgrid(step, step, indexing="xy"), -1)
-        half = ((second - first) / 2)[:, None, None]
-        baseline = ((first + second) / 2)[:, None, None] + offsets
+    def _coherence(self, first: Tensor, second: Tensor, separation: Tensor, step: Tensor, n: int) -> Tensor:
+        """The mean of exp(-Q / 2) over `far` at n x n baselines around that midway, `step` (E, 2) apart, (E, rows,
+        columns)."""
+        nodes = torch.arange(n, dtype=first.dtype, device=first.device) - (n - 1) / 2
+        middle = (first + second) / 2
+        zero = torch.zeros(n, n, dtype=first.dtype, device=first.device)
+        bx = middle[:, :1, None] + step[:, :1, None] * nodes + zero
+        by = middle[:, 1:, None] + step[:, 1:, None] * nodes[:, None] + zero
+        scale, square = self._scale(middle, bx, by)
         xx, xy, yy = (
             one + other + drift
             for one, other, drift in zip(
-                self._moments(offsets + half), self._moments(offsets - half), self.drift, strict=True
+                self._moments(bx / scale - first[:, :1, None], by / scale - first[:, 1:, None]),
+                self._moments(bx / scale - second[:, :1, None], by / scale - second[:, 1:, None]),
+                self.drift,
+                strict=True,
             )
         )
         # the symmetric square root: a mask that is turned by 90 degrees has the same points
         root = torch.sqrt((xx * yy - xy**2).clamp(min=1e-6 * self.variance**2))
         trace = torch.sqrt(xx + yy + 2 * root)
         along, skew, across = (xx + root) / trace, xy / trace, (yy + root) / trace
+        sx, sy = separation[:, :1, None], separation[:, 1:, None]
         total = torch.zeros_like(xx)
         for i in (-1, 1):
             for j in (-1, 1):
-                t = torch.stack([i * along + j * skew, i * skew + j * across], -1)
-                total = total + self._kernel(baseline, separation[:, None, None] + t)
-        return total / (4 * self.far(baseline))
+                total = total + self._kernel(bx, by, sx + i * along + j * skew, sy + i * skew + j * across, square)
+        return total / (4 * self._far(bx, by))
 
-    def _moments(self, place: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """xx, xy and yy (...) [m^2] of the lens at `place` (..., 2): its width shrinks as 1 - x, its height as that of
-        two discs, x the distance over the hole's diameter."""
-        scaled = place / self.geometry.reach
-        squared = (scaled**2).sum(-1) + 1e-4
-        x = torch.sqrt(squared)
-        inside = (1 - x).clamp(min=0.03)  # no lens: it has no weight either
-        narrow, base = -2 * inside / x * self.variance, inside * (1 + x) * self.variance
-        a, b = scaled.unbind(-1)
-        return base + narrow * a * a, narrow * a * b, base + narrow * b * b
+    def _scale(self, middle: Tensor, bx: Tensor, by: Tensor) -> tuple[Tensor | float, Tensor | float]:
+        """The phases of the light at baselines (E, 3, 3) near `middle` (E, 2), over those at the reference wavelength,
+        and their squares."""
+        least, largest = self.scales
+        if largest == least:
+            return least, least**2
+        squared = (middle**2).sum(-1)[:, None, None]
+        along = (bx * middle[:, :1, None] + by * middle[:, 1:, None] - squared) / (squared + 1e-6 * self.variance)
+        # the part of it that the lenses tell apart: all of it where they lie side by side, none where they overlap
+        spread = (largest - least) ** 2 / 4 * squared
+        scale = 1 + along.clamp(least - 1, largest - 1) * spread / (spread + self.variance)
+        return scale, scale * scale
 
-    def _parabola(self, nodes: Tensor, corner: Tensor, middle: Tensor, plan: PatchPlan) -> Tensor:
-        """The values at 3 x 3 nodes around `middle` (S, 2) [m] on the pixels of the patches (S, rows, columns)."""
-        step = _NODE * self.geometry.reach
-        start = (corner * self.pixel - middle) / step
-        x = start[:, :1] + plan.column * (float(self.pixel[0]) / step)
-        y = start[:, 1:] + torch.arange(len(plan.row), device=x.device) * (float(self.pixel[1]) / step)
-        rows = _quadratic(nodes, x[:, None, :])  # (S, 3, columns)
-        return _quadratic(rows.transpose(1, 2)[:, None], y[:, :, None])
-
-
-def _quadratic(nodes: Tensor, t: Tensor) -> Tensor:
-    """The parabola through values (..., 3) at -1, 0, 1, at t (...)."""
-    below, middle, above = (nodes[..., k, None] if nodes.ndim == 3 else nodes[..., k] for k in range(3))
-    return middle + t * ((above - below) / 2 + t * ((above + below) / 2 - middle))
+    def _moments(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """xx, xy and yy (...) [m^2] of the lens at the place (x, y): its width shrinks as 1 - r, its height as that of
+        two discs, r the distance over the hole's diameter."""
+        x, y = x / self.geometry.reach, y / self.geometry.reach
+        r = torch.sqrt(x * x + y * y + 1e-4)
+        inside = (1 - r).clamp(min=0.03)  # no lens: it has no weight either
+        narrow, base = -2 * inside / r * self.variance, inside * (1 + r) * self.variance
+        return base + narrow * x * x, narrow * x * y, base + narrow * y * y
 
 
-def _at_the_pixels_of(lenses: Lenses, mask: Tensor, a: Tensor, b: Tensor, sign: Tensor) -> Tensor:
-    """The second lens on the patches of the first, (S, rows, columns); turned by half a turn where its sign is -1."""
-    rows, columns = lenses.values.shape[-2:]
+def _parabola(nodes: Tensor, start: Tensor, step: Tensor, n_rows: int, n_columns: int) -> Tensor:
+    """The values at 3 x 3 nodes (S, y, x) on patches (S, rows, columns) whose first pixel lies at `start` (S, 2) and
+    the others `step` (S, 2) apart, in units of the nodes' distance: a polynomial in row and column."""
+    rows = _coefficients(nodes, start[:, 1:], step[:, 1:])  # (S, 3, x)
+    both = _coefficients(rows.transpose(1, 2), start[:, :1], step[:, :1])  # (S, 3 of x, 3 of y)
+    row, column = (torch.arange(n, dtype=nodes.dtype, device=nodes.device) for n in (n_rows, n_columns))
+    powers = [[(row**j)[:, None] * (column**i) for j in range(3)] for i in range(3)]
+    matrix = torch.stack([torch.stack(some) for some in powers]).flatten(0, 1).flatten(1)
+    return (both.flatten(1) @ matrix).unflatten(1, (n_rows, n_columns))
+
+
+def _coefficients(nodes: Tensor, start: Tensor, step: Tensor) -> Tensor:
+    """Of the parabolas through values (S, 3, k) at -1, 0, 1 in powers of the pixel (S, 3, k)."""
+    below, middle, above = nodes.unbind(1)
+    slope, curvature = (above - below) / 2, (above + below) / 2 - middle
+    at_start = middle + start * (slope + start * curvature)
+    return torch.stack([at_start, step * (slope + 2 * start * curvature), step**2 * curvature], 1)
+
+
+def _at_pixels(
+    lenses: Lenses, mask: Tensor, lens: Tensor, sign: Tensor, corner: Tensor, size: tuple[int, int]
+) -> Tensor:
+    """Lenses (S,) on patches of `size` whose first pixel is `corner` (S, 2), (S, modes, rows, columns); turned by half
+    a turn where their sign is -1."""
+    n_modes, rows, columns = lenses.values.shape[-3:]
     padded = torch.nn.functional.pad(lenses.values, (1, 1, 1, 1))
-    size = torch.tensor([columns, rows], device=mask.device)
-    corner, other = lenses.corner[mask, a].long(), lenses.corner[mask, b].long()
-    positive = (sign > 0)[:, None]
-    shift = torch.where(positive, corner - other, corner + other + size - 1)
-    index = []
-    for axis, count in enumerate((columns, rows)):
-        place = shift[:, axis, None] + torch.arange(count, device=mask.device)
-        place = torch.where(positive, place, count - 1 - place)
-        index.append(place.clamp(-1, count) + 1)
-    start = (mask * lenses.values.shape[1] + b) * ((rows + 2) * (columns + 2))
-    flat = start[:, None, None] + index[1][:, :, None] * (columns + 2) + index[0][:, None, :]
-    return padded.flatten()[flat]
+    first, own, sign = corner.long(), lenses.corner[mask, lens].long(), sign[:, None]
+    y, x = (
+        (sign * (first[:, axis, None] + torch.arange(n, device=mask.device)) - own[:, axis, None]).clamp(-1, last) + 1
+        for axis, n, last in ((1, size[0], rows), (0, size[1], columns))
+    )
+    layer = (rows + 2) * (columns + 2)
+    start = (mask * lenses.values.shape[1] + lens) * (n_modes * layer)
+    start = start[:, None] + torch.arange(n_modes, device=mask.device) * layer
+    index = (start[:, :, None] + (y * (columns + 2))[:, None])[..., None] + x[:, None, None]
+    return padded.flatten().index_select(0, index.flatten()).view(index.shape)

@@ -2,9 +2,8 @@
 
 At a frequency near the baseline of two holes the pupil overlaps its copy in one lens, midway between the holes.
 E|OTF|^2 is the sum over all pairs of lenses of the coherence between them: of each lens with itself, which depends on
-the frequency and the distance from the baseline and is a sum of products of both
-(`torchmask.atmosphere.lens_coherence`), and of lenses of different pairs of holes whose baselines nearly agree
-(`torchmask.design.lens_pairs`, `torchmask.design.central_lenses`).
+the frequency and the transmission of the lens (`torchmask.atmosphere.lens_coherence`), and of lenses of different
+pairs of holes whose baselines nearly agree (`torchmask.design.lens_pairs`, `torchmask.design.central_lenses`).
 """
 
 from __future__ import annotations
@@ -12,103 +11,96 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchmask.atmosphere.lens_coherence import lens_coherence
+from torchmask.atmosphere.colour_coherence import ColourCoherence
+from torchmask.atmosphere.lens_coherence import lens_coherence, lens_functions
 from torchmask.atmosphere.seeing import Seeing
 from torchmask.design.central_lenses import CentralLenses
-from torchmask.design.lens_pairs import Lenses, LensPairs
-from torchmask.design.overlap import Geometry, PatchPlan, cached_plan
-from torchmask.design.spline_patches import SplinePatches
+from torchmask.design.frequency_plane import FrequencyPlane, half_plane
+from torchmask.design.lens_pairs import LensPairs
+from torchmask.design.lens_patches import Lenses, LensPatches
+from torchmask.design.overlap import Geometry
+from torchmask.optics.band import Band
 
-_CHUNK = 2**22  # numbers of patches in work at a time: few enough for memory, enough to amortise launches
+_CHUNK = 2**20  # pixels of lenses in work at a time: few enough for memory, enough to amortise launches
 
 
 class MaskTransfer:
-    """E|OTF|^2 of any masks with the holes of one geometry, on one grid, under one turbulence.
+    """E|OTF|^2 of any masks with the holes of one geometry, on one grid, under one turbulence and in one band.
 
-    Its tables take a second to make, and hold for any number and places of holes.
+    Its tables take a second to make, and hold for any number and places of holes. `reference` [m] is the wavelength of
+    the seeing and of the geometry, `longest` [m] the longest baseline on the frequency torus.
     """
 
-    geometry: Geometry
-    seeing: Seeing
-
     def __init__(
-        self, geometry: Geometry, seeing: Seeing, longest: float, dtype: torch.dtype, device: torch.device
+        self,
+        geometry: Geometry,
+        seeing: Seeing,
+        band: Band,
+        reference: float,
+        longest: float,
+        dtype: torch.dtype,
+        device: torch.device,
     ) -> None:
-        self.geometry, self.seeing = geometry, seeing
-        plan = cached_plan(geometry, 1, dtype, device)
-        sides = geometry.grid[1], geometry.grid[0]
-        self.pixel: Tensor = torch.tensor([geometry.period / side for side in sides], dtype=torch.float64)
-        self.splines: SplinePatches = SplinePatches(
-            (float(plan.reach[0]), float(plan.reach[1])), (len(plan.column), len(plan.row))
+        scales = [reference / wavelength for wavelength in band.wavelengths]
+        furthest = longest * max(1.0, *scales)
+        several = len(scales) > 1
+        colours = None
+        if several:
+            colours = ColourCoherence(geometry.shape, geometry.diameter, seeing, band, reference, furthest)
+        self.patches: LensPatches = LensPatches(geometry, band, reference, colours, dtype, device)
+        self.plane: FrequencyPlane = self.patches.plane
+        self.pixel: Tensor = torch.tensor([geometry.period / side for side in geometry.grid[::-1]], dtype=dtype)
+        self.pixel = self.pixel.to(device)
+        self.reach: float = geometry.reach
+        spread = tuple(sorted({min(scales), sum(scales) / len(scales), max(scales)}))
+        coherence = lens_coherence(geometry.shape, geometry.diameter, seeing, furthest, spread)
+        self.factors: Tensor = coherence(self.plane.baselines).to(device, dtype)
+        self.central: CentralLenses = CentralLenses(
+            geometry, seeing, band, reference, longest, half_plane(geometry), dtype, device
         )
-        coherence = lens_coherence(geometry.shape, geometry.diameter, seeing, longest)
-        x, y = self.splines.lattice()
-        places = torch.stack(torch.meshgrid(x * self.pixel[0], y * self.pixel[1], indexing="xy"), -1)
-        lens = geometry.shape.otf(places, geometry.diameter)
-        by_place = coherence.by_place(places.flatten(0, 1)).unflatten(-1, lens.shape)
-        self.rank: int = len(by_place)
-        self.squares: Tensor = self.splines.slices(lens**2 * by_place).to(device, dtype)
-        self.lenses: Tensor = self.splines.slices(lens[None]).to(device, dtype)
-        baselines = half_plane(geometry)
-        self.by_baseline: Tensor = coherence.by_baseline(baselines).to(device, dtype)
-        self.pairs: LensPairs = LensPairs(geometry, seeing, longest, self.pixel.to(device, dtype))
-        self.central: CentralLenses = CentralLenses(geometry, seeing, longest, baselines, dtype, device)
-        self.far: Tensor = self.pairs.far(baselines.to(device)).to(dtype)
+        self.pairs: LensPairs = LensPairs(geometry, seeing, longest, self.pixel, (min(scales), max(scales)))
+        self.far: Tensor = self.pairs.far(self.plane.baselines.to(device)).to(dtype)
 
     def __call__(self, centers: Tensor) -> Tensor:
         """N^2 E|OTF|^2 (B, H // 2 + 1, W) of masks with `centers` (B, N, 2) [m]."""
         n = centers.shape[1]
-        plan = cached_plan(self.geometry, n, centers.dtype, centers.device)
-        pixels = len(plan.first) * len(plan.row) * len(plan.column) * (self.rank + 4)
-        parts = [self._transfer(chunk, plan) for chunk in centers.split(max(1, _CHUNK // pixels))]
-        return torch.cat(parts).unflatten(1, (-1, self.geometry.grid[1]))
+        pixels = (1 + n * (n - 1) // 2) * self.patches.n_pixels * self.patches.n_layers
+        parts = [self._transfer(chunk) for chunk in centers.split(max(1, _CHUNK // pixels))]
+        return torch.cat(parts).unflatten(1, (-1, self.plane.n_columns))
 
-    def _transfer(self, centers: Tensor, plan: PatchPlan) -> Tensor:
-        n, size = centers.shape[1], (len(plan.row), len(plan.column))
-        first, second = (centers.index_select(1, index) for index in (plan.first, plan.second))
-        nu = (first - second) / self.geometry.period
-        nu = nu - nu.detach().round()
-        sign = torch.copysign(plan.one, nu[..., 1:]).detach()
-        baseline = nu * sign * plan.size  # [pixels], of the two opposite ones that with nu_y >= 0
-        corner = (baseline.detach() - plan.reach).ceil()
-        weights = self.splines.weights(corner - baseline)
-        multiplicity = torch.ones_like(baseline[:1, :, 0])
-        multiplicity[:, 0] = n / 2  # every patch counts twice in the end, at nu and at -nu
-        own = (weights * multiplicity[..., None]) @ self.squares
-        own = own.unflatten(-1, (self.rank, -1)).transpose(1, 2).flatten(2)  # (B, R, pairs rows columns)
-        index = patch_index(corner, plan)
-        plane = own.new_zeros(len(centers), self.rank, plan.n_plane)
-        plane = plane.scatter_add(2, index.flatten(1)[:, None].expand(own.shape), own)
-        found = (folded(plane, plan) * self.by_baseline).sum(1) + self.central(centers)
+    def _transfer(self, centers: Tensor) -> Tensor:
+        lenses = self.patches(centers)
+        alone = self._alone(lenses, centers.shape[1])
+        index = self.plane.index(lenses.corner, *lenses.root.shape[-2:]).flatten(1)
+        planes = centers.new_zeros(*alone.shape[:2], self.plane.n_pixels)
+        planes = planes.scatter_add(2, index[:, None].expand_as(alone), alone)
+        plane = (planes * self.factors).sum(1)
+        shared = self.pairs(lenses, centers)
+        if shared:
+            together = torch.zeros_like(plane).flatten()
+            for mask, corner, values in shared:
+                index = self.plane.index(corner, *values.shape[-2:]) + mask[:, None, None] * self.plane.n_pixels
+                together = together.scatter_add(0, index.flatten(), values.flatten())
+            plane = plane + together.view_as(plane) * self.far
+        return self.plane.folded(plane) + self.central(centers)
 
-        lenses = Lenses((weights @ self.lenses).unflatten(-1, size), baseline, corner, sign, (first + second) / 2)
-        pairs = self.pairs(lenses, centers, plan)
-        if pairs is None:
-            return found
-        mask, corners, values = pairs
-        flat = patch_index(corners, plan) + mask[:, None, None] * plan.n_plane
-        plane = values.new_zeros(len(centers) * plan.n_plane).scatter_add(0, flat.flatten(), values.flatten())
-        return found + folded(plane.unflatten(0, (-1, plan.n_plane)), plan) * self.far
+    def _alone(self, lenses: Lenses, n: int) -> Tensor:
+        """What lenses give with themselves, in parts of which each has a factor (B, parts, L rows columns)."""
+        count = torch.ones_like(lenses.root[:1, :, :1, :1])
+        count[:, 0] = n / 2  # every patch counts twice in the end, at nu and at -nu
+        power = (lenses.values**2).sum(2) * count
+        places = self._places(lenses, *lenses.root.shape[-2:])
+        return torch.stack([power * function for function in lens_functions(lenses.root, *places)], 1).flatten(2)
 
-
-def half_plane(geometry: Geometry) -> Tensor:
-    """Baselines (P, 2) [m] of the half-plane of frequencies, nu_y >= 0."""
-    rows, columns = geometry.grid
-    nu_y = torch.arange(rows // 2 + 1, dtype=torch.float64) / rows
-    nu_x = torch.fft.fftfreq(columns, dtype=torch.float64)
-    return torch.stack(torch.meshgrid(nu_x, nu_y, indexing="xy"), -1).flatten(0, 1) * geometry.period
-
-
-def patch_index(corner: Tensor, plan: PatchPlan) -> Tensor:
-    """Where the pixels of patches with the first pixel `corner` (..., 2) lie in the plane, (..., rows, columns)."""
-    columns = int(plan.size[0])
-    pixel = corner.nan_to_num(0.0).long()  # NaN, of an optimiser that diverged, must not become an index
-    index_x = (pixel[..., :1] + plan.column).remainder(columns)
-    index_y = plan.row + pixel[..., 1:] * columns
-    return index_y[..., :, None] + index_x[..., None, :]
-
-
-def folded(plane: Tensor, plan: PatchPlan) -> Tensor:
-    """The half-plane of planes (..., n_plane), with what lies beyond its border reflected into it."""
-    half = plane[..., plan.half]
-    return half.index_add(half.ndim - 1, plan.mirrored, plane[..., plan.outside])
+    def _places(self, lenses: Lenses, rows: int, columns: int) -> tuple[Tensor, Tensor]:
+        """How far the light at the pixels is from the lenses' baselines, x and y, over the holes' outer diameter."""
+        x = lenses.corner[..., :1] + torch.arange(columns, device=self.pixel.device)
+        y = lenses.corner[..., 1:] + torch.arange(rows, device=self.pixel.device)
+        x, y = x[..., None, :], y[..., :, None]
+        base_x, base_y = lenses.baseline[..., None, None].unbind(2)
+        if lenses.scale is not None:
+            turn_x, turn_y = lenses.turns[..., None, None].unbind(2)
+            x = (x + turn_x) / lenses.scale - turn_x
+            y = (y + turn_y) / lenses.scale - turn_y
+        unit = (self.pixel / self.reach).tolist()
+        return (x - base_x) * unit[0], (y - base_y) * unit[1]

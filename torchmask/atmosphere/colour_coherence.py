@@ -1,0 +1,86 @@
+"""How far the light of two wavelengths is coherent that the same holes bring to the same frequency.
+
+Light of the phases a and a' times those at the reference wavelength comes from baselines b / a and b / a', so from
+other points of the holes, and its phases differ by (a - a') phi. Over the geometric mean of what turbulence leaves of
+either alone, it keeps exp(-k), k even in a - a': the ratio is taken where a hole's lenses of both are alike.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchmask.atmosphere.lens_coherence import PolarTable, lens_densities, lens_drift
+from torchmask.atmosphere.seeing import Seeing
+from torchmask.atmosphere.transfer import difference_variance
+from torchmask.optics.band import Band
+from torchmask.optics.shape_base import Shape
+
+_BASELINES = (16, 16)
+_STEPS = (0.4, 0.75, 1.0)  # of the largest a - a', where k is taken
+_PER_HOLE, _PER_R0 = 12, 6
+_THINNEST = 0.9  # of a hole's reach: lenses further out carry nothing
+_LOST = 1e-3  # of the light, in modes that are left out
+
+
+class ColourCoherence:
+    """Of the wavelengths of a band, at any baseline up to `longest` [m], for holes of one shape."""
+
+    def __init__(
+        self, shape: Shape, diameter: float, seeing: Seeing, band: Band, reference: float, longest: float
+    ) -> None:
+        self.scales: Tensor = reference / torch.tensor(band.wavelengths, dtype=torch.float64)
+        self.shares: Tensor = torch.tensor(band.shares, dtype=torch.float64)
+        widest = self.scales.max() - self.scales.min()
+        isotropic = shape.is_round and seeing.is_isotropic
+        nodes = PolarTable.nodes((_BASELINES[0], 1 if isotropic else _BASELINES[1]), longest, 2.0).flatten(0, 1)
+        # lenses further apart than a hole's reach to either side have no frequency in common
+        met = 2 * _THINNEST * shape.outer_diameter(diameter) / nodes.norm(dim=-1).clamp(min=1e-9)
+        steps = torch.minimum(met, widest)[:, None] * torch.tensor(_STEPS, dtype=torch.float64)
+        lost = torch.stack([_lost(shape, diameter, seeing, nodes, step) for step in steps.T], -1)
+        powers = torch.stack([steps**0, steps**2], -1)
+        factors = torch.linalg.lstsq(powers, (lost / steps**2)[..., None]).solution[..., 0].T
+        factors = factors.unflatten(-1, (_BASELINES[0], -1))
+        self.factors: PolarTable = PolarTable(factors.expand(-1, -1, _BASELINES[1]).contiguous(), longest, 2.0)
+
+    def between(self, baselines: Tensor) -> Tensor:
+        """exp(-k) (P, W, W) of all pairs of wavelengths at baselines (P, 2) [m]."""
+        step = (self.scales[:, None] - self.scales) ** 2
+        second, fourth = self.factors(baselines)[..., None, None]
+        return torch.exp(-((second + fourth * step).clamp(min=0) * step))
+
+    def modes(self, baselines: Tensor) -> Tensor:
+        """The matrices (M, W, P) whose products with themselves, over M, are exp(-k)."""
+        root = self.shares.sqrt()
+        size, vectors = torch.linalg.eigh(self.between(baselines) * root[:, None] * root)
+        size = size.clamp(min=0)
+        left_out = size.cumsum(-1) / size.sum(-1, keepdim=True)
+        n = max(1, int((left_out > _LOST).sum(-1).max()))
+        modes = vectors[..., -n:] * size[:, None, -n:].sqrt() / root[:, None]
+        return modes.permute(2, 1, 0)
+
+
+def _lost(shape: Shape, diameter: float, seeing: Seeing, baselines: Tensor, step: Tensor) -> Tensor:
+    """k (P,) at baselines (P, 2) [m], for phases that differ by `step` (P,) times those at the reference."""
+    one, other = (1 + step / 2)[:, None], (1 - step / 2)[:, None]
+    reach = shape.outer_diameter(diameter)
+    first, second = baselines / one, baselines / other
+    place = (first - second) / 2
+    per_hole = max(_PER_HOLE, math.ceil(_PER_R0 * diameter / seeing.r0))
+    separations, densities = lens_densities(shape, diameter, place, per_hole)
+    drift, shares = lens_drift(seeing)
+    furthest = float(baselines.norm(dim=-1).max()) / float(other.min()) + 4 * reach + float(drift.norm(dim=-1).max())
+    structure = seeing.structure(furthest)
+
+    def kept(b: Tensor, c: Tensor, scale: Tensor, other_scale: Tensor) -> Tensor:
+        total = torch.zeros(len(b), dtype=torch.float64)
+        for lag, share in zip(drift, shares, strict=True):
+            variance = difference_variance(structure, separations + lag, b[:, None], c[:, None], scale, other_scale)
+            total += share * (torch.exp(-variance / 2) * densities).sum(-1)
+        return total
+
+    alone = torch.sqrt(kept(first, first, one, one) * kept(second, second, other, other))
+    together = kept(first, second, one, other).clamp(min=1e-30)
+    return torch.log(alone / together)
