@@ -82,7 +82,7 @@ def test_paths_that_exist_become_absolute_and_places_of_results_are_not_stored(t
         ),
         ("inner: {siz: 1.0}", r"unknown key inner.siz; known keys are inner.size, inner.count, inner.sun$"),
         ("out: here", "unknown key out"),
-        ("inner: 3", "inner holds 3"),
+        ("inner: 3", "inner is 3"),
         ("- 1", r"the file holds \[1\]"),
         ("wavelength: long", "wavelength is 'long': a number is needed"),
         ("wavelength: null", "wavelength is None: a number is needed"),
@@ -97,8 +97,8 @@ def test_paths_that_exist_become_absolute_and_places_of_results_are_not_stored(t
         ("bars: 3", "bars is 3: a list is needed"),
         ("inner: {sun: [1, 2]}", "inner.sun has 2 items: 3 are needed"),
         ("command: restore", "it is for restore, not for test"),
-        ("wavelength: [1", "is no valid YAML"),
-        ("wavelength: 1\0", "is no valid YAML"),
+        ("wavelength: [1", "is not valid YAML"),
+        ("wavelength: 1\0", "is not valid YAML"),
     ],
 )
 def test_a_bad_config_is_refused_with_its_name_and_the_key(tmp_path, text, message):
@@ -113,7 +113,7 @@ def test_missing_and_binary_files_are_refused(tmp_path):
     with pytest.raises(ValueError, match=re.escape(f"no config file {tmp_path / 'none.yaml'}")):
         load_config(tmp_path / "none.yaml", Options, "test")
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00\xd8")
-    with pytest.raises(ValueError, match="no valid YAML"):
+    with pytest.raises(ValueError, match="not valid YAML"):
         load_config(tmp_path / "binary.yaml", Options, "test")
 
 
@@ -125,7 +125,7 @@ def test_an_empty_config_is_all_defaults(tmp_path):
 def test_a_config_executes_nothing(tmp_path):
     path, trap = tmp_path / "evil.yaml", tmp_path / "trap"
     path.write_text(f"title: !!python/object/apply:os.mkdir ['{trap}']")
-    with pytest.raises(ValueError, match="no valid YAML"):
+    with pytest.raises(ValueError, match="not valid YAML"):
         load_config(path, Options, "test")
     assert not trap.exists()
     yaml.unsafe_load(path.read_text())  # the trap is one

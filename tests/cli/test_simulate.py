@@ -105,7 +105,7 @@ def test_the_wavelength_is_the_masks_unless_another_is_given(tmp_path, capsys):
     for mask_without in (str(tmp_path / "old.json"), "keck_nirc2_9"):
         capsys.readouterr()
         assert main([*simulate, mask_without, "--out", str(tmp_path / "new")]) == 1
-        said = f"--wavelength is missing: give it in m, such as 550e-9. --mask {mask_without} holds none"
+        said = f"--wavelength is missing: give it in m, such as 550e-9. --mask {mask_without} has none"
         assert said in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
 
@@ -127,7 +127,7 @@ def test_a_filter_gives_the_band_and_without_a_wavelength_its_mean(tmp_path):
     ("options", "said"),
     [
         (["--conditions.filter", "bessell-Q"], "of bessell they are bessell-U"),
-        (["--conditions.filter", "bessell-V", "--conditions.band-width", "1e-8"], "two bands: give one"),
+        (["--conditions.filter", "bessell-V", "--conditions.band-width", "1e-8"], "both given: give only one"),
         (["--conditions.filter", "twomass-Ks"], "and not the wavelength 5.5e-07 m"),
     ],
 )

@@ -101,7 +101,7 @@ def test_a_search_that_finds_no_room_is_a_row_that_says_so(tmp_path, monkeypatch
 def test_a_space_without_any_design_is_refused_before_any_work(tmp_path):
     space = replace(SMALL, n_subapertures=(3,), diameter_over_r0=(20.0,))
     with pytest.raises(
-        ValueError, match=r"no combination can be designed; the first: d/r0 is 4\.47.* at most 0\.01688"
+        ValueError, match=r"no combination can be built; the reason for the first one: d/r0 is 4\.47.* at most 0\.01688"
     ):
         design_table(space, tmp_path / "table")
     assert not (tmp_path / "table").exists()

@@ -237,6 +237,6 @@ def test_the_table_on_the_command_line(tmp_path, capsys):
     assert design_table.main(argv) == 0
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "table" / "tasks").iterdir()} == before
     assert design_table.main([*argv, "--space.diameter-over-r0", "30"]) == 1
-    assert "no combination can be designed" in capsys.readouterr().err
+    assert "no combination can be built" in capsys.readouterr().err
     assert design_table.main([*argv, "--space.exponent", "-3"]) == 1
     assert capsys.readouterr().err == "design_table: error: exponent is -3.0: it must be finite and not negative\n"

@@ -132,9 +132,9 @@ def test_files_give_it_back_to_the_last_bit(tmp_path):
     [
         ("exposure: 1", r"instrument.telescope is missing"),
         ("exposre: 1", r"unknown key instrument.exposre; known keys are instrument.telescope"),
-        ("- 1", r"instrument holds \[1\]"),
+        ("- 1", r"instrument is \[1\]"),
         ("format: torchmask mask, version 1", "it is 'torchmask mask, version 1'"),
-        ("a: [", "no valid YAML"),
+        ("a: [", "not valid YAML"),
     ],
 )
 def test_files_that_hold_none_say_why(text, said, tmp_path):

@@ -60,7 +60,7 @@ class Seeing:
 
     @property
     def speed(self) -> float:
-        """Of the wind [m/s]."""
+        """Speed of the wind [m/s]."""
         return math.hypot(*self.wind) if isinstance(self.wind, tuple | list) else float(self.wind)
 
     @property

@@ -23,25 +23,25 @@ from torchmask.record import Callback
 
 @dataclass(frozen=True, kw_only=True)
 class Options(StackOptions, RunOptions):
-    """Measure how a mask lies, turned, magnified or mirrored, on short exposures of a star or pinhole.
+    """Measure rotation, magnification and mirroring of a mask on short exposures of a star or pinhole.
 
     The exposures are an .npz file or FITS files, of one star through the mask, in any turbulence. FITS files need
-    --mask. Writes mask.json, the mask where it lies, for --mask of `torchmask restore`, and calibration.json with all
-    estimates and their errors to a new folder.
+    --mask. Writes mask.json, the mask with its measured geometry, for --mask of `torchmask restore`, and
+    calibration.json with all estimates and their errors to a new folder.
     """
 
     stacks: tyro.conf.Positional[tuple[Path, ...]] = ()
     """Exposures of the star, .npz or .fits; several FITS files are one stack."""
     pixel_fill: float | None = None
-    """Part of the area of its pitch in which a pixel is sensitive, 1 for gapless pixels; None: pixels are points."""
+    """Sensitive fraction of the area of a pixel, 1 for pixels without gaps; None: pixels are points."""
     n_modes: int = 6
-    """Zernike modes per hole of each frame, Noll 1 (piston) to this."""
+    """Number of Zernike modes per hole and frame, from Noll mode 1 (piston)."""
 
 
 def run(options: Options) -> None:
     """Measure, write and print."""
     if not options.stacks:
-        raise ValueError("there is no star to calibrate with: give .npz or FITS files")
+        raise ValueError("no exposures of a star are given: give .npz or FITS files")
     seen = read_stack(options.stacks, options)
     pixel = pixel_response(options.pixel_fill)
     with new_run("calibrate", options) as output:
@@ -50,16 +50,16 @@ def run(options: Options) -> None:
 
 
 def pixel_response(fill: float | None) -> SquarePixel | None:
-    """What --pixel-fill stands for. Raises ValueError if it is no part of the pitch's area."""
+    """Return the pixel response for --pixel-fill. Raises ValueError if it is not in (0, 1]."""
     return None if fill is None else SquarePixel(fill)
 
 
 def calibrate_on(
     star: Observation, pixel: PixelResponse | None, n_modes: int = 6, callback: Callback | None = None
 ) -> MaskCalibration:
-    """How the mask of a star's exposures lies. Raises ValueError as `calibrate_mask`, and for a full pupil."""
+    """Measure the mask's geometry on exposures of a star. Raises ValueError as `calibrate_mask` or for a full pupil."""
     if not isinstance(star.aperture, SparseAperture):
-        raise ValueError("--mask is a full pupil: only a mask can be calibrated, by its fringes")
+        raise ValueError("--mask is a full pupil: only a mask has fringes to be calibrated by")
     return calibrate_mask(
         star.frames,
         star.aperture,
@@ -73,7 +73,7 @@ def calibrate_on(
 
 
 def read_star(path: Path, options: StackOptions, pixel_fill: float | None) -> MaskCalibration:
-    """How the mask of a file with a star lies. Raises ValueError, which names --star, if it tells nothing."""
+    """Measure the mask's geometry on a file with a star. Raises ValueError, which names --star, if that fails."""
     try:
         return calibrate_on(read_stack([path], options), pixel_response(pixel_fill))
     except ValueError as error:
@@ -81,14 +81,14 @@ def read_star(path: Path, options: StackOptions, pixel_fill: float | None) -> Ma
 
 
 def write_calibration(output: Run, found: MaskCalibration, files: Sequence[Path], wavelength: float) -> None:
-    """mask.json, for the wavelength [m] of the exposures, calibration.json, and what is printed."""
+    """Write mask.json, for the wavelength [m] of the exposures, and calibration.json, and add to the summary."""
     save_json(output.directory / "mask.json", found.aperture, wavelength)
     write_json(output.directory / "calibration.json", estimates(found, files))
     output.summary.append(str(found))
 
 
 def estimates(found: MaskCalibration, files: Sequence[Path]) -> dict[str, Any]:
-    """What calibration.json says: angles in rad, places of the star in pixels."""
+    """Return the content of calibration.json, with angles in rad and positions of the star in pixels."""
     names = ("rotation", "magnification_x", "magnification_y", "shear")
     return {
         "stars": [str(file) for file in files],

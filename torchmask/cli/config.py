@@ -47,7 +47,7 @@ def load_config(path: str | Path, options: type[T], command: str) -> T:
     try:
         values = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is no valid YAML: {error}") from error
+        raise ValueError(f"{path} is not valid YAML: {error}") from error
     try:
         values = {} if values is None else values
         if not isinstance(values, dict):

@@ -30,7 +30,7 @@ from torchmask.optics.packing import hole_diameter
 from torchmask.record import Callback, Record, fan_out
 from torchmask.spectra import NoisePSD, PowerLawPSD
 
-_GROWTH, _SUCCESS = 0.01, 0.95  # of the MSE by machining errors, and the share of machined masks that stay below it
+_GROWTH, _SUCCESS = 0.01, 0.95  # tolerated growth of the MSE by machining errors, and fraction of masks below it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,39 +42,39 @@ class Options(SearchOptions, RunOptions):
     """
 
     mask_diameter: float = 1.0
-    """Of the disc that the mask is cut from, D [m]."""
+    """Diameter of the mask, D [m]."""
     wavelength: float = 550e-9
-    """Of the observation [m]."""
+    """Wavelength of the observation [m]."""
     n_photons: float = 1e7
     """Electrons per frame through the mask."""
     n_frames: int = 20
-    """Short exposures that the restoration will have."""
+    """Number of short exposures for the restoration."""
     readout_noise: float = 0.0
-    """Electrons rms per pixel and frame."""
+    """Read-out noise [electrons rms per pixel and frame]."""
     n_pixels: int = 128
-    """Of the detector's field, per side: the read-out noise counts them, not the frequencies of the criterion."""
+    """Pixels per side of the detector's field, which sets the total read-out noise; the criterion has its own grid."""
     r0: float | None = None
-    """Fried parameter of the turbulence at the wavelength [m], to warn of holes that are wider; None: no such check."""
+    """Fried parameter at the wavelength [m], to warn if holes are wider; None: no such check."""
     method: Literal["hybrid", "cma"] = "hybrid"
-    """Descents and basin hopping on a coarse grid, which finds better masks, or CMA-ES, which is published."""
+    """Search method: descents and basin hopping on a coarse grid, which finds better masks, or CMA-ES, as published."""
     min_gap: float = 0.0
-    """Solid material between any two holes, at least [m]."""
+    """Smallest width of material between two holes [m]."""
     rim_margin: float = 0.0
-    """Solid material between any hole and the rim of the mask, at least [m]."""
+    """Smallest width of material between a hole and the rim of the mask [m]."""
     central_obstruction: float = 0.0
-    """Diameter of the disc in the middle that no hole may reach [m]."""
+    """Diameter of a central disc to be kept free of holes [m]."""
     spiders: tuple[tuple[float, float, float, float, float], ...] = ()
-    """Bars that no hole may reach, five numbers each: from x y to x y, width [m]."""
+    """Bars to be kept free of holes, five numbers each: from x y to x y, width [m]."""
     keep_out: tuple[tuple[float, float, float], ...] = ()
-    """Discs that no hole may reach, three numbers each: x y of the centre, diameter [m]."""
+    """Discs to be kept free of holes, three numbers each: x y of the centre, diameter [m]."""
     scale: float = LIFE_SIZE
-    """Of the drawings, in millimetres on the plate for each metre of the pupil; 1000 is life-size."""
+    """Scale of the drawings: millimetres on the plate for each metre of the pupil; 1000 is full size."""
     seed: int = 0
-    """Of the search."""
+    """Random seed of the search."""
 
 
 def make_criterion(search: SearchOptions, grid: Grid, noise: NoisePSD, n_frames: int) -> AsymptoticMSE:
-    """The asymptotic MSE that the options ask for."""
+    """Return the asymptotic MSE for these options."""
     knee = PowerLawPSD.knee if search.knee is None else search.knee
     return AsymptoticMSE(grid, PowerLawPSD(search.exponent, noise.n_photons, knee), noise, n_frames=n_frames)
 
@@ -87,7 +87,7 @@ def search(
     callback: Callback,
     constraints: Sequence[Constraint] = (),
 ) -> SearchResult:
-    """Search as the options say."""
+    """Search for a mask with these options."""
     return search_mask(
         criterion,
         options.n_subapertures,
@@ -103,7 +103,7 @@ def search(
 
 
 def run(options: Options) -> None:
-    """Search, and write the mask; interrupted, the best mask so far."""
+    """Search, and write the mask, or the best one so far if interrupted."""
     require_wavelength(options.wavelength)
     require_scale(options.scale)
     criterion = make_criterion(
@@ -146,7 +146,7 @@ def run(options: Options) -> None:
 
 
 def constraints(options: Options) -> list[Constraint]:
-    """The rules that the options ask for beside the mask disc and the overlap."""
+    """Return the constraints of the options, in addition to those on the mask disc and on overlaps."""
     rules: list[Constraint] = []
     if options.min_gap:
         rules.append(MinimumGap(options.min_gap))
@@ -159,7 +159,7 @@ def constraints(options: Options) -> list[Constraint]:
 
 
 def warn_of_wide_holes(options: Options, r0: float) -> None:
-    """Warn where turbulence aberrates the holes, which the criterion leaves out. Raises ValueError for no r0."""
+    """Warn if holes are wider than r0, whose aberrations the criterion ignores. Raises ValueError if r0 is invalid."""
     if not (math.isfinite(r0) and r0 > 0):
         raise ValueError(f"--r0 is {r0}: it must be finite and positive, in m")
     hole = hole_diameter(options.n_subapertures, options.mask_diameter, options.fill_factor)
@@ -167,14 +167,14 @@ def warn_of_wide_holes(options: Options, r0: float) -> None:
         return
     enough = math.ceil(options.fill_factor * (options.mask_diameter / r0) ** 2 * (1 - 1e-9))
     warnings.warn(
-        f"holes of {hole:.3g} m are {hole / r0:.2f} r0 wide: turbulence aberrates each of them, while the "
-        f"criterion counts a piston for each hole and no more. At this fill factor {enough} holes are no wider than r0",
+        f"holes of {hole:.3g} m are {hole / r0:.2f} r0 wide: turbulence aberrates each of them, but the criterion "
+        f"includes only a piston for each hole. At this fill factor, {enough} holes would not be wider than r0",
         stacklevel=2,
     )
 
 
 def machining(criterion: AsymptoticMSE, aperture: SparseAperture, seed: int) -> dict[str, float]:
-    """What metrics.json says of the workshop: the rms error [m] of positions and diameter that the mask bears."""
+    """Return the machining tolerance for metrics.json: the rms error [m] of positions and diameter."""
     generator = torch.Generator().manual_seed(seed)
     found = machining_tolerance(criterion, aperture, _GROWTH, quantile=_SUCCESS, generator=generator)
     return {
@@ -186,7 +186,7 @@ def machining(criterion: AsymptoticMSE, aperture: SparseAperture, seed: int) -> 
 
 
 def metrics(result: SearchResult, criterion: AsymptoticMSE) -> dict[str, object]:
-    """What metrics.json says of a mask: errors, hole size, baselines."""
+    """Return the properties of a mask for metrics.json: errors, hole size, baselines."""
     aperture = result.aperture
     floor = float(criterion.floor(aperture.mask_diameter) / criterion.object_psd.mean())
     table: dict[str, object] = {
@@ -209,10 +209,10 @@ def _save_mask(directory: Path, aperture: SparseAperture, options: Options) -> N
 
 
 def _save_interrupted(directory: Path, options: Options, record: Record, rules: Sequence[Constraint]) -> None:
-    """The best mask so far, moved onto the rules, which a search may break by a little on its way."""
+    """Write the best mask so far, projected onto the constraints, which a running search may violate slightly."""
     diameter = hole_diameter(options.n_subapertures, options.mask_diameter, options.fill_factor)
     best = SparseAperture(record.arrays["centers"], diameter, options.mask_diameter)
     try:
         _save_mask(directory, project(best, (InsideDisc(), NoOverlap(), *rules)), options)
     except ValueError as error:  # its centres are still in the checkpoint
-        warnings.warn(f"the best mask so far is not feasible, and not written: {error}", stacklevel=2)
+        warnings.warn(f"the best mask so far is not written, because it is not feasible: {error}", stacklevel=2)

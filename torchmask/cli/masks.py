@@ -25,18 +25,18 @@ _ANY_SIZE = (1.0, 0.1)  # mask diameter [m] and fill factor at which a mask with
 
 @dataclass(frozen=True, kw_only=True)
 class Options(CatalogOptions, DebugOptions):
-    """List the catalogue of masks, or show one mask of the catalogue or of a file, and write it to a file.
+    """List the catalogue of masks, or show one mask from the catalogue or a file, and write it to a file.
 
-    A mask of the catalogue without a size of its own is shown in a disc of 1 m, at a fill factor of 0.1 where no source
-    gives the size of the holes.
+    A mask of the catalogue that has no size of its own is shown in a disc of 1 m; if no source gives the size of the
+    holes, the fill factor is 0.1.
     """
 
     name: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="NAME|FILE")] = None
-    """Mask to show: of the catalogue, or of a file (.json, .dxf, .fits); None: list the catalogue."""
+    """Mask to show, by its name in the catalogue or its file (.json, .dxf, .fits); None: list the catalogue."""
     out: Path | None = None
     """New file for the mask (.json, .dxf, .svg, .fits) or for its picture (.png)."""
     scale: float | None = None
-    """Of a drawing (.dxf, .svg), in millimetres on the plate for each metre of the pupil; None: 1000, life-size."""
+    """Scale of a drawing (.dxf, .svg): millimetres on the plate for each metre of the pupil; None: 1000, full size."""
 
 
 def run(options: Options) -> None:
@@ -50,7 +50,7 @@ def run(options: Options) -> None:
 
 
 def listing() -> str:
-    """A line for each mask of the catalogue."""
+    """Return a line for each mask of the catalogue."""
     rows = [("name", "holes", "shape", "hole [m]", "pupil [m]", "note")]
     for name in catalog.names():
         mask = catalog.entry(name)
@@ -68,7 +68,7 @@ def listing() -> str:
 
 
 def show(name: str, options: Options) -> None:
-    """Print what is known of a mask, and write it to a file if that is wanted."""
+    """Print the properties of a mask, and write it to a file if --out is given."""
     if is_mask_file(Path(name)):
         entry, aperture, wavelength = None, load_mask_file(name, options), mask_wavelength(name)
     else:
@@ -84,7 +84,7 @@ def show(name: str, options: Options) -> None:
 
 
 def _from_catalog(mask: catalog.CatalogEntry, options: Options) -> SparseAperture:
-    """As built or as the options say; what has no size of its own gets one."""
+    """Return the mask as built or as the options say, with default sizes where the catalogue has none."""
     diameter, fill = options.mask_diameter, options.fill_factor
     if mask.pupil_diameter is None:
         diameter, fill = diameter or _ANY_SIZE[0], fill or _ANY_SIZE[1]
@@ -94,7 +94,7 @@ def _from_catalog(mask: catalog.CatalogEntry, options: Options) -> SparseApertur
 
 
 def describe(aperture: SparseAperture, mask: catalog.CatalogEntry | None = None) -> str:
-    """Size, holes and baselines of a mask, and what the catalogue says of it."""
+    """Describe the size, holes and baselines of a mask, with its entry in the catalogue."""
     lines = [
         f"{'mask' if mask is None else mask.name}: {aperture.n_subapertures} {aperture.shape.plural} of "
         f"{aperture.subaperture_diameter:.4g} m in {aperture.mask_diameter:.4g} m, fill factor "
@@ -112,9 +112,9 @@ def describe(aperture: SparseAperture, mask: catalog.CatalogEntry | None = None)
 
 
 def write(path: Path, aperture: SparseAperture, scale: float | None = None, wavelength: float | None = None) -> None:
-    """Write a mask, or its picture, to a new file of the kind that the suffix says.
+    """Write a mask, or its picture, to a new file whose suffix sets the format.
 
-    `scale` is for drawings; a .json file holds the wavelength [m].
+    `scale` applies to drawings; a .json file contains the wavelength [m].
     """
     drawings = {".dxf": save_dxf, ".svg": save_svg}
     others = {".json": partial(save_json, wavelength=wavelength), ".fits": save_fits, ".png": _save_png}
@@ -124,7 +124,7 @@ def write(path: Path, aperture: SparseAperture, scale: float | None = None, wave
     elif kind not in others:
         raise ValueError(f"{path} does not end in one of {', '.join([*drawings, *others])}")
     elif scale is not None:
-        raise ValueError(f"--scale is for drawings (.dxf, .svg), and {path} is none: it holds metres in the pupil")
+        raise ValueError(f"--scale is for drawings (.dxf, .svg), but {path} is in metres in the pupil: leave it out")
     else:
         others[kind](path, aperture)
 

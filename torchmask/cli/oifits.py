@@ -20,36 +20,38 @@ FILE = "frames.oifits"
 
 @dataclass(frozen=True, kw_only=True)
 class OIFITSOptions:
-    """What the frames' visibilities depend on."""
+    """Options of the OIFITS file."""
 
     oifits: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Write the squared visibilities and closure phases of the frames, not calibrated by a star, to frames.oifits."""
+    """Write the frames' squared visibilities and closure phases, not calibrated by a star, to frames.oifits."""
     bandwidth: float | None = None
     """Width of the band for the OIFITS file [m]; None: that of the FILTER in the header."""
 
 
 def measure_frames(observation: Observation, options: OIFITSOptions, sky: float = 0.0) -> Observables | None:
-    """The frames' observables, without a sky [electrons per pixel] that is known; None if --oifits was not given.
+    """Return the frames' observables, after subtracting a sky [electrons per pixel]; None if --oifits was not given.
 
-    Raises ValueError if the band's width is not known or cannot be, or the mask's fringes cannot be told apart.
+    Raises ValueError if the width of the band is unknown or invalid, or the mask's fringes overlap too much.
     """
     if not options.oifits:
         return None
     width = options.bandwidth
     if width is None and filter_of_header(observation.header) is None:
-        raise ValueError("--oifits needs the width of the band, and no FILTER tells it: give --bandwidth [m]")
+        raise ValueError(
+            "--oifits needs the width of the band, but the header has no known FILTER: give --bandwidth [m]"
+        )
     if width is not None and not (math.isfinite(width) and width > 0):
         raise ValueError(f"--bandwidth is {width:g}: it must be finite and positive, in m")
     readout = observation.readout_noise
     if readout is not None:
-        readout = math.hypot(readout, math.sqrt(sky))  # a sky that is taken off leaves its noise
+        readout = math.hypot(readout, math.sqrt(sky))  # a subtracted sky leaves its noise
     return frame_observables(dataclasses.replace(observation, frames=observation.frames - sky, readout_noise=readout))
 
 
 def write_frames(
     folder: Path, observables: Observables | None, observation: Observation, options: OIFITSOptions
 ) -> list[str]:
-    """Write the file if there is something to write; the line that a summary says of it."""
+    """Write the file if there are observables, and return the line for the summary."""
     if observables is None:
         return []
     save_oifits(folder / FILE, observables, observation, options.bandwidth)

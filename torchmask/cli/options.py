@@ -1,4 +1,4 @@
-"""Options that several commands share. The text below each is its help."""
+"""Options shared by several commands. The text below each option is its help."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from torchmask.optics.overlaps import check_overlaps
 from torchmask.optics.passband import Passband
 from torchmask.record import Callback
 
-FULL = "full"  # what stands for a full pupil among the names of masks
+FULL = "full"  # name of a full pupil
 MASK_SUFFIXES = (".json", ".dxf", ".fits")
 
 
@@ -26,7 +26,7 @@ class DebugOptions:
     """How errors are shown."""
 
     debug: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Show where an error comes from, with its traceback."""
+    """Show the traceback of an error."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +34,7 @@ class ConfigOptions(DebugOptions):
     """Where options come from."""
 
     config: Path | None = None
-    """A config.yaml that an earlier run wrote: its values stand for all options not given here."""
+    """config.yaml of an earlier run, whose values are used for all options not given here."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,28 +42,28 @@ class RunOptions(ConfigOptions):
     """Where results go."""
 
     out: Path | None = None
-    """New folder for the results, for instance runs/first; None: runs/COMMAND-date-time."""
+    """New folder for the results, such as runs/first; None: runs/COMMAND-date-time."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExperimentOptions(RunOptions):
-    """Whether it is in earnest."""
+    """Options of an experiment."""
 
     smoke: bool = False
-    """Everything tiny, to see that it runs."""
+    """Run with everything tiny, to test that it works."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class WorkerOptions:
-    """Where tasks are done."""
+    """Where tasks run."""
 
     workers: int | None = None
-    """Processes at a time; None: one per core."""
+    """Number of processes at a time; None: one per core."""
     backend: Literal["loky", "ray"] = "loky"
-    """This machine or a Ray cluster."""
+    """Where tasks run: loky for this machine, ray for a Ray cluster."""
 
     def keywords(self, callback: Callback) -> dict[str, Any]:
-        """The same as `run_tasks` and `design_table` call it."""
+        """Return the arguments for `run_tasks` and `design_table`."""
         return {"n_workers": self.workers, "backend": self.backend, "callback": callback}
 
 
@@ -72,11 +72,11 @@ class SweepOptions(WorkerOptions, ExperimentOptions):
     """An experiment of many independent tasks."""
 
     sweep: Path = Path("runs/sweep")
-    """Where finished tasks are kept: a run that was stopped goes on from there, and others share what they have."""
+    """Folder for finished tasks, from which an interrupted run continues and which other runs share."""
 
 
 def require_wavelength(metres: float, option: str = "--wavelength") -> None:
-    """Raise ValueError unless this is a wavelength of light in metres: says so where it looks like another unit."""
+    """Raise ValueError unless this is a wavelength of light in metres; the message recognises other units."""
     if 1e-8 <= metres <= 1e-2:
         return
     meant = ""
@@ -87,7 +87,7 @@ def require_wavelength(metres: float, option: str = "--wavelength") -> None:
 
 
 def pixel_angle(arcsec: float | None) -> float | None:
-    """The angle of --pixel-scale-arcsec [rad]. Raises ValueError, in arcsec, unless it is finite and positive."""
+    """Return the angle of --pixel-scale-arcsec [rad]. Raises ValueError unless it is finite and positive."""
     if arcsec is None:
         return None
     if not (math.isfinite(arcsec) and arcsec > 0):
@@ -97,15 +97,15 @@ def pixel_angle(arcsec: float | None) -> float | None:
 
 @dataclass(frozen=True, kw_only=True)
 class FilterOptions:
-    """A broad band by its filter."""
+    """A broad band, given by a filter."""
 
     filter: str | None = None
-    """Its name (bessell-V, twomass-Ks, ...), or a text file of two columns: wavelength [m] and transmission."""
+    """Filter, by its name (bessell-V, twomass-Ks, ...) or a text file with columns wavelength [m] and transmission."""
     n_wavelengths: int = 5
-    """That stand for the band: 3 are enough for a width of 5 percent of the wavelength, 5 for 15."""
+    """Number of wavelengths that represent the band: 3 suffice for a width of 5 percent of the wavelength, 5 for 15."""
 
     def filter_band(self, wavelength: float) -> Band | None:
-        """What stands for the filter, None without one. Raises ValueError if it does not pass `wavelength` [m]."""
+        """Return the band of the filter, None without one. Raises ValueError if it does not pass `wavelength` [m]."""
         if self.filter is None:
             return None
         passband = Passband.find(self.filter)
@@ -120,20 +120,20 @@ class FilterOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class BandOptions(FilterOptions):
-    """A broad band, by its filter or as it is."""
+    """A broad band, given by a filter or by wavelengths."""
 
     wavelengths: tuple[float, ...] = ()
-    """A broad band as a few wavelengths, in place of a filter [m]; none: the filter, or --wavelength alone."""
+    """Wavelengths that represent a broad band, instead of a filter [m]; default: the filter, or --wavelength alone."""
     weights: tuple[float, ...] = ()
-    """Share of the light of each of them, any positive numbers; none: equal."""
+    """Relative amount of light at each of --wavelengths, any positive numbers; default: equal."""
 
     def band(self, wavelength: float) -> dict[str, Any]:
-        """The band as `MyopicDeconvolution` takes it. Raises ValueError for two bands, and for a filter elsewhere."""
+        """Return the band as `MyopicDeconvolution` takes it. Raises ValueError for two bands or another filter."""
         band = self.filter_band(wavelength)
         if band is None:
             return {"wavelengths": self.wavelengths or None, "weights": self.weights or None}
         if self.wavelengths or self.weights:
-            raise ValueError("--filter and --wavelengths are two bands: give one")
+            raise ValueError("--filter and --wavelengths are both given: give only one of them")
         return {"wavelengths": band.wavelengths, "weights": band.shares}
 
 
@@ -144,34 +144,34 @@ class SearchOptions:
     n_subapertures: int = 11
     """Number of holes, N."""
     fill_factor: float = 0.15
-    """Collecting area N d^2 / D^2, of holes of diameter d in a mask of diameter D."""
+    """Fill factor N d^2 / D^2, of holes of diameter d in a mask of diameter D."""
     method: Literal["cma", "hybrid"] = "cma"
-    """CMA-ES, or descents and basin hopping on a coarse grid, which finds better masks."""
+    """Search method: CMA-ES, or descents and basin hopping on a coarse grid, which finds better masks."""
     refine: bool = True
-    """Refine the result by gradient descent through the same criterion."""
+    """Refine the result by gradient descent on the same criterion."""
     budget: int | None = None
     """Evaluations of the criterion; None: 20000 for cma, 100000 for hybrid (minutes), fewer above 11 holes."""
     n_frequencies: int = 256
-    """Frequency grid of the criterion, per side."""
+    """Frequencies per side of the criterion's grid."""
     exponent: float = 1.5
-    """Of the power-law power spectrum of the object."""
+    """Exponent of the object's power-law power spectrum."""
     knee: float | None = None
-    """Frequency below which that spectrum is flat [cycles/pixel]: one over the object's size in pixels; None: 1/64, or
-    that of the scene which `codesign` simulates."""
+    """Frequency below which that spectrum is flat [cycles/pixel], one over the object's size in pixels; None: 1/64, or
+    that of the scene that `codesign` simulates."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CatalogOptions:
-    """How a mask is taken from the catalogue, and whether one with overlapping holes may be."""
+    """Size of a mask from the catalogue, and whether its holes may overlap."""
 
     mask_diameter: float | None = None
-    """D of a mask from the catalogue [m]; None: as built."""
+    """Diameter D of a mask from the catalogue [m]; None: as built."""
     fill_factor: float | None = None
-    """Collecting area N d^2 / D^2 of a mask from the catalogue; None: as built. Golay arrays need both."""
+    """Fill factor N d^2 / D^2 of a mask from the catalogue; None: as built. Golay arrays need diameter and factor."""
     mirrored: bool = False
     """Reverse x of a mask from the catalogue, for instruments that look from the other side."""
     allow_overlap: bool = False
-    """Take a mask whose holes overlap, as those of some real masks do; models count the light twice there."""
+    """Accept a mask whose holes overlap, as in some real masks; models count the light in overlaps twice."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,15 +179,15 @@ class MaskOptions(CatalogOptions):
     """The aperture."""
 
     mask: Annotated[Path | None, tyro.conf.arg(metavar="FILE|NAME|full")] = None
-    """Mask file (.json, .dxf, .fits), name from `torchmask masks`, or `full`: a full pupil of --mask-diameter."""
+    """Mask file (.json, .dxf, .fits), name from `torchmask masks`, or `full` for a full pupil of --mask-diameter."""
     mask_diameter: float | None = None
-    """D, of a mask from the catalogue or of a full pupil [m]; None: as built."""
+    """Diameter D of a mask from the catalogue or of a full pupil [m]; None: as built."""
     central_obstruction: float = 0.0
-    """Diameter of the disc that is blocked in the middle of a full pupil [m]."""
+    """Diameter of the central obstruction of a full pupil [m]."""
 
 
 def load_aperture(options: MaskOptions) -> Aperture:
-    """The aperture that `options.mask` names, float64. Raises ValueError for what is unknown, missing or of no use."""
+    """Return the aperture of `options.mask`, float64. Raises ValueError if it is missing, unknown or invalid."""
     if options.mask is None:
         raise ValueError(
             f"--mask is missing: give a mask file ({', '.join(MASK_SUFFIXES)}), a name from `torchmask masks`, or "
@@ -197,7 +197,7 @@ def load_aperture(options: MaskOptions) -> Aperture:
     if name == FULL:
         if options.mask_diameter is None:
             raise ValueError("a full pupil needs --mask-diameter [m]")
-        FullAperture(options.mask_diameter)  # raises for a diameter that nothing can be divided by
+        FullAperture(options.mask_diameter)  # raises for an invalid diameter, before it is divided by
         if not 0 <= options.central_obstruction < options.mask_diameter:
             raise ValueError(
                 f"--central-obstruction is {options.central_obstruction:g} m: it must be at least 0 and less than "
@@ -205,7 +205,7 @@ def load_aperture(options: MaskOptions) -> Aperture:
             )
         return FullAperture(options.mask_diameter, options.central_obstruction / options.mask_diameter)
     if options.central_obstruction:
-        raise ValueError("--central-obstruction is for a full pupil (--mask full); a mask has the holes that it has")
+        raise ValueError("--central-obstruction is for a full pupil (--mask full): leave it out for a mask")
     if is_mask_file(options.mask):
         return require_apart(name, load_mask_file(options.mask, options), options.allow_overlap)
     try:
@@ -216,17 +216,17 @@ def load_aperture(options: MaskOptions) -> Aperture:
 
 
 def told_wavelength(options: MaskOptions) -> float | None:
-    """The wavelength [m] that the file of the mask holds; None for a mask without one."""
+    """Return the wavelength [m] in the file of the mask, or None if it has none."""
     return mask_wavelength(options.mask) if options.mask is not None and is_mask_file(options.mask) else None
 
 
 def is_mask_file(path: Path) -> bool:
-    """Whether a file is meant, and not a mask of the catalogue."""
+    """Return whether `path` is a file rather than a name in the catalogue."""
     return path.is_file() or path.suffix.lower() in MASK_SUFFIXES
 
 
 def load_mask_file(path: str | Path, options: CatalogOptions) -> SparseAperture:
-    """The mask of a file. Raises ValueError for options that are for masks of the catalogue."""
+    """Return the mask in a file. Raises ValueError if options for masks of the catalogue are given."""
     if options.mask_diameter is not None or options.fill_factor is not None or options.mirrored:
         raise ValueError(
             f"--mask-diameter, --fill-factor and --mirrored are for masks from the catalogue: {path} is a file"
@@ -235,10 +235,10 @@ def load_mask_file(path: str | Path, options: CatalogOptions) -> SparseAperture:
 
 
 def require_apart(name: str, mask: SparseAperture, allow_overlap: bool) -> SparseAperture:
-    """The mask itself. Raises ValueError if its holes overlap, unless that is asked for."""
+    """Return the mask, or raise ValueError if its holes overlap, unless that is allowed."""
     if not allow_overlap:
         try:
             check_overlaps(mask)
         except ValueError as error:
-            raise ValueError(f"{name}: {error}; if it is to be so, --allow-overlap takes it") from error
+            raise ValueError(f"{name}: {error}; give --allow-overlap to accept it") from error
     return mask

@@ -47,12 +47,12 @@ def run_script(
     Parameters
     ----------
     name : str
-        Of the script: it begins every message, and stands in its config files.
+        Name of the script, which begins every message and is stored in its config files.
     run : callable
-        Does the work, and may return an exit status. What it raises as ValueError or OSError is a mistake of the
-        user's, and becomes one line.
+        Function that does the work and may return an exit status. ValueError and OSError are taken as mistakes of the
+        user and shown as one line.
     options : type
-        Dataclass whose fields are the options; those of `torchmask.cli.options` bring --config, --debug and --out.
+        Dataclass whose fields are the options; those of `torchmask.cli.options` add --config, --debug and --out.
     description : str, optional
         Heads the help, usually the docstring of the script.
     argv : sequence of str, optional

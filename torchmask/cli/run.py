@@ -27,12 +27,12 @@ CHECKPOINT = "resume.npz"  # of a run that can go on from there
 
 @dataclass(frozen=True)
 class Run:
-    """Where a program writes, and to whom its algorithms speak.
+    """Output of a run.
 
-    directory : of the results
-    logger : TensorBoard and metrics.jsonl
-    callback : for the algorithms
-    summary : lines that are printed at the end, when no progress bar is in their way
+    directory : folder of the results
+    logger : writer of TensorBoard events and metrics.jsonl
+    callback : callback for the algorithms
+    summary : lines that are printed at the end, after the progress bars
     """
 
     directory: Path

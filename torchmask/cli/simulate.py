@@ -37,21 +37,21 @@ from torchmask.simulation.wavefronts import Turbulence
 
 @dataclass(frozen=True)
 class TurbulenceOptions:
-    """The turbulence in height and time."""
+    """Layers, wind and timing of the turbulence."""
 
     profile: str | None = None
-    """Layers in height: hv57, las_campanas or mauna_kea, at the zenith. None: all turbulence at the pupil."""
+    """Profile of layers at the zenith: hv57, las_campanas or mauna_kea; None: all turbulence at the pupil."""
     layers: int = 8
-    """Into which the profile is grouped; theta0 and tau0 do not depend on it."""
+    """Number of layers into which the profile is grouped; theta0 and tau0 do not depend on it."""
     wind: tuple[float, float] | None = None
-    """Speed towards +x and +y, in place of those of a profile [m/s]; None: no wind without a profile."""
+    """Wind speed towards +x and +y [m/s]; None: the winds of the profile, or no wind without one."""
     frame_interval: float | None = None
-    """From the start of one frame to the next, of turbulence that drifts by [s]; None: all frames independent."""
+    """Time from the start of one frame to the next [s], for drifting turbulence; None: independent frames."""
     exposure_time: float = 0.0
-    """Of a frame [s]; needs a wind."""
+    """Exposure time of a frame [s]; needs a wind."""
 
     def make(self, r0: float | None, wavelength: float, outer_scale: float) -> Turbulence:
-        """The turbulence with Fried parameter `r0` [m]; None: that of the profile, or no turbulence."""
+        """Return the turbulence with Fried parameter `r0` [m]; None means that of the profile, or no turbulence."""
         if self.profile is not None:
             layers = named_layers(self.profile, self.layers)
             if r0 is not None or self.wind is not None:
@@ -72,25 +72,25 @@ class TurbulenceOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ConditionOptions(FilterOptions):
-    """What else the frames show."""
+    """Observing conditions: sky, clouds, band and pixels."""
 
     sky: float = 0.0
-    """Electrons per pixel and frame."""
+    """Sky background [electrons per pixel and frame]."""
     transparency_scatter: float = 0.0
-    """Of clouds: standard deviation of the logarithm of each frame's transmission."""
+    """Standard deviation of the logarithm of each frame's transmission, due to clouds."""
     band_width: float = 0.0
-    """Of a band of even transmission around the wavelength, in place of a filter [m]; 0: one wavelength."""
+    """Width of a top-hat band around the wavelength, instead of a filter [m]; 0: one wavelength."""
     pixel_fill_factor: float = 0.0
-    """Sensitive part of the area of a square pixel, at most 1; 0: pixels are points."""
+    """Sensitive fraction of the area of a square pixel, at most 1; 0: pixels are points."""
 
     def make(self, exposure_time: float, wavelength: float) -> Conditions:
-        """The same as `simulate_observation` takes them. Raises ValueError for what cannot be, in these units."""
+        """Return the conditions for `simulate_observation`. Raises ValueError if a value is out of range."""
         if not (math.isfinite(self.band_width) and 0 <= self.band_width < 2 * wavelength):
             raise ValueError(
                 f"--conditions.band-width is {self.band_width}: it must be at least 0 m and below twice the wavelength"
             )
         if self.band_width and self.filter is not None:
-            raise ValueError("--conditions.band-width and --conditions.filter are two bands: give one")
+            raise ValueError("--conditions.band-width and --conditions.filter are both given: give only one of them")
         even = Band.top_hat(wavelength, self.band_width, self.n_wavelengths) if self.band_width else None
         return Conditions(
             sky=self.sky,
@@ -103,15 +103,15 @@ class ConditionOptions(FilterOptions):
 
 @dataclass(frozen=True)
 class TrueMaskOptions:
-    """How the mask lies otherwise than told: the stack names the mask as told, and holds the true one as a truth."""
+    """Error of the mask's position: frames are taken through a mask that differs from the one named in the stack."""
 
     rotation_deg: float = 0.0
-    """From x to y [degrees]."""
+    """Rotation of the mask from x to y [degrees]."""
     magnification: float = 1.0
-    """Of positions and holes."""
+    """Magnification of the positions and sizes of the holes."""
 
     def apply(self, aperture: Aperture) -> Aperture | None:
-        """The true mask; None where it is as told. Raises ValueError for a full pupil."""
+        """Return the true mask, or None if it does not differ. Raises ValueError for a full pupil."""
         if self == TrueMaskOptions():
             return None
         if not isinstance(aperture, SparseAperture):
@@ -122,42 +122,42 @@ class TrueMaskOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class Options(MaskOptions, RunOptions):
-    """Draw short exposures of a scene through a mask and turbulence, with photon and read-out noise.
+    """Simulate short exposures of a scene through a mask and turbulence, with photon and read-out noise.
 
-    Writes stack.npz (for `torchmask restore`; it holds the truth too), figures, config.yaml and the log to a new
+    Writes stack.npz (for `torchmask restore`; it also contains the truth), figures, config.yaml and the log to a new
     folder.
     """
 
     scene: SceneOptions = field(default_factory=SceneOptions)
     """The target."""
     wavelength: float | None = None
-    """Of the observation [m]; None: the mean of the filter, or that which the mask was designed for (its .json)."""
+    """Wavelength of the observation [m]; None: the mean of the filter, or else that of the mask's .json file."""
     n_pixels: int = 128
-    """Of the image, per side."""
+    """Pixels per side of the image."""
     pixel_scale_arcsec: float | None = None
     """Angle on the sky of one pixel [arcsec]; None: the largest without aliasing at the shortest wavelength."""
     r0: float | None = 0.15
-    """Fried parameter of the turbulence at the wavelength [m]; None: that of the profile, without one no turbulence."""
+    """Fried parameter of the turbulence at the wavelength [m]; None: that of the profile, or no turbulence."""
     outer_scale: float = 20.0
-    """Of the turbulence [m]."""
+    """Outer scale of the turbulence [m]."""
     turbulence: TurbulenceOptions = field(default_factory=TurbulenceOptions)
-    """In height and time."""
+    """Layers, wind and timing."""
     conditions: ConditionOptions = field(default_factory=ConditionOptions)
     """Sky, clouds, filter and pixels."""
     true_mask: TrueMaskOptions = field(default_factory=TrueMaskOptions)
-    """Otherwise than told."""
+    """Error of the mask's position."""
     n_frames: int = 20
-    """Short exposures."""
+    """Number of short exposures."""
     n_photons: float = 1e7
-    """Electrons per frame through the mask, before light leaves the field."""
+    """Electrons per frame through the mask, including light that falls outside the field."""
     readout_noise: float = 1.5
-    """Electrons rms per pixel and frame."""
+    """Read-out noise [electrons rms per pixel and frame]."""
     seed: int = 0
-    """Of the turbulence and the noise."""
+    """Random seed of the turbulence and the noise."""
 
 
 def observing_wavelength(options: Options) -> float:
-    """The wavelength [m] that is given, or else the filter's or the mask's. Raises ValueError if there is none."""
+    """Return the wavelength [m]: --wavelength, else that of the filter or the mask; ValueError if none is known."""
     if options.wavelength is not None:
         require_wavelength(options.wavelength)
         return options.wavelength
@@ -166,7 +166,7 @@ def observing_wavelength(options: Options) -> float:
     told = told_wavelength(options)
     if told is None:
         raise ValueError(
-            f"--wavelength is missing: give it in m, such as 550e-9. --mask {options.mask} holds none, "
+            f"--wavelength is missing: give it in m, such as 550e-9. --mask {options.mask} has none, "
             "unlike the mask.json of `torchmask design`"
         )
     return told

@@ -1,4 +1,4 @@
-"""Reading a stack of exposures, with what the options say in place of what its files say."""
+"""Reading a stack of exposures, with options that override what its files say."""
 
 from __future__ import annotations
 
@@ -21,50 +21,50 @@ from torchmask.restoration.noise import check_errors
 
 @dataclass(frozen=True)
 class FITSOptions:
-    """What the header of a FITS file may lack, and calibration. What is given wins over the header."""
+    """Values that the header of a FITS file may lack, over which they take precedence, and calibration."""
 
     unit: str | None = None
-    """Such as "adu", "electron / s" or "250 electron"; None: from the header (BUNIT), or else adu."""
+    """Unit of the pixels, such as "adu", "electron / s" or "250 electron"; None: from the header (BUNIT), else adu."""
     gain: float | None = None
-    """Electrons per adu; None: from the header (EGAIN, GAIN)."""
+    """Gain [electrons per adu]; None: from the header (EGAIN, GAIN)."""
     exposure_time: float | None = None
-    """Of one frame [s], for units per second; None: from the header."""
+    """Exposure time of one frame [s], for units per second; None: from the header."""
     saturation: float | None = None
-    """Value in the file from which on a pixel is full, in its unit; None: from the header (SATURATE, FULLWELL)."""
+    """Value in the file, in its unit, at which pixels saturate; None: from the header (SATURATE, FULLWELL)."""
     dark: Path | None = None
-    """FITS image that is subtracted, in the units of the files."""
+    """FITS image to subtract, in the units of the files."""
     flat: Path | None = None
     """FITS image to divide by, of any scale."""
     bad_pixels: Path | None = None
-    """FITS image, not 0 where a pixel is bad."""
+    """FITS image that is not 0 where a pixel is bad."""
     crop: int | None = None
-    """Side of the field that is cut out around the target [pixels]; None: all of the image."""
+    """Side of the field to cut out around the target [pixels]; None: the whole image."""
     target: tuple[int, int] | None = None
     """Pixel of the target in every file: row column, counted from 0; None: where the mean frame is brightest."""
     keep: float | None = None
     """Fraction of the frames to keep, the best ones; None: all."""
     keep_by: Literal["sharpness", "flux"] = "sharpness"
-    """What makes a frame good."""
+    """Quantity by which the best frames are chosen."""
 
 
 @dataclass(frozen=True)
 class StackOptions(MaskOptions, FITSOptions):
-    """What an observer may know better than the files."""
+    """Options that override what the files say."""
 
     wavelength: float | None = None
-    """Of the observation [m]; None: as the file says, or else the .json file of the mask."""
+    """Wavelength of the observation [m]; None: from the file, or else from the mask's .json file."""
     pixel_scale_arcsec: float | None = None
-    """Angle on the sky of one pixel [arcsec]; None: as the file says."""
+    """Angle on the sky of one pixel [arcsec]; None: from the file."""
     readout_noise: float | None = None
-    """Electrons rms per pixel and frame; None: as the file says, or else measured on the frames."""
+    """Read-out noise [electrons rms per pixel and frame]; None: from the file, or else measured on the frames."""
     skip: tuple[int, ...] = ()
     """Frames to leave out, counted from 0 through all files of a stack."""
     errors: bool = True
-    """Weigh pixels by the standard deviations in the file (FITS extension ERR), where it has them."""
+    """Weight pixels by the standard deviations in the file (FITS extension ERR), if it has them."""
 
 
 def group_files(files: Sequence[Path], join: bool) -> dict[str, list[Path]]:
-    """Stacks and their files, by names that differ: those of the (first) file, with a number if it stands twice."""
+    """Return the files of each stack by a unique name: that of the (first) file, with a number if it occurs twice."""
     groups = [list(files)] if join and files else [[file] for file in files]
     named: dict[str, list[Path]] = {}
     for group in groups:
@@ -77,7 +77,7 @@ def group_files(files: Sequence[Path], join: bool) -> dict[str, list[Path]]:
 
 
 def read_stack(files: Sequence[Path], options: StackOptions) -> Observation:
-    """One stack: an .npz file, or FITS files that belong together. Raises ValueError for what is missing or wrong."""
+    """Read one stack: an .npz file, or FITS files that belong together. Raises ValueError if it cannot be used."""
     if options.wavelength is not None:
         require_wavelength(options.wavelength)
     observation = _read(files, options)
@@ -86,7 +86,7 @@ def read_stack(files: Sequence[Path], options: StackOptions) -> Observation:
     try:
         check_errors(observation.errors, *check_frames(observation.frames, observation.valid, observation.grid))
     except ValueError as error:
-        raise ValueError(f"{files[0]}: {error}; or give --no-errors, and all pixels count alike") from error
+        raise ValueError(f"{files[0]}: {error}; or give --no-errors to weight all pixels equally") from error
     return observation
 
 
@@ -94,10 +94,12 @@ def _read(files: Sequence[Path], options: StackOptions) -> Observation:
     if files[0].suffix.lower() != ".npz":
         return _from_fits(files, options)
     if len(files) > 1:
-        raise ValueError(f"--join is for FITS files; {files[0]} is a stack by itself")
+        raise ValueError(f"--join is for FITS files, but {files[0]} is a stack by itself: leave it out")
     for item in dataclasses.fields(FITSOptions):
         if getattr(options, item.name) != item.default:
-            raise ValueError(f"--{item.name.replace('_', '-')} is for FITS files; {files[0]} is none")
+            raise ValueError(
+                f"--{item.name.replace('_', '-')} is for FITS files, but {files[0]} is not one: leave it out"
+            )
     observation = Observation.load(files[0])
     grid, scale = observation.grid, pixel_angle(options.pixel_scale_arcsec)
     changes: dict[str, Any] = {
@@ -111,7 +113,7 @@ def _read(files: Sequence[Path], options: StackOptions) -> Observation:
 
 
 def _usable(observation: Observation, path: Path, options: StackOptions) -> Observation:
-    """The frames that are not skipped and hold light."""
+    """Return the observation with the frames that hold light and are not skipped."""
     frames = observation.frames
     valid = torch.isfinite(frames) if observation.valid is None else observation.valid.expand_as(frames)
     try:
@@ -121,12 +123,12 @@ def _usable(observation: Observation, path: Path, options: StackOptions) -> Obse
 
 
 def _as_option(message: str) -> str:
-    """A message that begins with the name of `skip`, as the command line calls it."""
+    """Replace `skip` at the beginning of a message by the name of the option."""
     return re.sub(r"^skip", "--skip", message)
 
 
 def _from_fits(files: Sequence[Path], options: StackOptions) -> Observation:
-    """Read FITS files; what their header lacks is named as the option of the command line that supplies it."""
+    """Read FITS files. Errors about missing keywords name the command-line options to give instead."""
     aperture = load_aperture(options)
     scale = pixel_angle(options.pixel_scale_arcsec)
     given = {item.name: getattr(options, item.name) for item in dataclasses.fields(FITSOptions)}

@@ -1,8 +1,8 @@
-"""MSE_a: the error of the best linear restoration from many short exposures, in closed form and without an image.
+"""MSE_a, the error of the best linear restoration from many short exposures, in closed form and without an image.
 
-Every sub-aperture carries an independent uniform piston, so the expected squared transfer function of the mask is the
-sum over its baselines of the squared OTF of one sub-aperture. That sum has compact terms, and it is even in nu: each
-unordered pair of sub-apertures leaves one small patch of pixels on half the frequency plane.
+Every sub-aperture has an independent uniform piston, so the expected squared transfer function of the mask is the sum
+over its baselines of the squared OTF of one sub-aperture. The terms of that sum are compact and the sum is even in nu,
+so each unordered pair of sub-apertures contributes one small patch of pixels on half the frequency plane.
 """
 
 from __future__ import annotations
@@ -32,26 +32,28 @@ class AsymptoticMSE(nn.Module):
     Parameters
     ----------
     grid : Grid
-        Its frequencies are where the integral is sampled. It must resolve h: at least 256 pixels for a result to quote.
-    object_psd, noise_psd : callable or Tensor
-        psd(grid, dtype, device) such as `PowerLawPSD` and `NoisePSD`, or a tensor that broadcasts to (H, W) in FFT
-        order. They need not be symmetric. The object's must be at least 0, the noise's positive.
+        Grid at whose frequencies the integral is sampled. It must resolve h: use at least 256 pixels for final results.
+    object_psd : callable or Tensor
+        PSD of the object, at least 0: a function psd(grid, dtype, device) such as `PowerLawPSD`, or a tensor that
+        broadcasts to (H, W) in FFT order. It need not be symmetric.
+    noise_psd : callable or Tensor
+        PSD of the noise, positive, such as `NoisePSD`.
     n_frames : int
         Number of exposures, K.
 
     Raises
     ------
     ValueError, TypeError
-        For PSDs of a wrong shape, sign or type, and for `n_frames` below 1.
+        If a PSD has a wrong shape, sign or type, or `n_frames` is below 1.
 
     Notes
     -----
     `forward(aperture)` returns (...), one value for each mask of the population `aperture.centers` (..., N, 2), in
-    the dtype of the centres (float64 or float32) and differentiable once in them. Cost grows with the G^2 pixels of
-    the grid and the 2 N^2 c^2 G^2 of the patches, c = diameter of a sub-aperture / grid.period; a large population is
-    treated in chunks, so that memory does not. It raises ValueError for a full pupil and for c > 1/2. Under
-    `torch.func.vmap` over centres, what is mapped over is one more axis of the population. On CUDA equal calls may
-    differ by rounding (atomic sums).
+    the dtype of the centres (float64 or float32) and differentiable once in them. Computing time grows with the G^2
+    pixels of the grid and the 2 N^2 c^2 G^2 pixels of the patches, c = diameter of a sub-aperture / grid.period; large
+    populations are split into chunks to limit memory. It raises ValueError for a full pupil and for c > 1/2. With
+    `torch.func.vmap` over centres, the mapped axis is one more axis of the population. On CUDA equal calls may differ
+    by rounding (atomic sums).
 
     Examples
     --------
@@ -79,16 +81,16 @@ class AsymptoticMSE(nn.Module):
         self.register_buffer("object_psd", evaluate_psd(object_psd, grid, "object_psd"))
         self.register_buffer("noise_psd", evaluate_psd(noise_psd, grid, "noise_psd"))
         if not bool((self.noise_psd > 0).all()):
-            raise ValueError("noise_psd is 0 somewhere: without noise the error is 0 wherever light comes through")
+            raise ValueError("noise_psd is 0 somewhere: it must be positive, or the error would be 0 there")
         if not bool((self.object_psd > 0).any()):
             raise ValueError("object_psd is 0 everywhere: there is nothing to restore")
         self._pack()
         self.register_load_state_dict_post_hook(_pack_again)
 
     def _pack(self) -> None:
-        """Write MSE_a as the sum of weight / (transfer + ratio) over half the frequency plane.
+        """Precompute weight and ratio, so that MSE_a is the sum of weight / (transfer + ratio) over half the plane.
 
-        A frequency and its opposite see the same transfer; two layers hold them where the PSDs differ there.
+        A frequency and its negative have the same transfer. If the PSDs differ there, they are kept in two layers.
         """
         rows, columns = self.grid.shape
         height = rows // 2 + 1
@@ -108,7 +110,7 @@ class AsymptoticMSE(nn.Module):
 
     def forward(self, aperture: Aperture) -> Tensor:
         if not isinstance(aperture, Aperture):
-            raise TypeError(f"aperture is a {type(aperture).__name__}: make a SparseAperture of the centres")
+            raise TypeError(f"aperture is a {type(aperture).__name__}: make a SparseAperture from the centres")
         centers = aperture.centers
         geometry = self._geometry(aperture)
         flat = centers.reshape(math.prod(centers.shape[:-2]), *centers.shape[-2:])
@@ -116,11 +118,11 @@ class AsymptoticMSE(nn.Module):
         return baseline_mse(flat, weight, ratio, geometry).reshape(centers.shape[:-2])
 
     def relative(self, aperture: Aperture) -> Tensor:
-        """MSE_a over the mean of the object's PSD, (...): 0 is a perfect restoration, 1 none at all."""
+        """Return MSE_a over the mean of the object's PSD, (...): 0 is a perfect restoration, 1 none at all."""
         return self(aperture) / self.object_psd.mean().to(aperture.centers.dtype)
 
     def floor(self, mask_diameter: float) -> Tensor:
-        """The part of MSE_a that no mask of `mask_diameter` [m] can change, a scalar: S_o beyond the mask's reach."""
+        """Return the part of MSE_a () that no mask of `mask_diameter` [m] can change: S_o beyond its cut-off."""
         if not (math.isfinite(mask_diameter) and mask_diameter > 0):
             raise ValueError(f"mask_diameter is {mask_diameter}: it must be finite and positive, in m")
         nu_y, nu_x = self.grid.frequencies(self.object_psd.dtype, self.object_psd.device)
@@ -128,10 +130,10 @@ class AsymptoticMSE(nn.Module):
         return (self.object_psd * beyond).mean()
 
     def on_grid(self, n_pixels: int | tuple[int, int]) -> Self:
-        """The same criterion with the integral sampled on another grid of the same pixel scale.
+        """Return the same criterion with its integral sampled on another grid of the same pixel scale.
 
-        For searches, which a coarse grid makes fast. The image stays what it was: the noise keeps its level, also its
-        read-out part. A callable object PSD is evaluated anew; tensors are interpolated (`resample_psd`).
+        A coarse grid makes searches fast. The image does not change: the noise keeps its level, including the read-out
+        noise. A callable object PSD is evaluated again; tensors are interpolated (`resample_psd`).
         """
         grid = replace(self.grid, n_pixels=n_pixels)
         noise = resample_psd(self.noise_psd, grid.shape)
@@ -139,14 +141,14 @@ class AsymptoticMSE(nn.Module):
         return self._like(grid, model, noise).to(self.object_psd.device, self.object_psd.dtype)
 
     def _like(self, grid: Grid, object_psd: PSD, noise_psd: PSD) -> Self:
-        """The same criterion but for these."""
+        """Return the same criterion with another grid and other PSDs."""
         return type(self)(grid, object_psd, noise_psd, self.n_frames)
 
     def _geometry(self, aperture: Aperture) -> Geometry:
         if isinstance(aperture, FullAperture):
             raise ValueError(
                 "MSE_a is defined for masks (SparseAperture): a full pupil has aberrations that a piston per "
-                "sub-aperture does not describe; take TurbulentMSE with the r0 of the site, or wiener_mse of drawn OTFs"
+                "sub-aperture does not describe; use TurbulentMSE with the r0 of the site, or wiener_mse of random OTFs"
             )
         centers = aperture.centers
         if centers.dtype not in (torch.float32, torch.float64) or centers.device != self.object_psd.device:
@@ -168,29 +170,32 @@ class AsymptoticMSE(nn.Module):
 
 
 def wiener_mse(otfs: Tensor, object_psd: PSD, noise_psd: PSD) -> Tensor:
-    """Mean squared error of the multi-frame Wiener restoration for given OTFs.
+    """Return the mean squared error of the multi-frame Wiener restoration for given OTFs.
 
     Parameters
     ----------
-    otfs : (..., frame, H, W)
-        One OTF for each exposure, complex or real, in FFT order.
-    object_psd, noise_psd : callable or Tensor
-        As for `AsymptoticMSE`. A callable gets a grid of the OTFs' shape with pixels and wavelength of 1: it may know
-        frequencies in cycles/pixel only.
+    otfs : (..., frame, H, W) tensor
+        OTF of each exposure, complex or real, in FFT order.
+    object_psd : callable or Tensor
+        PSD of the object, as for `AsymptoticMSE`. A callable receives a grid of the OTFs' shape whose pixel scale and
+        wavelength are 1, so it may depend on frequencies in cycles/pixel only.
+    noise_psd : callable or Tensor
+        PSD of the noise of one exposure, likewise.
 
     Returns
     -------
     Tensor
-        (...) mean over nu of S_o S_n / (S_o sum_k |h_k|^2 + S_n). Its average over random pistons is at least MSE_a.
+        (...), the mean over nu of S_o S_n / (S_o sum_k |h_k|^2 + S_n). Its average over random pistons is at least
+        MSE_a.
 
     Raises
     ------
     ValueError, TypeError
-        For OTFs without a frame axis, and for PSDs of a wrong shape, sign or type.
+        If OTFs have no frame axis, or a PSD has a wrong shape, sign or type.
 
     Examples
     --------
-    One exposure through nothing: the object as it is, with its noise.
+    With perfect optics and one exposure, the error is that of the noise:
 
     >>> perfect = torch.ones(1, 8, 8, dtype=torch.float64)
     >>> round(float(wiener_mse(perfect, torch.tensor(100.0), torch.tensor(1.0))), 4)  # S_o S_n / (S_o + S_n)
@@ -207,12 +212,12 @@ def wiener_mse(otfs: Tensor, object_psd: PSD, noise_psd: PSD) -> Tensor:
 
 
 def _reflect(image: Tensor) -> Tensor:
-    """The image (..., H, W) at the opposite frequencies."""
+    """Return the image (..., H, W) at the negative frequencies."""
     return image.flip(-2, -1).roll((1, 1), (-2, -1))
 
 
 def _pack_again(module: nn.Module, _: Any) -> None:
-    """After load_state_dict: the PSDs may be others than those of the constructor."""
+    """Update the criterion after load_state_dict, which may have changed the PSDs."""
     assert isinstance(module, AsymptoticMSE)
     module._pack()
     model, psd = module._object_model, module.object_psd

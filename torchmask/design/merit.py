@@ -1,4 +1,4 @@
-"""What a search minimises: the logarithm of MSE_a and what the rules add to it, over the free coordinates of a mask."""
+"""The function that a search minimises: log MSE_a and terms for the constraints, over a mask's free coordinates."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from torchmask.optics.aperture import SparseAperture
 
 
 class Criterion(Protocol):
-    """What a search needs of a criterion: the mean squared error of masks (...), absolute and relative.
+    """Interface of a criterion for a search: the mean squared error of masks (...), absolute and relative.
 
-    `AsymptoticMSE` is one. A criterion may also offer `on_grid(n_pixels)`, for searches that begin on a coarse grid.
+    `AsymptoticMSE` is one. A criterion may also have `on_grid(n_pixels)`, for searches that begin on a coarse grid.
     """
 
     def __call__(self, aperture: SparseAperture, /) -> Tensor: ...
@@ -24,20 +24,20 @@ class Criterion(Protocol):
 
 
 class Holes:
-    """The holes a search may move, the rules on them, and the coordinates it moves them by.
+    """The holes that a search moves, the constraints on them, and their free coordinates.
 
     Parameters
     ----------
     template : SparseAperture
-        One mask, of which only the number and kind of holes, dtype and device count.
+        One mask, of which only the number and kind of holes, dtype and device are used.
     constraints : sequence of Constraint
-        All the rules, the mask disc and the overlap among them.
+        All constraints, including those on the mask disc and on overlaps.
 
     Notes
     -----
-    Coordinates x (..., F) and margins are in units of the mask diameter. The plane of x is rolled onto the disc that
-    centres may lie in, |centre| = R sin(|x| / R): no centre can leave it, and a hole that is drawn to the rim, as in
-    most good masks, finds a smooth minimum there and not a wall.
+    Coordinates x (..., F) and margins are in units of the mask diameter. The plane of x is mapped onto the disc of
+    allowed centres by |centre| = R sin(|x| / R). So no centre can leave the disc, and a hole that is attracted to the
+    rim, as in most good masks, has a smooth minimum there instead of a boundary.
     """
 
     def __init__(self, template: SparseAperture, constraints: Sequence[Constraint]) -> None:
@@ -50,13 +50,13 @@ class Holes:
         self.subspace.origin = self._unroll(pinned, 1.0).flatten(-2)
 
     def _unroll(self, centers: Tensor, largest: float) -> Tensor:
-        """The inverse of the rolling; radii are brought below `largest` of the disc's, where the slope vanishes."""
+        """Invert the mapping onto the disc; radii are limited to `largest` of the disc's, where its slope vanishes."""
         length = torch.linalg.vector_norm(centers, dim=-1, keepdim=True) / self.radius
         sine = length.clamp(max=largest)
         return centers * torch.where(length > 0, sine.asin() / length, 1.0)
 
     def aperture(self, x: Tensor) -> SparseAperture:
-        """The masks at x (..., F)."""
+        """Return the masks at x (..., F)."""
         plane = self.subspace.centers(x)
         squared = (plane**2).sum(-1, keepdim=True)
         length = torch.where(squared > 0, squared, 1.0).sqrt() * (squared > 0)
@@ -64,24 +64,24 @@ class Holes:
         return self.template.replace(centers=centers * self.template.mask_diameter)
 
     def coordinates(self, centers: Tensor) -> Tensor:
-        """The coordinates of masks near `centers` (..., N, 2) [m] that obey the equalities; off the rim by 1e-3."""
+        """Return the coordinates of masks near `centers` (..., N, 2) [m] in the subspace, at least 1e-3 off the rim."""
         return self.subspace.coordinates(self._unroll(centers / self.template.mask_diameter, 0.999))
 
     def margins(self, aperture: SparseAperture) -> Tensor:
-        """Margins (..., M) of all inequalities."""
+        """Return the margins (..., M) of all inequalities."""
         return all_margins(aperture, self.constraints) / self.template.mask_diameter
 
     def place(self, x: Tensor, hole: int, position: Tensor) -> Tensor:
-        """x (..., F) with one hole at `position` (..., 2) [mask diameters], as far as it may, and all tied to it."""
+        """Return x (..., F) with one hole, and those tied to it, moved to `position` (..., 2) [mask diameters]."""
         return self.subspace.place(x, hole, self._unroll(position.to(x), 1.0))
 
     def feasible(self, x: Tensor) -> SparseAperture:
-        """The mask nearest to x (F,) that obeys all rules, to rounding. Raises `Infeasible` if none is found."""
+        """Return the mask nearest to x (F,) that satisfies all constraints. Raises `Infeasible` if none is found."""
         return project(self.aperture(x.detach()), self.constraints)
 
 
 class Evaluation(NamedTuple):
-    """Of P masks: merit (P,), its gradient (P, F), relative MSE (P,) and margins (P, M)."""
+    """Merit (P,), its gradient (P, F), relative MSE (P,) and margins (P, M) of P masks."""
 
     merit: Tensor
     gradient: Tensor
@@ -92,8 +92,8 @@ class Evaluation(NamedTuple):
 class Merit:
     """log(relative MSE) + augmented Lagrangian of the margins g: sum(relu(multiplier - w g)^2 - multiplier^2) / (2 w).
 
-    Without multipliers this is the quadratic penalty (w / 2) sum(relu(-g)^2). The logarithm makes one weight fit every
-    problem. `evaluations` counts the masks whose MSE was computed, with or without gradient.
+    Without multipliers this is the quadratic penalty (w / 2) sum(relu(-g)^2). With the logarithm, one weight suits all
+    problems. `evaluations` counts the masks whose MSE was computed, with or without gradient.
     Source: Nocedal & Wright, Numerical Optimization, section 17.3.
     """
 
@@ -107,7 +107,7 @@ class Merit:
         self.evaluations = 0
 
     def __call__(self, x: Tensor, multipliers: Tensor | float = 0.0) -> Evaluation:
-        """At x (P, F), with multipliers (P, M)."""
+        """Evaluate masks at x (P, F), with multipliers (P, M)."""
         x = x.detach().requires_grad_()
         aperture = self.holes.aperture(x)
         relative, margins = self.criterion.relative(aperture), self.holes.margins(aperture)
@@ -119,7 +119,7 @@ class Merit:
         return Evaluation(merit.detach(), gradient, relative.detach(), margins.detach())
 
     def value(self, x: Tensor) -> Tensor:
-        """The merit alone (P,), without multipliers."""
+        """Return the merit (P,) without multipliers."""
         with torch.no_grad():
             aperture = self.holes.aperture(x)
             shortfall = self.holes.margins(aperture).clamp(max=0)

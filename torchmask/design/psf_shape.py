@@ -1,7 +1,7 @@
-"""The point-spread function of a mask in closed form: how wide its core is and how high its side lobes are.
+"""The point-spread function of a mask in closed form, its width and its side lobes.
 
 It is the squared transform of a hole times the squared mean of the holes' phasors. Frequencies are angles on the sky
-over the wavelength [1/m].
+divided by the wavelength [1/m].
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ from torchmask.optics.pupil import Aperture
 
 Array = NDArray[np.float64]
 
-_DIRECTIONS = 180  # in which the width is measured
-_BLOCK = 2**20  # array elements treated at a time
+_DIRECTIONS = 180  # directions in which the width is measured
+_BLOCK = 2**20  # array elements processed at a time
 
 
 def mask_psf(frequency: Array, centers: Array, aperture: Aperture) -> Array:
-    """PSF relative to its peak at `frequency` (..., 2) [1/m]."""
+    """Return the PSF, relative to its peak, at `frequency` (..., 2) [1/m]."""
     phasors = np.exp(-2j * np.pi * (frequency @ centers.T)).mean(-1)
     intensity: Array = phasors.real**2 + phasors.imag**2
     return _hole_power(frequency, aperture) * intensity
 
 
 def _hole_power(frequency: Array, aperture: Aperture) -> Array:
-    """PSF of a single hole relative to its peak."""
+    """Return the PSF of a single hole relative to its peak."""
     return aperture.shape.amplitude(frequency, aperture.subaperture_diameter) ** 2
 
 
 def psf_widths(centers: Array, aperture: Aperture) -> Array:
-    """Full width at half maximum in directions all around [1/m]."""
+    """Return the full width at half maximum in directions all around [1/m]."""
     angles = np.arange(_DIRECTIONS) * np.pi / _DIRECTIONS
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-    # A hole alone drops to one half within 0.52 / d. Steps small against the finest fringe find the first crossing.
+    # The PSF of a hole drops to one half within 0.52 / d. Steps much smaller than a fringe find the first crossing.
     limit, step = 0.6 / aperture.subaperture_diameter, 0.02 / aperture.extent
     radii = np.arange(1, math.ceil(limit / step) + 1) * step
     below = np.stack([mask_psf(radii[:, None] * e, centers, aperture) for e in directions]) < 0.5
@@ -52,26 +52,26 @@ def psf_widths(centers: Array, aperture: Aperture) -> Array:
 
 
 def peak_side_lobe(centers: Array, aperture: Aperture) -> float:
-    """Highest local maximum of the PSF besides the one at 0."""
+    """Return the highest local maximum of the PSF besides the one at 0."""
     scale = aperture.extent
     highest = 0.0
     for start, value in _grid_maxima(centers, aperture, 1 / (6 * scale)):
         if value < 0.8 * highest:
-            break  # a maximum is at most so much higher than the best of six samples a fringe
+            break  # with six samples per fringe, a maximum is not that much higher than its best sample
         result = minimize(lambda f: -float(mask_psf(f / scale, centers, aperture)), start * scale, method="BFGS")
-        if np.abs(result.x - start * scale).max() < 0.25:  # else it climbed a ridge, to another maximum
+        if np.abs(result.x - start * scale).max() < 0.25:  # otherwise it climbed to another maximum
             highest = max(highest, -float(result.fun))
     return highest
 
 
 def _grid_maxima(centers: Array, aperture: Aperture, step: float) -> Iterator[tuple[Array, float]]:
-    """Local maxima of the PSF on a grid, but for the origin, from the highest down: (frequency [1/m], value)."""
+    """Iterate over the PSF's local maxima on a grid, except the origin, the highest first: (frequency [1/m], value)."""
     n = math.ceil(2.5 / aperture.subaperture_diameter / step)
     x = np.arange(-n, n + 1) * step
     found = []
     rows = max(1, _BLOCK // len(x))
     for bottom in range(0, n + 1, rows):
-        y = np.arange(bottom - 1, min(bottom + rows, n + 1) + 1) * step  # with one row more on either side
+        y = np.arange(bottom - 1, min(bottom + rows, n + 1) + 1) * step  # with one more row on either side
         columns = np.exp(-2j * np.pi * x[:, None] * centers[:, 0])
         phasors = (np.exp(-2j * np.pi * y[:, None] * centers[:, 1]) @ columns.T) / len(centers)
         plane = np.stack(np.broadcast_arrays(x, y[:, None]), axis=-1)

@@ -1,4 +1,4 @@
-"""What a design table varies and what it holds fixed, as the rows of the table before anything is computed."""
+"""The parameters of a design table and its rows, before anything is computed."""
 
 from __future__ import annotations
 
@@ -14,53 +14,53 @@ from torchmask.optics.packing import hole_diameter
 
 AXES = ("n_subapertures", "fill_factor", "n_photons", "n_frames", "diameter_over_r0", "seed")
 _WHOLE = ("n_subapertures", "n_frames", "seed", "n_pixels", "n_draws")
-_SAMPLES = 512  # across the pupil raster for turbulence, at least: there the sampled OTF biases the error by 0.1 %
+_SAMPLES = 512  # minimum across the pupil raster for turbulence, where the sampled OTF biases the error by 0.1 %
 _MAY_BE_ZERO = ("seed", "exponent", "readout_noise")
 
 
 @dataclass(frozen=True)
 class DesignSpace:
-    """What a design table varies, and what it holds fixed. Every combination of the first six is a row.
+    """Parameters of a design table, which has a row for every combination of the first six.
 
-    Raises ValueError for an axis that is empty or repeats a value, and for values out of range.
+    Raises ValueError if an axis is empty or repeats a value, or a value is out of range.
     """
 
     n_subapertures: tuple[int, ...] = (6, 9, 11, 13, 16)
-    """Numbers of holes N."""
+    """Numbers of holes, N."""
     fill_factor: tuple[float, ...] = (0.15,)
-    """Collecting areas N d^2 / D^2."""
+    """Fill factors N d^2 / D^2, the collecting area of holes of diameter d in a mask of diameter D."""
     n_photons: tuple[float, ...] = (1e7,)
-    """Photons per frame at `reference_fill_factor`; other areas collect in proportion to N d^2."""
+    """Numbers of photons per frame at `reference_fill_factor`; at others they are in proportion to N d^2."""
     n_frames: tuple[int, ...] = (20,)
-    """Numbers of exposures K."""
+    """Numbers of exposures, K."""
     diameter_over_r0: tuple[float, ...] = (7.0,)
-    """Strengths of turbulence D / r0; none at all: MSE_a alone, without limit on d / r0."""
+    """Strengths of turbulence, D / r0. If empty, only MSE_a is computed, without a limit on d / r0."""
     seed: tuple[int, ...] = (0,)
-    """Seeds of the search."""
+    """Random seeds of the search."""
     reference_fill_factor: float = 0.15
-    """Where `n_photons` is quoted."""
+    """Fill factor to which `n_photons` refers."""
     max_hole_over_r0: float = 1.5
-    """Largest d / r0 that is designed for."""
+    """Largest hole diameter, in units of r0."""
     mask_diameter: float = 1.0
-    """D [m]."""
+    """Diameter of the mask, D [m]."""
     wavelength: float = 550e-9
-    """[m]"""
+    """Wavelength of the observation [m]."""
     n_pixels: int = 256
-    """Of the image, per side, sampled at Nyquist for D."""
+    """Number of pixels per side of the image, which is sampled at Nyquist for D."""
     exponent: float = 1.5
-    """Of the object's power-law power spectrum."""
+    """Exponent of the object's power-law power spectrum."""
     knee: float = 1 / 64
     """Frequency below which that spectrum is flat [cycles/pixel]."""
     readout_noise: float = 0.0
-    """[electrons rms per pixel]"""
+    """Read-out noise [electrons rms per pixel]."""
     outer_scale: float = 20.0
-    """Of the turbulence [m]."""
+    """Outer scale of the turbulence [m]."""
     n_draws: int = 16
-    """Stacks of K exposures drawn, for the mean of `wiener_mse` and its standard error."""
+    """Number of random stacks of K exposures for the mean of `wiener_mse` and its standard error."""
     method: str = "hybrid"
-    """Of `search_mask`."""
+    """Search method, as for `search_mask`."""
     budget: int | None = None
-    """Of `search_mask`."""
+    """Evaluations of the criterion in a search, as for `search_mask`."""
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -79,11 +79,11 @@ class DesignSpace:
 
     @property
     def oversampling(self) -> int:
-        """Of the pupil under turbulence: beyond the edge of a hole's OTF, where its tail is tiny, samples leak."""
+        """Oversampling of the pupil under turbulence, which limits errors of the sampled OTF."""
         return math.ceil(_SAMPLES / self.n_pixels)
 
     def designs(self) -> Iterator[Design]:
-        """The rows of the table before anything is computed; those that cannot be built say why."""
+        """Yield the rows of the table before anything is computed; those that cannot be built say why."""
         axes = [getattr(self, name) for name in AXES if name != "diameter_over_r0"]
         for (n, fill, photons, frames, seed), strength in itertools.product(
             itertools.product(*axes), self.diameter_over_r0 or (None,)
@@ -120,14 +120,15 @@ class DesignSpace:
 
 @dataclass(frozen=True)
 class Design:
-    """One row of a design table: a combination, the mask found for it, and its errors.
+    """One row of a design table: a combination of parameters, the mask found for it, and its errors.
 
-    hole diameter and mask diameter in metres; the errors are relative, over the mean of the object's PSD.
+    Diameters are in metres. Errors are relative to the mean of the object's PSD.
 
     relative_mse : MSE_a
-    above_floor : the same without the part that no mask of this diameter can change
-    wiener_mse, wiener_error : mean of `wiener_mse` under von Karman screens, and its standard error
-    centers : (N, 2) [m]
+    above_floor : MSE_a without the part that no mask of this diameter can change
+    wiener_mse : mean of `wiener_mse` under von Karman screens
+    wiener_error : standard error of that mean
+    centers : (N, 2) centres of the holes [m]
     infeasible : why there is no mask, or None
     """
 
@@ -148,7 +149,7 @@ class Design:
 
 
 def _number(name: str, value: Any, whole: bool) -> int | float:
-    """`value` as int or float, so that equal tasks are equal files."""
+    """Return `value` as int or float, so that equal tasks have equal files."""
     unit = {"mask_diameter": ", in m", "wavelength": ", in m", "outer_scale": ", in m"}.get(name, "")
     least = "not negative" if name in _MAY_BE_ZERO else "positive"
     fits = math.isfinite(value) and (value > 0 or (value == 0 and name in _MAY_BE_ZERO))

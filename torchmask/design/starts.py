@@ -12,9 +12,9 @@ from torchmask.design.merit import Holes
 
 
 def random_mask(holes: Holes, rng: np.random.Generator) -> Tensor:
-    """Coordinates (F,) of a random mask, whether holes overlap or not.
+    """Draw the coordinates (F,) of a random mask, whose holes may overlap.
 
-    Masks range from an even spread over the disc to a ring at the rim, radius = R u^a with a drawn for each mask;
+    Masks range from an even spread over the disc to a ring at the rim, radius = R u^a with a drawn for each mask, and
     half of them have nearly even angles. Good masks of many holes are uneven rings, which an even spread misses.
     """
     n = holes.template.n_subapertures
@@ -30,7 +30,7 @@ def random_mask(holes: Holes, rng: np.random.Generator) -> Tensor:
 
 
 def changed_mask(holes: Holes, x: Tensor, rng: np.random.Generator) -> Tensor:
-    """A start near the mask x (F,): all holes a little, one anywhere, or two anywhere."""
+    """Return a start near the mask x (F,), with all holes moved slightly, or one or two moved anywhere."""
     moved = int(rng.integers(3))
     if moved == 0:
         return x + 0.03 * torch.as_tensor(rng.standard_normal(len(x))).to(x)

@@ -1,8 +1,8 @@
-"""Choosing the number of holes, their size and the flux: one search for each combination, and what turbulence leaves.
+"""Tables for choosing the number of holes, their size and the flux, with a search for each combination.
 
-MSE_a knows no turbulence inside a hole: by it alone, one hole that fills the pupil would win. So the table lets the
-photons grow with the collecting area, refuses holes larger than `max_hole_over_r0` times r0, and gives beside MSE_a the
-mean of `wiener_mse` under full von Karman screens: the error of a linear restoration that knows every OTF.
+MSE_a ignores turbulence within a hole, so by itself it would favour one hole that fills the pupil. The table therefore
+makes the number of photons proportional to the collecting area, excludes holes larger than `max_hole_over_r0` times r0,
+and adds the mean of `wiener_mse` under full von Karman screens, the error of a linear restoration with known OTFs.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from torchmask.optics.otf import OTF
 from torchmask.record import Callback
 from torchmask.spectra import NoisePSD, PowerLawPSD
 
-_FRAMES_AT_ONCE = 20  # OTFs held in memory
+_FRAMES_AT_ONCE = 20  # largest number of OTFs held in memory
 _HEADINGS = {
     "n_subapertures": "N",
     "n_frames": "K",
@@ -45,14 +45,13 @@ _COLUMNS = tuple(field.name for field in fields(Design) if field.name != "center
 
 @dataclass(frozen=True)
 class DesignTable:
-    """The rows of a design table, in the order of the axes; `print` shows them as Markdown,
-    with what all rows share above."""
+    """A design table with rows in the order of the axes, which `print` shows as Markdown, common values above."""
 
     space: DesignSpace
     rows: tuple[Design, ...]
 
     def aperture(self, row: Design) -> SparseAperture:
-        """The mask of a row. Raises ValueError if it is infeasible."""
+        """Return the mask of a row. Raises ValueError if it is infeasible."""
         if row.infeasible is not None:
             raise ValueError(f"there is no mask in this row: {row.infeasible}")
         return SparseAperture(
@@ -60,7 +59,7 @@ class DesignTable:
         )
 
     def csv(self) -> str:
-        """All but the centres, one line a row under a line of names; what is missing is left empty."""
+        """Return the table as CSV, without centres, with a line of names first and missing values empty."""
         text = io.StringIO()
         writer = csv.DictWriter(text, _COLUMNS, extrasaction="ignore", lineterminator="\n")
         writer.writeheader()
@@ -88,28 +87,29 @@ def design_table(
     n_workers: int | None = None,
     callback: Callback | None = None,
 ) -> DesignTable:
-    """Search a mask for every combination of a design space, and measure it under turbulence.
+    """Search for a mask for every combination of a design space, and measure it under turbulence.
 
-    Every search, and every measurement, is a task of its own, on disk as soon as it is done: call again with the same
-    folder to go on after an interruption, or to widen an axis. See `torchmask.design.sweep.run_tasks`, also for
-    the backends. A combination that cannot be built is a row that says why.
+    Every search and every measurement is a task whose result is saved at once: call again with the same folder to
+    continue after an interruption, or to extend an axis. A combination that cannot be built has a row that says why.
 
     Parameters
     ----------
     space : DesignSpace
+        Parameters of the table.
     folder : path
-        For the tasks, one file each, and for the table: table.csv and table.json (with the centres), which are
-        written last, whole, and replace those of an earlier call.
+        Folder for the files of the tasks and of the table: table.csv, and table.json with the centres, which are
+        written last and replace those of an earlier call.
     backend : {"loky", "ray"}
+        Processes on this machine, or a Ray cluster; see `torchmask.design.sweep.run_tasks`.
     n_workers : int, optional
-        Tasks at a time, each on one torch thread; by default one per core.
+        Number of tasks that run at a time, each on one torch thread; by default one per core.
     callback : callable, optional
-        Gets a Record after each task, of the stages "design/table/search" and "design/table/turbulence".
+        Receives a `Record` after each task, of stage "design/table/search" or "design/table/turbulence".
 
     Raises
     ------
     ValueError
-        Before any work: as `run_tasks`; or if no combination keeps d / r0 below the limit.
+        Before any work, as `run_tasks` does, or if no combination can be built.
 
     Examples
     --------
@@ -122,7 +122,7 @@ def design_table(
     require_backend(backend, n_workers)
     rows = list(space.designs())
     if all(row.infeasible for row in rows):
-        raise ValueError(f"no combination can be designed; the first: {rows[0].infeasible}")
+        raise ValueError(f"no combination can be built; the reason for the first one: {rows[0].infeasible}")
     options: dict[str, Any] = {"backend": backend, "n_workers": n_workers, "callback": callback}
 
     feasible = [k for k, row in enumerate(rows) if not row.infeasible]
@@ -145,7 +145,7 @@ def design_table(
 
 
 def _scene(space: DesignSpace, row: Design) -> dict[str, Any]:
-    """What searches and measurements depend on besides the mask."""
+    """Return the values on which searches and measurements depend besides the mask."""
     names = ("mask_diameter", "wavelength", "n_pixels", "exponent", "knee", "readout_noise")
     return {name: getattr(space, name) for name in names} | {
         "photons_per_frame": row.photons_per_frame,
@@ -174,7 +174,7 @@ def _criterion(task: dict[str, Any]) -> AsymptoticMSE:
 
 
 def search(task: dict[str, Any]) -> dict[str, Any]:
-    """The task of a search: the best mask for one combination, or why there is none."""
+    """Run the task of a search: find the best mask for one combination, or say why there is none."""
     criterion = _criterion(task)
     names = ("n_subapertures", "mask_diameter", "fill_factor", "method", "seed", "budget")
     try:
@@ -190,7 +190,7 @@ def search(task: dict[str, Any]) -> dict[str, Any]:
 
 
 def measure(task: dict[str, Any]) -> dict[str, Any]:
-    """The task of a measurement: mean and standard error of the relative `wiener_mse` of a mask under turbulence."""
+    """Run the task of a measurement: mean and standard error of a mask's relative `wiener_mse` under turbulence."""
     criterion = _criterion(task)
     centers = torch.tensor(task["centers"], dtype=torch.float64)
     mask = SparseAperture(centers, task["subaperture_diameter"], task["mask_diameter"])
@@ -213,5 +213,5 @@ def _cell(name: str, value: Any) -> str:
     if value is None:
         return ""
     if name in _RESULTS:
-        return f"{value:#.4g}"  # with its zeros at the end
+        return f"{value:#.4g}"  # with trailing zeros
     return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -1,6 +1,6 @@
-"""What a team knows of an observation, and what follows for the frames: photons, sky, pixels, number, noise.
+"""The instrument of an observation, and what follows from it for the frames: photons, sky, pixels, number, noise.
 
-One frozen record, in the units that teams speak, which every command shares and writes.
+It is one frozen record, in the units that instrument teams use, which every command shares and writes.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ VEGA_IN_AB = {
 
 @dataclass(frozen=True, kw_only=True)
 class Instrument:
-    """All that a team knows of an observation: from it follow photons, frames and noise for any mask on the telescope.
+    """Complete description of an observation, which determines photons, frames and noise for any mask on the telescope.
 
-    Raises ValueError for numbers that cannot be, a band that is given twice or not at all, and a total time that is
-    shorter than one exposure: the message says what is possible.
+    Raises ValueError if a number is out of range, the band is given twice or not at all, or the observing time is
+    shorter than one frame; the message says what is possible.
 
     Examples
     --------
@@ -56,27 +56,27 @@ class Instrument:
     """
 
     telescope: Telescope
-    """What collects the light."""
+    """Telescope that collects the light."""
     source: Source
-    """The target."""
+    """Target of the observation."""
     site: Site
-    """The air."""
+    """Turbulence, wind and sky."""
     camera: Camera = field(default_factory=Camera)
-    """The detector."""
+    """Detector."""
     wavelength: float | None = None
-    """Of the observation, at which r0 is quoted [m]; None: the mean of the filter."""
+    """Wavelength of the observation, at which r0 is given [m]; None: the mean of the filter."""
     filter: str | None = None
-    """Name of the filter (bessell-V, twomass-Ks, ...), or a text file: wavelength [m] and transmission."""
+    """Name of the filter (bessell-V, twomass-Ks, ...), or a text file with columns wavelength [m] and transmission."""
     width: float | None = None
-    """Of a band of even transmission around the wavelength, in place of a filter [m]."""
+    """Width of a top-hat band around the wavelength, instead of a filter [m]."""
     n_wavelengths: int = 5
-    """That stand for the band."""
+    """Number of wavelengths that represent the band."""
     exposure: float
-    """Of a frame [s]."""
+    """Exposure time of a frame [s]."""
     observing_time: float | None = None
-    """In which frames are taken one after the other [s]."""
+    """Total time in which frames are taken one after the other [s]."""
     n_frames: int | None = None
-    """In place of the observing time: number of frames."""
+    """Number of frames, instead of the observing time."""
 
     def __post_init__(self) -> None:
         require("wavelength", self.wavelength, ", in m", most=1e-2)
@@ -116,7 +116,7 @@ class Instrument:
 
     @property
     def passband(self) -> Passband:
-        """The transmission of the band."""
+        """Transmission of the band."""
         if self.filter is not None:
             return Passband.find(self.filter)
         assert self.wavelength is not None
@@ -125,12 +125,12 @@ class Instrument:
 
     @property
     def band(self) -> Band:
-        """The few wavelengths that stand for the band, with the source's light at each."""
+        """Wavelengths that represent the band, with the source's share of light at each."""
         return Band.from_filter(self.passband, self.n_wavelengths, self.source.temperature)
 
     @property
     def mean_wavelength(self) -> float:
-        """At which r0 is quoted [m]."""
+        """Wavelength at which r0 is given [m]."""
         return self.passband.mean_wavelength if self.wavelength is None else self.wavelength
 
     @property
@@ -153,21 +153,21 @@ class Instrument:
         return Grid.nyquist(self.telescope.diameter, self.band.shortest, 2).pixel_scale
 
     def grid(self, n_pixels: int | None = None) -> Grid:
-        """The camera's pixels, or a grid of as large ones with `n_pixels` a side, at the wavelength of r0."""
+        """Return the grid of the camera, or one of equal pixels with `n_pixels` a side, at the wavelength of r0."""
         return Grid(self.camera.n_pixels if n_pixels is None else n_pixels, self.pixel_scale, self.mean_wavelength)
 
     @property
     def seeing(self) -> Seeing:
-        """The turbulence as an exposure sees it."""
+        """Turbulence during an exposure."""
         return Seeing(self.site.r0, self.site.outer_scale, self.exposure, self.site.wind)
 
     def _rate(self, magnitude: float) -> float:
-        """Electrons per second and square metre of the pupil."""
+        """Return the electrons per second and square metre of the pupil for a magnitude."""
         offset = VEGA_IN_AB[self.filter] if self.source.system == "Vega" and self.filter is not None else 0.0
         return self.telescope.throughput * self.passband.ab_photons * 10 ** (-0.4 * (magnitude + offset))
 
     def photons(self, area: float) -> float:
-        """Electrons per frame from the target, through an open area of the pupil [m^2]."""
+        """Return the electrons per frame from the target through an open area of the pupil [m^2]."""
         require("area", area, ", in m^2")
         source = self.source
         if source.magnitude is not None:
@@ -178,29 +178,29 @@ class Instrument:
         return rate * area * self.exposure
 
     def sky(self, area: float) -> float:
-        """Electrons per pixel and frame from the sky, through an open area of the pupil [m^2]."""
+        """Return the electrons per pixel and frame from the sky through an open area of the pupil [m^2]."""
         require("area", area, ", in m^2")
         if self.site.sky is None:
             return 0.0
         return self._rate(self.site.sky) * area * self.exposure * (self.pixel_scale / ARCSEC) ** 2
 
     def noise_psd(self, area: float) -> NoisePSD:
-        """Photon noise of the target, and the read-out noise of all pixels of the camera; a sky comes on top."""
+        """Return the PSD of the target's photon noise and the camera's read-out noise, without that of the sky."""
         return NoisePSD(self.photons(area), self.camera.readout_noise, self.camera.n_pixels**2)
 
     def object_psd(self, area: float) -> PowerLawPSD:
-        """The power spectrum of the target."""
+        """Return the power spectrum of the target."""
         knee = 1 / 64 if self.source.size is None else self.pixel_scale / (self.source.size * ARCSEC)
         return PowerLawPSD(self.source.exponent, self.photons(area), knee)
 
     def with_exposure(self, exposure: float) -> Instrument:
-        """The same with another exposure [s]; of the observing time, other frames follow."""
+        """Return the same instrument with another exposure time [s], which may change the number of frames."""
         return replace(self, exposure=exposure)
 
     def with_width(self, width: float) -> Instrument:
-        """The same with another width of the band [m]; a photon rate grows with it.
+        """Return the same instrument with another width of the band [m], to which a photon rate is proportional.
 
-        Raises ValueError for a filter, which has the width that it has.
+        Raises ValueError if the band is that of a filter.
         """
         if self.width is None:
             raise ValueError(f"the band is the filter {self.filter}: give wavelength and width [m] to vary the width")
@@ -210,7 +210,7 @@ class Instrument:
         return replace(self, source=source, width=width)
 
     def describe(self, area: float) -> str:
-        """What follows for an open area of the pupil [m^2], as a table (Markdown)."""
+        """Return a Markdown table of what follows for an open area of the pupil [m^2]."""
         seeing, telescope = self.seeing, self.telescope
         rows = [
             ("quantity", "value"),
@@ -228,7 +228,7 @@ class Instrument:
         return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
     def save(self, path: str | Path) -> None:
-        """Write a new JSON file that `load` gives back to the last bit. Raises ValueError as `write_json`."""
+        """Write a new JSON file that `load` reads back exactly. Raises ValueError as `write_json` does."""
         write_json(path, {"format": _FORMAT} | to_json(self))
 
     @classmethod
@@ -238,7 +238,7 @@ class Instrument:
         Raises
         ------
         ValueError
-            If the file is missing or damaged, holds an unknown key or lacks one, or numbers that cannot be.
+            If the file is missing or damaged, a key is unknown or missing, or a number is out of range.
         """
         values = _read_yaml(Path(path)) if Path(path).suffix.lower() in (".yaml", ".yml") else read_json(path)
         try:
@@ -249,7 +249,7 @@ class Instrument:
                 values = {key: value for key, value in values.items() if key != "format"}
             return from_json(cls, values, "instrument.")
         except ValueError as error:
-            raise ValueError(f"{path} is no instrument that can be read: {error}") from error
+            raise ValueError(f"{path} cannot be read as an instrument: {error}") from error
 
 
 def _read_yaml(path: Path) -> Any:
@@ -261,4 +261,4 @@ def _read_yaml(path: Path) -> Any:
     try:
         return yaml.safe_load(path.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is no valid YAML: {error}") from error
+        raise ValueError(f"{path} is not valid YAML: {error}") from error

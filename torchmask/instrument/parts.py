@@ -1,4 +1,4 @@
-"""What an observation is made of: telescope, source, site and camera, in the units that teams speak."""
+"""The parts of an observation: telescope, source, site and camera, in the units that instrument teams use."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ def require(name: str, value: float | None, unit: str, zero: bool = False, most:
 
 @dataclass(frozen=True, kw_only=True)
 class Telescope:
-    """What collects the light, before a mask covers it.
+    """A telescope without a mask.
 
-    Raises ValueError for what no telescope has.
+    Raises ValueError if a number is out of range.
 
     Examples
     --------
@@ -32,12 +32,12 @@ class Telescope:
     """
 
     diameter: float
-    """Of the pupil, and of the mask that covers it [m]."""
+    """Diameter of the pupil, and of a mask that covers it [m]."""
     central_obstruction: float = 0.0
-    """Diameter of the disc in the middle that is blocked [m]."""
+    """Diameter of the central obstruction [m]."""
     throughput: float = 1.0
-    """Electrons for each photon that reaches the open pupil inside the band: of mirrors, lenses and detector, as far as
-    the curve of the filter does not hold them."""
+    """Electrons for each photon that enters the open pupil inside the band: efficiency of mirrors, lenses and detector,
+    as far as the curve of the filter does not include it."""
 
     def __post_init__(self) -> None:
         require("telescope.diameter", self.diameter, ", in m")
@@ -51,9 +51,9 @@ class Telescope:
 
 @dataclass(frozen=True, kw_only=True)
 class Source:
-    """The target: its light above the air, by a magnitude or a rate, and the statistics of its image.
+    """The target: its brightness, by a magnitude or a rate, and the statistics of its image.
 
-    Raises ValueError unless one of `magnitude` and `photon_rate` is given, and for numbers out of range.
+    Raises ValueError unless exactly one of `magnitude` and `photon_rate` is given, and if a number is out of range.
 
     Examples
     --------
@@ -62,17 +62,17 @@ class Source:
     """
 
     magnitude: float | None = None
-    """Of the whole target in the band, as the site lets it through."""
+    """Magnitude of the whole target in the band, as seen from the site."""
     system: Literal["AB", "Vega"] = "AB"
-    """Of that magnitude; Vega is known for bessell and twomass filters."""
+    """Magnitude system; Vega is known for bessell and twomass filters."""
     photon_rate: float | None = None
-    """In place of a magnitude: photons per second and square metre that the band passes."""
+    """Photons per second and square metre that the band passes, instead of a magnitude."""
     temperature: float | None = None
-    """Of the black body whose light it is [K], 5772 for sunlight; None: as many photons at each wavelength."""
+    """Temperature of a black-body spectrum [K], 5772 for sunlight; None: equally many photons at each wavelength."""
     size: float | None = None
-    """Of the target across [arcsec], below whose inverse its power spectrum is flat; None: 64 pixels."""
+    """Diameter of the target [arcsec], below whose inverse its power spectrum is flat; None: 64 pixels."""
     exponent: float = 1.5
-    """Of the power law by which its power falls with the frequency."""
+    """Exponent of the power law with which its power spectrum falls."""
 
     def __post_init__(self) -> None:
         if (self.magnitude is None) == (self.photon_rate is None):
@@ -87,9 +87,9 @@ class Source:
 
 @dataclass(frozen=True, kw_only=True)
 class Site:
-    """The air above the telescope.
+    """Turbulence, wind and sky above the telescope.
 
-    Raises ValueError for impossible numbers.
+    Raises ValueError if a number is out of range.
 
     Examples
     --------
@@ -100,11 +100,11 @@ class Site:
     r0: float
     """Fried parameter of the turbulence at the wavelength of the observation [m]."""
     wind: float
-    """Its speed, all directions being equally likely [m/s]."""
+    """Speed of the wind, whose direction is random [m/s]."""
     outer_scale: float = 20.0
-    """Of the turbulence [m]."""
+    """Outer scale of the turbulence [m]."""
     sky: float | None = None
-    """Brightness of the sky in the band, magnitudes per square arcsec of the source's system; None: black."""
+    """Brightness of the sky in the band, in magnitudes of the source's system per square arcsec; None: black."""
 
     def __post_init__(self) -> None:
         for name, unit in (("r0", "m"), ("wind", "m/s"), ("outer_scale", "m")):
@@ -117,7 +117,7 @@ class Site:
 class Camera:
     """The detector.
 
-    Raises ValueError for impossible numbers.
+    Raises ValueError if a number is out of range.
 
     Examples
     --------
@@ -126,15 +126,15 @@ class Camera:
     """
 
     n_pixels: int = 128
-    """Of the field that is read out, per side: the read-out noise counts them all."""
+    """Pixels per side of the field that is read out, all of which add read-out noise."""
     pixel_scale: float | None = None
     """Angle on the sky of one pixel [arcsec]; None: the largest without aliasing at the shortest wavelength."""
     pixel_fill: float | None = None
-    """Part of the area of its pitch in which a pixel is sensitive, 1 for gapless pixels; None: pixels are points."""
+    """Sensitive fraction of the area of a pixel, 1 for pixels without gaps; None: pixels are points."""
     readout_noise: float = 0.0
-    """Electrons rms per pixel and frame."""
+    """Read-out noise [electrons rms per pixel and frame]."""
     readout_time: float = 0.0
-    """From the end of one exposure to the start of the next [s]."""
+    """Time from the end of one exposure to the start of the next [s]."""
 
     def __post_init__(self) -> None:
         if self.n_pixels != int(self.n_pixels) or self.n_pixels < 2:
