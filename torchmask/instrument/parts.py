@@ -104,7 +104,7 @@ class Site:
     outer_scale: float = 20.0
     """Outer scale of the turbulence [m]."""
     sky: float | None = None
-    """Brightness of the sky in the band, in magnitudes of the source's system per square arcsec; None: black."""
+    """Brightness of the sky in the band [magnitudes per square arcsec], in the system of the source; None: black."""
 
     def __post_init__(self) -> None:
         for name, unit in (("r0", "m"), ("wind", "m/s"), ("outer_scale", "m")):
