@@ -235,7 +235,7 @@ def test_refuses_what_cannot_be_called():
 
 
 def test_a_subclass_without_forward_says_so():
-    with pytest.raises(TypeError, match=r"Empty has no forward\(image\) that returns a scalar: write one"):
+    with pytest.raises(TypeError, match=r"Empty has no method forward\(image\): define one that returns a scalar"):
         type("Empty", (ObjectPrior,), {})()(rough())
 
 
