@@ -33,6 +33,7 @@ from torchmask.optics.geometry import MaskGeometry
 from torchmask.optics.otf import OTF
 from torchmask.optics.psf import PSF
 from torchmask.optics.zernike import ZernikePhase
+from torchmask.planning.bounds import MyopicBound, myopic_bound
 from torchmask.planning.plan import plan_observation
 from torchmask.planning.result import ObservationPlan
 from torchmask.restoration.baselines import average_psf, shift_and_add
@@ -66,6 +67,7 @@ __all__ = [
     "MaskCalibration",
     "MaskGeometry",
     "Measurements",
+    "MyopicBound",
     "MyopicDeconvolution",
     "NoisePSD",
     "Observables",
@@ -97,6 +99,7 @@ __all__ = [
     "make_scene",
     "map_companions",
     "multiframe_wiener",
+    "myopic_bound",
     "named_layers",
     "plan_observation",
     "read_observation",

@@ -1,0 +1,97 @@
+"""The bound of a blind restoration against dense matrices, and what it tends to."""
+
+import math
+
+import pytest
+import torch
+
+from torchmask.grid import Grid
+from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.otf import OTF
+from torchmask.optics.zernike import ZernikePhase
+from torchmask.planning.bounds import myopic_bound
+from torchmask.restoration.aberrations import turbulent_basis
+from torchmask.spectra import NoisePSD, PowerLawPSD
+
+GRID = Grid.nyquist(1.0, 550e-9, (12, 11))
+MASK = SparseAperture([[0.0, 0.3], [-0.28, -0.2], [0.28, -0.2]], 0.4, 1.0)
+OBJECT, NOISE = PowerLawPSD(1.5, 1e4, knee=1 / 4), NoisePSD(1e4)
+
+
+def scene(light=1e4):
+    image = torch.rand(GRID.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(7))
+    return light * image / image.sum()
+
+
+def bound(n_modes=3, n_frames=3, r0=0.4, seed=0, **changes):
+    known = {"image": scene(), "object_psd": OBJECT, "noise_psd": NOISE} | changes
+    generator = torch.Generator().manual_seed(seed)
+    return myopic_bound(
+        **known,
+        aperture=MASK,
+        grid=GRID,
+        n_frames=n_frames,
+        n_modes=n_modes,
+        r0=r0,
+        oversampling=2,
+        generator=generator,
+    )
+
+
+@pytest.mark.parametrize("n_modes", [1, 3, 6])
+def test_it_is_the_inverse_of_the_dense_information(n_modes):
+    """Frames and priors by automatic differentiation in pixels and parameters; common tilts held by a stiff prior."""
+    n_frames, (height, width) = 3, GRID.shape
+    n_pixels = height * width
+    basis = turbulent_basis(MASK, n_modes, 0, 0.4, 20.0)
+    z = torch.randn(n_frames, basis.n_parameters, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    otf, phase = OTF(MASK, GRID, 2), ZernikePhase(MASK, GRID, n_modes, 2)
+
+    def frames(image, z):
+        return torch.fft.ifft2(otf(phase(basis.coefficients(z))) * torch.fft.fft2(image)).real.flatten()
+
+    parts = torch.autograd.functional.jacobian(frames, (scene(), z))
+    jacobian = torch.cat([part.flatten(1) for part in parts], dim=1)
+    variance = float(NOISE(GRID)[0, 0]) / n_pixels
+    fourier = torch.fft.fft2(torch.eye(n_pixels, dtype=torch.float64).reshape(-1, height, width)).flatten(1)
+    prior = (fourier.conj() @ torch.diag(1 / OBJECT(GRID).flatten()).to(fourier) @ fourier.mT).real
+    information = jacobian.mT @ jacobian / variance
+    information[:n_pixels, :n_pixels] += prior
+    information[n_pixels:, n_pixels:] += torch.eye(z.numel(), dtype=torch.float64)
+    if n_modes >= 3:  # pistons alone make no tilt
+        x, y = MASK.centers.T
+        for slope_x, slope_y in ((1.0, 0.0), (0.0, 1.0)):
+            coefficients = torch.zeros(1, 3, n_modes, dtype=torch.float64)
+            coefficients[0, :, 0] = slope_x * x + slope_y * y
+            coefficients[0, :, 1], coefficients[0, :, 2] = 0.4 / 4 * slope_x, 0.4 / 4 * slope_y
+            held = basis.parameters_of(coefficients).expand(n_frames, -1).flatten()
+            held = held / held.norm()
+            information[n_pixels:, n_pixels:] += 1e7 * torch.outer(held, held)
+    covariance = torch.linalg.inv(information)[:n_pixels, :n_pixels]
+    dense = float(covariance.trace() / OBJECT(GRID).mean())
+    found = bound(n_modes)
+    # a prior of 1e7 against an information of at most some 1e4 holds to 1e-3 of the excess
+    assert found.unknown - found.known == pytest.approx(dense - found.known, rel=2e-3)
+    assert found.ratio > 1.0001
+
+
+def test_known_aberrations_are_the_wiener_estimate():
+    """Their prior shrinks as r0^(-5/6) in amplitude, and the excess as its square."""
+    excesses = [bound(r0=r0).ratio - 1 for r0 in (1e3, 1e5)]
+    assert 0 < excesses[1] < 1e-7
+    assert math.log(excesses[0] / excesses[1]) / math.log(100) == pytest.approx(5 / 3, rel=0.01)
+
+
+def test_more_modes_cost_more_and_more_light_tells_more():
+    assert bound(n_modes=6).ratio > bound(n_modes=3).ratio
+    bright = bound(image=scene(1e6), object_psd=PowerLawPSD(1.5, 1e6, knee=1 / 4), noise_psd=NoisePSD(1e6))
+    assert bright.unknown < bound().unknown
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [({"image": torch.ones(4, 4)}, r"image has shape \(4, 4\)"), ({"n_frames": 0}, "n_frames is 0")],
+)
+def test_what_cannot_be_is_refused(changes, said):
+    with pytest.raises(ValueError, match=said):
+        bound(**changes)
