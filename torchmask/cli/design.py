@@ -12,7 +12,7 @@ from typing import Literal
 
 import torch
 
-from torchmask.cli.options import RunOptions, SearchOptions, require_wavelength
+from torchmask.cli.options import InstrumentOptions, RunOptions, SearchOptions, require_wavelength
 from torchmask.cli.report import log_design
 from torchmask.cli.run import new_run
 from torchmask.design.constraint_base import Constraint, project
@@ -24,17 +24,19 @@ from torchmask.design.redundancy import analyse_redundancy
 from torchmask.design.search import SearchResult, search_mask
 from torchmask.design.tolerance import machining_tolerance
 from torchmask.grid import Grid
+from torchmask.instrument.instrument import Instrument
 from torchmask.io import write_json
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.packing import hole_diameter
 from torchmask.record import Callback, Record, fan_out
 from torchmask.spectra import NoisePSD, PowerLawPSD
 
+_PHOTONS = 1e7  # per frame, if nothing is given
 _GROWTH, _SUCCESS = 0.01, 0.95  # tolerated growth of the MSE by machining errors, and fraction of masks below it
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(SearchOptions, RunOptions):
+class Options(InstrumentOptions, SearchOptions, RunOptions):
     """Search the positions of the holes that minimise the error of the restored image.
 
     Writes mask.json (for `torchmask simulate` and `restore`), mask.fits (an image in metres), the drawings mask.dxf and
@@ -45,8 +47,8 @@ class Options(SearchOptions, RunOptions):
     """Diameter of the mask, D [m]."""
     wavelength: float = 550e-9
     """Wavelength of the observation [m]."""
-    n_photons: float = 1e7
-    """Electrons per frame through the mask."""
+    n_photons: float | None = None
+    """Electrons per frame through the mask; None: from --instrument for this collecting area, or else 1e7."""
     n_frames: int = 20
     """Number of short exposures for the restoration."""
     readout_noise: float = 0.0
@@ -71,6 +73,31 @@ class Options(SearchOptions, RunOptions):
     """Scale of the drawings: millimetres on the plate for each metre of the pupil; 1000 is full size."""
     seed: int = 0
     """Random seed of the search."""
+
+    @classmethod
+    def of_instrument(cls, known: Instrument) -> Options:
+        """What an instrument gives, but for its light and its sky."""
+        return cls(
+            mask_diameter=known.telescope.diameter,
+            central_obstruction=known.telescope.central_obstruction,
+            wavelength=known.mean_wavelength,
+            n_frames=known.frames,
+            readout_noise=known.camera.readout_noise,
+            n_pixels=known.camera.n_pixels,
+            r0=known.site.r0,
+            exponent=known.source.exponent,
+            knee=known.knee,
+        )
+
+
+def light(options: Options) -> float:
+    """Electrons per frame: as given, or what the instrument collects with holes of this area."""
+    if options.n_photons is not None:
+        return options.n_photons
+    if options.instrument is None:
+        return _PHOTONS
+    area = math.pi / 4 * options.fill_factor * options.mask_diameter**2
+    return Instrument.load(options.instrument).photons(area)
 
 
 def make_criterion(search: SearchOptions, grid: Grid, noise: NoisePSD, n_frames: int) -> AsymptoticMSE:
@@ -109,7 +136,7 @@ def run(options: Options) -> None:
     criterion = make_criterion(
         options,
         Grid.nyquist(options.mask_diameter, options.wavelength, options.n_frequencies),
-        NoisePSD(options.n_photons, options.readout_noise, options.n_pixels**2),
+        NoisePSD(light(options), options.readout_noise, options.n_pixels**2),
         options.n_frames,
     )
     rules = constraints(options)

@@ -38,6 +38,14 @@ class ConfigOptions(DebugOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
+class InstrumentOptions:
+    """File with what is known of an observation; each command has an `of_instrument` that turns it into options."""
+
+    instrument: Path | None = None
+    """An instrument.json of `torchmask plan`, or a YAML file with its keys; used for all options not given here."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class RunOptions(ConfigOptions):
     """Where results go."""
 

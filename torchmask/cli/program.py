@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from torchmask.cli.config import CONFIG, load_config
+from torchmask.instrument.instrument import Instrument
 
 T = TypeVar("T")
 
@@ -112,7 +113,8 @@ def _interrupted_by_termination() -> Iterator[None]:
 def parse(options: type[T], command: str, argv: Sequence[str], *, prog: str, description: str | None = None) -> T:
     """The options of a program, by falling priority: `argv`, the file behind --config, the defaults of `options`.
 
-    Without --config the file is that of the run behind --resume, for a program that has this option.
+    Without --config the file is that of the run behind --resume, or what the instrument behind --instrument says, for a
+    program that has these options.
 
     Raises ValueError for values that an option cannot have and for a config file that `load_config` refuses, SystemExit
     for wrong usage and for --help.
@@ -121,13 +123,18 @@ def parse(options: type[T], command: str, argv: Sequence[str], *, prog: str, des
 
     early = argparse.ArgumentParser(prog=prog, add_help=False, allow_abbrev=False)
     known = {field.name for field in dataclasses.fields(typing.cast(Any, options))}
-    for name in known & {"config", "resume"}:
+    for name in known & {"config", "resume", "instrument"}:
         early.add_argument(f"--{name}", type=Path)
     given = vars(early.parse_known_args(argv)[0])
     path, resumed = given.get("config"), given.get("resume")
     if path is None and resumed is not None:
         path = resumed / CONFIG
     default: dict[str, Any] = {} if path is None else {"default": load_config(path, options, command)}
+    instrument = given.get("instrument")
+    if instrument is not None:
+        if default:
+            raise ValueError("--instrument and --config both say what is not given here: give one")
+        default["default"] = typing.cast(Any, options).of_instrument(Instrument.load(instrument))
     with _checked_at_the_end(options):
         return tyro.cli(options, prog=prog, args=argv, description=description, **default)
 

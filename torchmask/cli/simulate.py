@@ -12,6 +12,7 @@ from torchmask.atmosphere.phase import LayeredPhase, TurbulencePhase
 from torchmask.atmosphere.profiles import named_layers
 from torchmask.cli.options import (
     FilterOptions,
+    InstrumentOptions,
     MaskOptions,
     RunOptions,
     load_aperture,
@@ -22,6 +23,7 @@ from torchmask.cli.options import (
 from torchmask.cli.report import log_observation
 from torchmask.cli.run import new_run
 from torchmask.grid import ARCSEC, Grid
+from torchmask.instrument.instrument import Instrument
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.band import Band
 from torchmask.optics.detector import Detector
@@ -33,6 +35,8 @@ from torchmask.simulation.conditions import Conditions
 from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
 from torchmask.simulation.wavefronts import Turbulence
+
+_PHOTONS = 1e7  # per frame, if nothing is given
 
 
 @dataclass(frozen=True)
@@ -74,8 +78,8 @@ class TurbulenceOptions:
 class ConditionOptions(FilterOptions):
     """Observing conditions: sky, clouds, band and pixels."""
 
-    sky: float = 0.0
-    """Sky background [electrons per pixel and frame]."""
+    sky: float | None = None
+    """Sky background [electrons per pixel and frame]; None: from --instrument, or else 0."""
     transparency_scatter: float = 0.0
     """Standard deviation of the logarithm of each frame's transmission, due to clouds."""
     band_width: float = 0.0
@@ -83,7 +87,7 @@ class ConditionOptions(FilterOptions):
     pixel_fill_factor: float = 0.0
     """Sensitive fraction of the area of a square pixel, at most 1; 0: pixels are points."""
 
-    def make(self, exposure_time: float, wavelength: float) -> Conditions:
+    def make(self, exposure_time: float, wavelength: float, sky: float = 0.0) -> Conditions:
         """Return the conditions for `simulate_observation`. Raises ValueError if a value is out of range."""
         if not (math.isfinite(self.band_width) and 0 <= self.band_width < 2 * wavelength):
             raise ValueError(
@@ -93,7 +97,7 @@ class ConditionOptions(FilterOptions):
             raise ValueError("--conditions.band-width and --conditions.filter are both given: give only one of them")
         even = Band.top_hat(wavelength, self.band_width, self.n_wavelengths) if self.band_width else None
         return Conditions(
-            sky=self.sky,
+            sky=sky if self.sky is None else self.sky,
             transparency_scatter=self.transparency_scatter,
             exposure_time=exposure_time,
             band=even or self.filter_band(wavelength),
@@ -121,7 +125,7 @@ class TrueMaskOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(MaskOptions, RunOptions):
+class Options(InstrumentOptions, MaskOptions, RunOptions):
     """Simulate short exposures of a scene through a mask and turbulence, with photon and read-out noise.
 
     Writes stack.npz (for `torchmask restore`; it also contains the truth), figures, config.yaml and the log to a new
@@ -148,12 +152,32 @@ class Options(MaskOptions, RunOptions):
     """Error of the mask's position."""
     n_frames: int = 20
     """Number of short exposures."""
-    n_photons: float = 1e7
-    """Electrons per frame through the mask, including light that falls outside the field."""
+    n_photons: float | None = None
+    """Electrons per frame through the mask, also outside the field; None: from --instrument, or else 1e7."""
     readout_noise: float = 1.5
     """Read-out noise [electrons rms per pixel and frame]."""
     seed: int = 0
     """Random seed of the turbulence and the noise."""
+
+    @classmethod
+    def of_instrument(cls, known: Instrument) -> Options:
+        """What an instrument gives; its light depends on the mask."""
+        return cls(
+            wavelength=known.mean_wavelength,
+            n_pixels=known.camera.n_pixels,
+            pixel_scale_arcsec=known.pixel_scale / ARCSEC,
+            r0=known.site.r0,
+            outer_scale=known.site.outer_scale,
+            turbulence=TurbulenceOptions(wind=(known.site.wind, 0.0), exposure_time=known.exposure),
+            conditions=ConditionOptions(
+                filter=known.filter,
+                band_width=known.width or 0.0,
+                n_wavelengths=known.n_wavelengths,
+                pixel_fill_factor=known.camera.pixel_fill or 0.0,
+            ),
+            n_frames=known.frames,
+            readout_noise=known.camera.readout_noise,
+        )
 
 
 def observing_wavelength(options: Options) -> float:
@@ -178,7 +202,10 @@ def run(options: Options) -> None:
     true = options.true_mask.apply(told)
     aperture = true or told
     wavelength = observing_wavelength(options)
-    conditions = options.conditions.make(options.turbulence.exposure_time, wavelength)
+    known = None if options.instrument is None else Instrument.load(options.instrument)
+    told_photons, told_sky = (_PHOTONS, 0.0) if known is None else (known.photons(told.area), known.sky(told.area))
+    n_photons = told_photons if options.n_photons is None else options.n_photons
+    conditions = options.conditions.make(options.turbulence.exposure_time, wavelength, told_sky)
     turbulence = options.turbulence.make(options.r0, wavelength, options.outer_scale)
     pixel_scale = pixel_angle(options.pixel_scale_arcsec)
     if pixel_scale is None:
@@ -190,7 +217,7 @@ def run(options: Options) -> None:
     else:
         grid = Grid(options.n_pixels, pixel_scale, wavelength)
     detector = Detector(options.readout_noise)
-    scene = make_scene(grid.shape, options.n_photons, options.scene)
+    scene = make_scene(grid.shape, n_photons, options.scene)
     with new_run("simulate", options, options.seed) as output:
         generator = torch.Generator().manual_seed(options.seed)
         observation = simulate_observation(
@@ -205,8 +232,9 @@ def run(options: Options) -> None:
             output.summary.append(turbulence.layers.describe(wavelength))
         assert observation.transmission is not None
         light = observation.frames.mean() - conditions.sky
-        kept = float(light * math.prod(grid.shape) / (options.n_photons * observation.transmission.mean()))
+        kept = float(light * math.prod(grid.shape) / (n_photons * observation.transmission.mean()))
         output.summary.append(
             f"{options.n_frames} frames of {grid.shape[0]} x {grid.shape[1]} pixels of "
-            f"{grid.pixel_scale / ARCSEC:.4g} arcsec, {100 * kept:.1f} % of the light inside the field"
+            f"{grid.pixel_scale / ARCSEC:.4g} arcsec, {n_photons:.4g} photons in each, {100 * kept:.1f} % of the "
+            "light inside the field"
         )

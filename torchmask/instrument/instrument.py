@@ -188,10 +188,15 @@ class Instrument:
         """Return the PSD of the target's photon noise and the camera's read-out noise, without that of the sky."""
         return NoisePSD(self.photons(area), self.camera.readout_noise, self.camera.n_pixels**2)
 
+    @property
+    def knee(self) -> float:
+        """The frequency below which the power spectrum of the target is flat [cycles/pixel]."""
+        size = self.source.size
+        return PowerLawPSD.knee if size is None else self.pixel_scale / (size * ARCSEC)
+
     def object_psd(self, area: float) -> PowerLawPSD:
         """Return the power spectrum of the target."""
-        knee = 1 / 64 if self.source.size is None else self.pixel_scale / (self.source.size * ARCSEC)
-        return PowerLawPSD(self.source.exponent, self.photons(area), knee)
+        return PowerLawPSD(self.source.exponent, self.photons(area), self.knee)
 
     def with_exposure(self, exposure: float) -> Instrument:
         """Return the same instrument with another exposure time [s], which may change the number of frames."""

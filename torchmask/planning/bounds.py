@@ -30,8 +30,8 @@ class MyopicBound:
 
     Examples
     --------
-    >>> MyopicBound(known=0.2, unknown=0.21).ratio
-    1.05
+    >>> MyopicBound(known=0.25, unknown=0.375).ratio
+    1.5
     """
 
     known: float

@@ -1,0 +1,94 @@
+"""One file of what is known of an observation, for several commands: what is given beside it wins."""
+
+import json
+import math
+
+import pytest
+import yaml
+
+from torchmask.cli.main import main
+from torchmask.design.manufacture import load_mask, mask_wavelength, save_json
+from torchmask.grid import ARCSEC
+from torchmask.instrument.instrument import Instrument
+from torchmask.instrument.parts import Camera, Site, Source, Telescope
+from torchmask.observation import Observation
+from torchmask.optics.aperture import SparseAperture
+
+MASK = SparseAperture.from_catalog("golay6", 1.2, 0.1)
+KNOWN = Instrument(
+    telescope=Telescope(diameter=1.2, central_obstruction=0.2, throughput=0.5),
+    source=Source(magnitude=2.0, size=3.0, exponent=2.0),
+    site=Site(r0=0.3, wind=5.0, sky=4.0, outer_scale=30.0),
+    camera=Camera(n_pixels=24, readout_noise=2.5, pixel_fill=0.9),
+    wavelength=700e-9,
+    width=20e-9,
+    n_wavelengths=2,
+    exposure=3e-3,
+    n_frames=2,
+)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    KNOWN.save(tmp_path / "instrument.json")
+    save_json(tmp_path / "mask.json", MASK)
+    return tmp_path
+
+
+def test_frames_are_simulated_as_the_instrument_takes_them(folder, capsys):
+    told = ["--mask", folder / "mask.json", "--instrument", folder / "instrument.json", "--out", folder / "run"]
+    assert main(["simulate", *map(str, told), "--scene.size", "0.4", "--r0", "0.2"]) == 0
+    stack = Observation.load(folder / "run/stack.npz")
+    assert stack.grid.shape == (24, 24)
+    assert len(stack.frames) == 2
+    assert (stack.grid.wavelength, stack.readout_noise, stack.outer_scale) == (700e-9, 2.5, 30.0)
+    assert stack.grid.pixel_scale == pytest.approx(KNOWN.pixel_scale, rel=1e-12)
+    assert stack.background == pytest.approx(KNOWN.sky(float(MASK.area)), rel=1e-12)
+    assert stack.r0 == pytest.approx(0.2)  # given beside it
+    assert f"{KNOWN.photons(float(MASK.area)):.4g} photons in each" in capsys.readouterr().out
+    config = yaml.safe_load((folder / "run/config.yaml").read_text())
+    assert config["turbulence"]["exposure_time"] == 3e-3
+    assert config["turbulence"]["wind"] == [5.0, 0.0]
+    assert (config["conditions"]["band_width"], config["conditions"]["pixel_fill_factor"]) == (20e-9, 0.9)
+    again = ["simulate", "--config", str(folder / "run/config.yaml"), "--out", str(folder / "again")]
+    assert main(again) == 0
+    assert Observation.load(folder / "again/stack.npz").frames.equal(stack.frames)
+
+
+def test_a_mask_is_designed_for_the_instrument(folder):
+    options = [
+        "--n-subapertures",
+        "4",
+        "--fill-factor",
+        "0.1",
+        "--budget",
+        "60",
+        "--n-frequencies",
+        "32",
+        "--n-frames",
+        "9",
+    ]
+    told = ["--instrument", str(folder / "instrument.json"), "--out", str(folder / "run")]
+    assert main(["design", *options, *told]) == 0
+    mask = load_mask(folder / "run/mask.json")
+    assert mask.mask_diameter == 1.2
+    assert mask_wavelength(folder / "run/mask.json") == 700e-9
+    assert float(mask.centers.norm(dim=-1).min()) >= (0.2 + mask.subaperture_diameter) / 2 - 1e-9
+    config = yaml.safe_load((folder / "run/config.yaml").read_text())
+    assert (config["n_frames"], config["readout_noise"], config["r0"], config["exponent"]) == (9, 2.5, 0.3, 2.0)
+    assert config["knee"] == pytest.approx(KNOWN.pixel_scale / (3.0 * ARCSEC))
+    metrics = json.loads((folder / "run/metrics.json").read_text())
+    photons = KNOWN.photons(math.pi / 4 * 0.1 * 1.2**2)
+    # of any criterion the error is at most 1, and its scale is the object's power, photons^2 times the mean spectrum
+    psd = KNOWN.object_psd(1.0)(KNOWN.grid(32)).mean() / KNOWN.photons(1.0) ** 2
+    assert metrics["mse"] / metrics["relative_mse"] == pytest.approx(photons**2 * float(psd), rel=0.02)
+
+
+@pytest.mark.parametrize("command", ["design", "simulate"])
+def test_files_that_are_no_instrument_are_refused(command, folder, capsys):
+    assert main([command, "--instrument", str(folder / "mask.json")]) == 1
+    assert "cannot be read as an instrument" in capsys.readouterr().err
+    told = ["--instrument", str(folder / "instrument.json"), "--config", str(folder / "config.yaml")]
+    (folder / "config.yaml").write_text(f"command: {command}\n")
+    assert main([command, *told]) == 1
+    assert "give one" in capsys.readouterr().err
