@@ -46,7 +46,7 @@ def test_means_of_polynomials_over_a_curve_are_exact(transmission, n, random):
     ("wavelengths", "transmission", "n", "message"),
     [
         ([5e-7], [1.0], 3, "at least 2"),
-        ([5e-7, 6e-7], [1.0], 3, "as many"),
+        ([5e-7, 6e-7], [1.0], 3, "equal numbers"),
         ([6e-7, 5e-7], [1.0, 1.0], 3, "increasing"),
         ([-1e-7, 5e-7], [1.0, 1.0], 3, "positive"),
         ([5e-7, 6e-7], [1.0, -1.0], 3, "negative"),

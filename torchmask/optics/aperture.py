@@ -1,4 +1,4 @@
-"""Apertures: where light enters, through the holes of a mask or a full pupil."""
+"""Apertures: masks with several holes, and full pupils."""
 
 from __future__ import annotations
 
@@ -24,22 +24,28 @@ class SparseAperture(Aperture):
     subaperture_diameter : float
         Diameter of a disc, or flat-to-flat width of a hexagon [m].
     mask_diameter : float
-        Diameter of the disc that the mask is cut from [m].
+        Diameter of the disc that contains the mask [m].
     shape : str or Shape
-        The form of the holes: "disc", "hexagon", "square" or an object of `torchmask.optics.shapes`.
+        Shape of the holes: "disc", "hexagon", "square" or an object of `torchmask.optics.shapes`.
     orientation : float
-        For hexagons and squares given by name, the angle from +x to the normal of one side [rad].
+        Angle from +x to the normal of one side [rad], for hexagons and squares given by name.
+    dtype : torch.dtype, optional
+        Type of the centres, by default their own.
+    device : torch.device, optional
+        Device of the centres, by default their own.
 
     Raises
     ------
     ValueError
-        For a wrong shape, values that are not finite, a diameter that is not positive, an unknown hole shape.
-        Under `torch.func.vmap` values cannot be looked at, and are not.
+        If `centers` has a wrong shape or values that are not finite (not checked under `torch.func.vmap`), a diameter
+        is not positive, or the shape of the holes is unknown.
+    TypeError
+        If `centers` is not floating point.
 
     Notes
     -----
-    Feasibility (holes inside the disc, no overlap) is not demanded here, because real masks may break it
-    slightly: see `torchmask.design.constraints.check_mask`.
+    Holes may overlap or leave the disc, because real masks may do so slightly; see
+    `torchmask.design.constraints.check_mask`.
 
     Examples
     --------
@@ -75,10 +81,10 @@ class SparseAperture(Aperture):
         if not centers.is_floating_point():
             raise TypeError(f"centers has dtype {centers.dtype}: it must be floating point, in m")
         if can_be_read(centers) and not bool(torch.isfinite(centers).all()):
-            raise ValueError("centers holds values that are not finite")
+            raise ValueError("centers holds values that are not finite: positions in m are needed")
         if isinstance(centers, nn.Parameter):
             if dtype not in (None, centers.dtype) or device not in (None, centers.device):
-                raise ValueError("dtype and device of a Parameter are its own: move it before it is handed in")
+                raise ValueError("centers is a Parameter of another dtype or device: convert it before passing it")
             self.centers: Tensor = centers
         else:
             self.register_buffer("centers", centers.to(dtype=dtype, device=device))
@@ -97,26 +103,29 @@ class SparseAperture(Aperture):
         dtype: torch.dtype | None = None,
         device: torch.device | str | None = None,
     ) -> SparseAperture:
-        """A mask of the catalogue (`torchmask.optics.catalog`), such as "golay6" or "jwst_niriss_ami_7".
+        """Return a mask of the catalogue (`torchmask.optics.catalog`), such as "golay6" or "jwst_niriss_ami_7".
+
+        Without `mask_diameter` and `fill_factor` the mask is as built, in metres on the primary mirror, and its
+        diameter is that of the pupil. If both are given, the smallest circle around the holes is centred on the origin
+        and the outermost holes touch the mask's edge (hexagons with the circle through their corners); Golay arrays
+        need both.
 
         Parameters
         ----------
         name : str
             Any of `catalog.names()`; case and punctuation do not matter.
-        mask_diameter, fill_factor : float, optional
-            Neither: as built, in metres on the primary mirror; mask_diameter is that of the pupil.
-            Both: the pattern afresh. N d^2 / D^2 = fill_factor, the smallest circle around the holes centred on the
-            origin, the outermost holes touching mask_diameter [m] (hexagons with their corners' circle). Golay arrays
-            need this. mask_diameter alone: the mask as built, centres and holes scaled until its pupil has this
-            diameter. fill_factor alone: the centres as built, holes of another size.
+        mask_diameter : float, optional
+            Diameter D of the mask [m]. Alone, it scales the mask as built so that its pupil has this diameter.
+        fill_factor : float, optional
+            Fill factor N d^2 / D^2. Alone, it changes only the diameter d of the holes.
         mirrored : bool
-            Reverse x, for instruments that look from the other side.
+            Whether to reverse x, for instruments that look from the other side.
 
         Raises
         ------
         ValueError
-            For an unknown name (the known ones are listed), a size that is not positive or leaves no room, a
-            Golay array without both sizes, a mask whose hole diameter no source gives without fill_factor.
+            If the name is unknown (the message lists the known ones), a size is not positive or leaves no room, or a
+            size is needed that the catalogue does not have.
 
         Examples
         --------
@@ -137,22 +146,23 @@ class SparseAperture(Aperture):
         dtype: torch.dtype | None = None,
         device: torch.device | str | None = None,
     ) -> SparseAperture:
-        """A mask of round holes at random places, inside the disc and without overlap.
+        """Return a mask of round holes at random positions, inside the disc and without overlap.
 
         Parameters
         ----------
         n_subapertures : int
             Number of holes, N.
         mask_diameter : float
-            D [m].
+            Diameter D of the mask [m].
         fill_factor : float
-            N d^2 / D^2, which sets the diameter d of the holes.
+            Fill factor N d^2 / D^2, which sets the diameter d of the holes.
         generator : torch.Generator, optional
+            Source of randomness.
 
         Raises
         ------
         ValueError
-            If the holes cannot be packed; the message says the largest fill factor that can.
+            If the holes cannot be packed; the message gives the largest fill factor that can.
 
         Examples
         --------
@@ -166,7 +176,7 @@ class SparseAperture(Aperture):
 
     @property
     def fill_factor(self) -> float:
-        """N d^2 / D^2."""
+        """Fill factor N d^2 / D^2."""
         return self.n_subapertures * (self.subaperture_diameter / self.mask_diameter) ** 2
 
     def replace(
@@ -176,7 +186,7 @@ class SparseAperture(Aperture):
         mask_diameter: float | None = None,
         shape: Shape | None = None,
     ) -> SparseAperture:
-        """The same mask but for what is given: elsewhere, turned, or of another size.
+        """Return a copy of the mask with some of its properties replaced.
 
         Examples
         --------
@@ -199,12 +209,12 @@ class SparseAperture(Aperture):
 
 
 class FullAperture(Aperture):
-    """A full circular pupil, the rival of every mask.
+    """A full circular pupil without a mask.
 
     Parameters
     ----------
     diameter : float
-        [m].
+        Diameter of the pupil [m].
     central_obstruction : float
         Diameter of the obstruction as a fraction of `diameter`, in [0, 1).
 
@@ -233,8 +243,8 @@ class FullAperture(Aperture):
             raise ValueError(f"diameter is {diameter}: it must be finite and positive, in m")
         if not 0 <= central_obstruction < 1:
             raise ValueError(
-                f"central_obstruction is {central_obstruction}: it is the fraction of the diameter that is "
-                "blocked, at least 0 and below 1"
+                f"central_obstruction is {central_obstruction}: it must be a fraction of the diameter, at least 0 and "
+                "below 1"
             )
         self.register_buffer("centers", torch.zeros(1, 2, dtype=dtype or torch.float64, device=device))
         self.subaperture_diameter: float = float(diameter)

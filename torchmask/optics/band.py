@@ -1,4 +1,4 @@
-"""The band of light that reaches the detector: as a few wavelengths, or by the name of a filter."""
+"""The band of light that reaches the detector, represented by a few wavelengths."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from torchmask.optics.passband import Passband, check_curve
 
-_MOST_WAVELENGTHS = 32  # of a quadrature: far more than any image needs
+_MOST_WAVELENGTHS = 32  # largest number of wavelengths, far more than any image needs
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,9 @@ class Band:
 
     @classmethod
     def of(cls, wavelengths: Sequence[float], weights: Sequence[float] | None = None) -> Band:
-        """The band of these wavelengths [m], with light in proportion to `weights` (None: equal).
+        """Return the band of these wavelengths [m], with light in proportion to `weights`, equal by default.
 
-        Raises ValueError if there is no wavelength, the weights are not as many, or one is not finite and positive.
+        Raises ValueError if there is no wavelength, the numbers differ, or a value is not finite and positive.
         """
         shares = [1.0] * len(wavelengths) if weights is None else [float(weight) for weight in weights]
         if not len(wavelengths) or len(shares) != len(wavelengths):
@@ -47,25 +47,26 @@ class Band:
 
     @classmethod
     def of_curve(cls, wavelengths: Sequence[float], transmission: Sequence[float], n_wavelengths: int = 5) -> Band:
-        """The few wavelengths that stand for a transmission curve, by Gauss quadrature.
+        """Represent a transmission curve by a few wavelengths, by Gauss quadrature.
 
-        The mean over the band of any polynomial in wavelength of degree 2 n_wavelengths - 1 or less is exact
-        (Golub & Welsch, Math. Comp. 23, 221, 1969). How many an image needs grows with the width of the band: 3 for
-        5 %, 5 for 15 %.
+        The mean over the band of any polynomial in wavelength of degree 2 n_wavelengths - 1 or less is exact (Golub &
+        Welsch, Math. Comp. 23, 221, 1969). An image needs 3 wavelengths for a width of 5 %, and 5 for 15 %.
 
         Parameters
         ----------
         wavelengths : sequence of float
-            Where the curve is known [m], increasing; it is straight in between and zero outside.
+            Increasing wavelengths of the curve [m], which is linear in between and zero outside.
         transmission : sequence of float
-            Of the detected light of the object, on any scale: of filter, telescope and detector, times its spectrum.
+            Relative detected light at each wavelength: transmission of filter, telescope and detector, times the
+            spectrum of the object.
         n_wavelengths : int
+            Number of wavelengths of the band.
 
         Raises
         ------
         ValueError
-            If both are not equally long with at least 2 values, wavelengths are not positive and increasing, the
-            transmission is negative, not finite or nowhere positive, or `n_wavelengths` is not from 1 to 32.
+            If the sequences differ in length or have fewer than 2 values, wavelengths are not positive and increasing,
+            the transmission is negative, not finite or nowhere positive, or `n_wavelengths` is not from 1 to 32.
 
         Examples
         --------
@@ -82,7 +83,7 @@ class Band:
 
     @classmethod
     def top_hat(cls, wavelength: float, width: float, n_wavelengths: int = 5) -> Band:
-        """The band of even transmission over `width` [m] around `wavelength` [m]; errors as for `of_curve`.
+        """Return the top-hat band of `width` [m] around `wavelength` [m]. Raises the errors of `of_curve`.
 
         Examples
         --------
@@ -93,15 +94,17 @@ class Band:
 
     @classmethod
     def from_filter(cls, name: str | Path | Passband, n_wavelengths: int = 5, temperature: float | None = None) -> Band:
-        """The few wavelengths that stand for a filter; errors as for `Passband.find` and `of_curve`.
+        """Represent a filter by a few wavelengths. Raises the errors of `Passband.find` and `of_curve`.
 
         Parameters
         ----------
         name : str, path or Passband
-            A filter's name such as "bessell-V" (extra `filters`), or a text file of wavelengths [m] and transmission.
+            Name of a filter such as "bessell-V" (extra `filters`), or a text file of wavelengths [m] and transmission.
         n_wavelengths : int
+            Number of wavelengths of the band.
         temperature : float, optional
-            Of a black body whose light it is [K], such as 5772 for sunlight; None: as many photons at each wavelength.
+            Temperature of a black-body spectrum [K], such as 5772 for sunlight. By default there are equally many
+            photons at each wavelength.
 
         Examples
         --------
@@ -115,12 +118,12 @@ class Band:
 
     @property
     def shortest(self) -> float:
-        """The shortest wavelength [m], which samples the image most coarsely."""
+        """Shortest wavelength [m], whose image is sampled most coarsely."""
         return min(self.wavelengths)
 
 
 def _fine_samples(wavelengths: np.ndarray, transmission: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes and weights that integrate the piecewise straight curve times a polynomial, piece by piece, exactly."""
+    """Return nodes and weights that integrate the piecewise linear curve times a polynomial exactly."""
     places, weights = np.polynomial.legendre.leggauss(_MOST_WAVELENGTHS + 1)
     half = np.diff(wavelengths)[:, None] / 2
     nodes = wavelengths[:-1, None] + half * (1 + places)
@@ -128,13 +131,13 @@ def _fine_samples(wavelengths: np.ndarray, transmission: np.ndarray) -> tuple[np
 
 
 def _gauss_quadrature(nodes: np.ndarray, weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """The n nodes and weights of the Gauss quadrature of a measure on many `nodes`, by Lanczos' recurrence."""
+    """Return the n nodes and weights of the Gauss quadrature of a measure on many `nodes`, by Lanczos' recurrence."""
     middle, half = (nodes[-1] + nodes[0]) / 2, (nodes[-1] - nodes[0]) / 2
     x, vectors, jacobi = (nodes - middle) / half, [np.sqrt(weights / weights.sum())], np.zeros((n, n))
     for step in range(n):
         following = x * vectors[step]
         jacobi[step, step] = following @ vectors[step]
-        for vector in vectors * 2:  # twice is enough against rounding
+        for vector in vectors * 2:  # orthogonalising twice removes rounding errors
             following = following - (following @ vector) * vector
         if step + 1 < n:
             jacobi[step, step + 1] = jacobi[step + 1, step] = np.linalg.norm(following)
@@ -161,7 +164,7 @@ FILTERS = {
 
 
 def filter_of_header(header: Mapping[str, Any]) -> Filter | None:
-    """The filter that the FITS cards INSTRUME and FILTER name; None if it is not in `FILTERS`.
+    """Return the filter named by the FITS cards INSTRUME and FILTER, or None if it is not in `FILTERS`.
 
     Examples
     --------

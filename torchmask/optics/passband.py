@@ -1,4 +1,4 @@
-"""Transmission curves: of a filter by its name, of a file, or even over a width; and how many photons pass through."""
+"""Transmission curves of filters, files and top-hat bands, and the number of photons that pass."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _FILES = (".txt", ".dat", ".csv")
 
 @dataclass(frozen=True)
 class Passband:
-    """The transmission at some wavelengths [m]: straight in between, and nothing outside.
+    """A transmission curve given at some wavelengths [m], linear in between and zero outside.
 
-    What it includes beside the filter, such as the air or a camera, is up to its source.
+    Depending on its source it may include the atmosphere or a camera.
 
-    Raises ValueError unless both are as long, at least 2, the wavelengths increase, and the transmission is nowhere
-    negative and somewhere positive.
+    Raises ValueError if the sequences differ in length or have fewer than 2 values, wavelengths do not increase, or the
+    transmission is negative somewhere or positive nowhere.
 
     Examples
     --------
@@ -40,32 +40,32 @@ class Passband:
 
     @classmethod
     def top_hat(cls, wavelength: float, width: float) -> Passband:
-        """Even transmission of 1 over `width` [m] around `wavelength` [m]."""
+        """Return a transmission of 1 over `width` [m] around `wavelength` [m]."""
         return cls((wavelength - width / 2, wavelength + width / 2), (1.0, 1.0))
 
     @classmethod
     def find(cls, name: str | Path) -> Passband:
-        """The curve of a filter's name, or of a file.
+        """Return the curve of a filter, by its name or from a file.
 
         Parameters
         ----------
         name : str or path
-            A name of speclite, GROUP-BAND such as "bessell-V", "sdss2010-r" or "twomass-Ks" (extra `filters`), or a
-            text file (.txt, .dat, .csv) of two columns: wavelength [m] and transmission.
+            Name in speclite, GROUP-BAND such as "bessell-V", "sdss2010-r" or "twomass-Ks" (extra `filters`), or a text
+            file (.txt, .dat, .csv) of two columns: wavelength [m] and transmission.
 
         Raises
         ------
         ValueError
-            For an unknown name (the known ones are listed) and a file that is missing or holds no curve.
+            If the name is unknown (the message lists the known ones), or the file is missing or has no valid curve.
         ModuleNotFoundError
-            For a name, if speclite is not installed.
+            If a name is given and speclite is not installed.
         """
         path = Path(name)
         return _read_curve(path) if path.suffix.lower() in _FILES else _named_curve(str(name))
 
     @property
     def mean_wavelength(self) -> float:
-        """Of light that has as many photons at each wavelength [m]."""
+        """Mean wavelength [m] of light with equally many photons at each wavelength."""
         x, y = np.array(self.wavelengths), np.array(self.transmission)
         step, before, after = np.diff(x), y[:-1], y[1:]
         moment = step * (x[:-1] * (2 * before + after) + x[1:] * (before + 2 * after)) / 6
@@ -73,10 +73,10 @@ class Passband:
 
     @property
     def ab_photons(self) -> float:
-        """Photons per second and square metre that pass of a source of AB magnitude 0, whatever its spectrum.
+        """Photons per second and square metre from a source of AB magnitude 0, for any spectrum.
 
-        AB magnitudes compare the photons that pass with those of a source of 3631 Jy at all frequencies, of which
-        3631 Jy / h * integral of transmission / wavelength pass.
+        By definition they are as many as from a source of 3631 Jy at all frequencies:
+        3631 Jy / h * integral of transmission / wavelength.
         """
         x, y = np.array(self.wavelengths), np.array(self.transmission)
         slope = np.diff(y) / np.diff(x)
@@ -84,9 +84,9 @@ class Passband:
         return float(_AB_ZERO / constants.h * (slope * np.diff(x) + (y[:-1] - slope * x[:-1]) * ratio).sum())
 
     def light(self, temperature: float | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Wavelengths [m] and the photons that pass at each, on any scale, of a black body of `temperature` [K].
+        """Return wavelengths [m] and relative numbers of photons from a black body of `temperature` [K] that pass.
 
-        None: as many photons at each wavelength. Raises ValueError for a temperature that is not positive.
+        None means equally many photons at each wavelength. Raises ValueError if the temperature is not positive.
         """
         x, y = np.array(self.wavelengths), np.array(self.transmission)
         if temperature is None:
@@ -95,7 +95,7 @@ class Passband:
             raise ValueError(f"temperature is {temperature}: it must be finite and positive, in K")
         fine = np.unique(np.concatenate([x, np.linspace(x[0], x[-1], 400)]))
         exponent = constants.h * constants.c / (fine * constants.k * temperature)
-        logarithm = -4 * np.log(fine) - np.log(-np.expm1(-exponent)) - exponent  # of Planck's photons
+        logarithm = -4 * np.log(fine) - np.log(-np.expm1(-exponent)) - exponent  # of Planck's photon spectrum
         return fine, np.interp(fine, x, y) * np.exp(logarithm - logarithm.max())
 
 
@@ -103,7 +103,7 @@ def check_curve(wavelengths: np.ndarray, transmission: np.ndarray) -> None:
     """Raise ValueError unless these are a transmission curve as `Passband` describes it."""
     if wavelengths.ndim != 1 or wavelengths.shape != transmission.shape or len(wavelengths) < 2:
         raise ValueError(
-            f"the curve has {wavelengths.shape} wavelengths and {transmission.shape} transmissions: as many, and at "
+            f"wavelengths have shape {wavelengths.shape} and transmissions {transmission.shape}: equal numbers, and at "
             "least 2, are needed"
         )
     if not (np.isfinite(wavelengths).all() and wavelengths[0] > 0 and (np.diff(wavelengths) > 0).all()):
