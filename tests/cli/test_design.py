@@ -15,8 +15,10 @@ from torchmask.design.constraints import KeepOutDisc, RimMargin, check_mask
 from torchmask.design.criterion import AsymptoticMSE
 from torchmask.design.manufacture import load_mask
 from torchmask.design.tolerance import machining_tolerance
+from torchmask.design.turbulent import TurbulentMSE
 from torchmask.grid import Grid
 from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.pixel import SquarePixel
 from torchmask.spectra import NoisePSD, PowerLawPSD
 
 SMALL = ["design", "--n-subapertures", "4", "--fill-factor", "0.1", "--budget", "60", "--n-frequencies", "32"]
@@ -53,6 +55,7 @@ def test_metrics_are_of_the_detector_and_of_the_workshop(folder):
     assert metrics["relative_mse"] == pytest.approx(float(criterion.relative(mask)), rel=1e-12)
     expected = machining_tolerance(criterion, mask, 0.01, quantile=0.95, generator=torch.Generator().manual_seed(0))
     assert metrics["machining"] == {
+        "error_of": "both",
         "growth_of_mse": 0.01,
         "success_probability": 0.95,
         "rms_error_tolerated": expected.rms,
@@ -124,3 +127,40 @@ def test_what_cannot_be_is_refused_before_any_work(option, said, tmp_path, capsy
     assert main([*SMALL, *option, "--out", str(tmp_path / "new")]) == 1
     assert re.search(said, capsys.readouterr().err)
     assert not (tmp_path / "new").exists()
+
+
+def test_a_mask_is_searched_under_turbulence(tmp_path):
+    out = tmp_path / "run"
+    few = ["--no-refine", "--method", "cma", "--budget", "20", "--criterion", "turbulent"]
+    seeing = ["--r0", "0.2", "--outer-scale", "20", "--sky", "2", "--pixel-fill-factor", "1"]
+    assert main([*SMALL, *NOISE, *few, *seeing, "--out", str(out)]) == 0
+    grid, noise = Grid.nyquist(1.0, 550e-9, 32), NoisePSD(1e5, 5.0, 48**2)
+    seen = {"r0": 0.2, "outer_scale": 20.0, "pixel": SquarePixel(1.0), "sky": 2.0}
+    criterion = TurbulentMSE(grid, PowerLawPSD(1.5, 1e5), noise, 20, **seen)
+    found = json.loads((out / "metrics.json").read_text())["relative_mse"]
+    assert found == pytest.approx(float(criterion.relative(load_mask(out / "mask.json"))), rel=1e-6)
+
+
+def test_options_of_turbulence_are_those_of_the_criterion():
+    given = {"criterion": "turbulent", "r0": 0.2, "exposure_time": 2e-3}
+    exposure = Options(**given, wind=(10.0,), wavelengths=(530e-9, 570e-9)).turbulence(550e-9)
+    assert (exposure["exposure"], exposure["wind"]) == (2e-3, 10.0)
+    assert "outer_scale" not in exposure
+    assert (exposure["wavelengths"], exposure["weights"]) == ((530e-9, 570e-9), None)
+    assert Options(**given, wind=(3.0, 4.0)).turbulence(550e-9)["wind"] == (3.0, 4.0)
+    assert Options(r0=0.2).turbulence(550e-9) is None
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["--criterion", "turbulent"], "needs --r0"),
+        (["--sky", "3"], "--sky needs --criterion turbulent"),
+        (["--outer-scale", "20", "--r0", "0.2"], "--outer-scale needs --criterion turbulent"),
+        (["--criterion", "turbulent", "--r0", "0.2", "--wind", "1", "2", "3"], "--wind has 3 numbers"),
+        (["--criterion", "turbulent", "--r0", "0.2", "--exposure-time", "1e-3"], "without wind"),
+    ],
+)
+def test_turbulence_that_cannot_be_is_refused(given, said, tmp_path, capsys):
+    assert main([*SMALL, *given, "--out", str(tmp_path / "run")]) != 0
+    assert said in capsys.readouterr().err

@@ -22,7 +22,7 @@ _BASELINES = (16, 16)
 _STEPS = (0.4, 0.75, 1.0)  # of the largest a - a', where k is taken
 _PER_HOLE, _PER_R0 = 12, 6
 _THINNEST = 0.9  # of a hole's reach: lenses further out carry nothing
-_LOST = 1e-3  # of the light, in modes that are left out
+_LOST = 1e-2  # of the light, in modes that are left out
 
 
 class ColourCoherence:

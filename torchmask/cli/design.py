@@ -6,12 +6,13 @@ import math
 import time
 import warnings
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 
+from torchmask.cli.criterion_options import CriterionOptions
 from torchmask.cli.options import InstrumentOptions, RunOptions, SearchOptions, require_wavelength
 from torchmask.cli.report import log_design
 from torchmask.cli.run import new_run
@@ -22,7 +23,8 @@ from torchmask.design.drawing import LIFE_SIZE, require_scale, save_dxf, save_sv
 from torchmask.design.manufacture import least_pixels, save_fits, save_json
 from torchmask.design.redundancy import analyse_redundancy
 from torchmask.design.search import SearchResult, search_mask
-from torchmask.design.tolerance import machining_tolerance
+from torchmask.design.tolerance import Kind, machining_tolerance
+from torchmask.design.turbulent import TurbulentMSE
 from torchmask.grid import Grid
 from torchmask.instrument.instrument import Instrument
 from torchmask.io import write_json
@@ -36,7 +38,7 @@ _GROWTH, _SUCCESS = 0.01, 0.95  # tolerated growth of the MSE by machining error
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(InstrumentOptions, SearchOptions, RunOptions):
+class Options(CriterionOptions, InstrumentOptions, SearchOptions, RunOptions):
     """Search the positions of the holes that minimise the error of the restored image.
 
     Writes mask.json (for `torchmask simulate` and `restore`), mask.fits (an image in metres), the drawings mask.dxf and
@@ -55,8 +57,6 @@ class Options(InstrumentOptions, SearchOptions, RunOptions):
     """Read-out noise [electrons rms per pixel and frame]."""
     n_pixels: int = 128
     """Pixels per side of the detector's field, which sets the total read-out noise; the criterion has its own grid."""
-    r0: float | None = None
-    """Fried parameter at the wavelength [m], to warn if holes are wider; None: no such check."""
     method: Literal["hybrid", "cma"] = "hybrid"
     """Search method: descents and basin hopping on a coarse grid, which finds better masks, or CMA-ES, as published."""
     min_gap: float = 0.0
@@ -100,10 +100,15 @@ def light(options: Options) -> float:
     return Instrument.load(options.instrument).photons(area)
 
 
-def make_criterion(search: SearchOptions, grid: Grid, noise: NoisePSD, n_frames: int) -> AsymptoticMSE:
-    """Return the asymptotic MSE for these options."""
+def make_criterion(
+    search: SearchOptions, grid: Grid, noise: NoisePSD, n_frames: int, turbulence: dict[str, Any] | None = None
+) -> AsymptoticMSE:
+    """The criterion that the options ask for; `turbulence` are keywords of `TurbulentMSE`."""
     knee = PowerLawPSD.knee if search.knee is None else search.knee
-    return AsymptoticMSE(grid, PowerLawPSD(search.exponent, noise.n_photons, knee), noise, n_frames=n_frames)
+    spectrum = PowerLawPSD(search.exponent, noise.n_photons, knee)
+    if turbulence is None:
+        return AsymptoticMSE(grid, spectrum, noise, n_frames)
+    return TurbulentMSE(grid, spectrum, noise, n_frames, **turbulence)
 
 
 def search(
@@ -133,14 +138,18 @@ def run(options: Options) -> None:
     """Search, and write the mask, or the best one so far if interrupted."""
     require_wavelength(options.wavelength)
     require_scale(options.scale)
+    turbulence = options.turbulence(options.wavelength)
+    shortest = min((turbulence or {}).get("wavelengths") or (options.wavelength,))
+    sampled = Grid.nyquist(options.mask_diameter, min(shortest, options.wavelength), options.n_frequencies)
     criterion = make_criterion(
         options,
-        Grid.nyquist(options.mask_diameter, options.wavelength, options.n_frequencies),
+        replace(sampled, wavelength=options.wavelength),
         NoisePSD(light(options), options.readout_noise, options.n_pixels**2),
         options.n_frames,
+        turbulence,
     )
     rules = constraints(options)
-    if options.r0 is not None:
+    if options.r0 is not None and turbulence is None:
         warn_of_wide_holes(options, options.r0)
     last: list[Record] = []
     with new_run("design", options, options.seed) as output:
@@ -200,11 +209,14 @@ def warn_of_wide_holes(options: Options, r0: float) -> None:
     )
 
 
-def machining(criterion: AsymptoticMSE, aperture: SparseAperture, seed: int) -> dict[str, float]:
-    """Return the machining tolerance for metrics.json: the rms error [m] of positions and diameter."""
+def machining(criterion: AsymptoticMSE, aperture: SparseAperture, seed: int) -> dict[str, float | str]:
+    """Return the machining tolerance for metrics.json: the rms error [m] of positions and, without turbulence,
+    of the diameter, each value of which would take turbulence tables of its own."""
     generator = torch.Generator().manual_seed(seed)
-    found = machining_tolerance(criterion, aperture, _GROWTH, quantile=_SUCCESS, generator=generator)
+    kind: Kind = "position" if isinstance(criterion, TurbulentMSE) else "both"
+    found = machining_tolerance(criterion, aperture, _GROWTH, quantile=_SUCCESS, kind=kind, generator=generator)
     return {
+        "error_of": kind,
         "growth_of_mse": _GROWTH,
         "success_probability": _SUCCESS,
         "rms_error_tolerated": found.rms,
