@@ -238,6 +238,26 @@ def test_covariance_is_stationary_and_definite(seed, shift, shape):
     assert float(torch.linalg.eigvalsh(covariance).min()) > -1e-13 * largest
 
 
+def test_change_over_a_drift_is_a_difference_of_places():
+    """Modes of a hole, and of the same hole a drift away in any of 24 directions."""
+    drift, hole = 0.6, modal_covariance(SparseAperture([[0.0, 0.0]], 1.0, 12.0), 6, 1.0, 30.0)
+    moved = torch.zeros_like(hole)
+    for k in range(24):
+        angle = (k + 0.5) * math.pi / 12
+        both = modal_covariance(pair(drift, angle=angle), 6, 1.0, 30.0)
+        moved += (both[:6, 6:] + both[6:, :6]) / 24
+    change = modal_covariance(SparseAperture([[0.0, 0.0]], 1.0, 12.0), 6, 1.0, 30.0, drift)
+    scale = change.diagonal().sqrt()
+    assert ((change - 2 * hole + moved) / scale / scale[:, None]).abs().max() < 2e-3
+    assert torch.equal(modal_covariance(pair(2.0), 3, 1.0, 30.0, 0.0), torch.zeros(6, 6, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("drift", [-1.0, math.inf, math.nan])
+def test_a_drift_is_a_distance(drift):
+    with pytest.raises(ValueError, match="drift is"):
+        modal_covariance(pair(2.0), 1, 1.0, 30.0, drift)
+
+
 def test_twenty_sub_apertures_are_quick_and_definite():
     """Six modes each, the fixed area of the reference case; positions as they come, coincidences included."""
     generator = torch.Generator().manual_seed(0)

@@ -63,6 +63,7 @@ UNITS = {
     "most_arcsec": r"\[arcsec\]",
     "exposure_time": r"\[s\]",
     "crop": r"\[pixels\]",
+    "exposure_tau0": r"\[tau0",
     "pixel_fill": "([Pp]art|fraction) of the area",
     "gain": "[Ee]lectrons per adu",
     "saturation": "in its unit",

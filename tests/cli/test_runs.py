@@ -204,6 +204,7 @@ def test_errors_of_a_cube_and_the_sky_are_those_of_the_library_call(runs, cube, 
     wrong = ["restore", tmp_path / "wrong.fits", *known]
     refused(wrong, tmp_path, capsys, r"wrong.fits: errors is not positive at 1 valid .* \(1, 2, 3\).* --no-errors")
     refused([*wrong, "--no-errors", "--sky", "-1"], tmp_path, capsys, "background is negative")
+    refused([*wrong, "--no-errors", "--exposure-tau0", "-1"], tmp_path, capsys, "exposure_tau0 is -1.*units of tau0")
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import torch
 from torchmask.restoration.checkpoint import Ending, Status
 from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.judge import Judge
+from torchmask.restoration.motion import Setting
 from torchmask.restoration.placed import moved_centers
 from torchmask.restoration.placement import moved
 from torchmask.restoration.schedule import Schedule
@@ -31,10 +32,12 @@ def test_each_ending_is_judged_where_it_has_found_the_mask(explain):
     objective, state = explain(noise=0.003)
     stack = FrameStack(objective.frames, torch.ones_like(objective.frames, dtype=torch.bool), 1.0, 0.003**2)
     told = objective.model.pupil.aperture
-    expected = Judge(objective.model, stack, TRAITS, Schedule()).verdict(objective, Ending(state, Status.CONVERGED))
+    expected = Judge(Setting.of(objective), stack, TRAITS, Schedule()).verdict(
+        objective, Ending(state, Status.CONVERGED)
+    )
     turned_back = told.replace(moved_centers(told.centers, -TURN))
     objective = objective.with_changes(model=objective.model.through(turned_back))
-    judge = Judge(objective.model, stack, TRAITS, Schedule(model_errors=0.0))  # any excess counts
+    judge = Judge(Setting.of(objective), stack, TRAITS, Schedule(model_errors=0.0))  # any excess counts
     there = Ending(moved(state, TURN), Status.CONVERGED)
     here = Ending(state, Status.CONVERGED)
     assert judge.verdict(objective, there).chi_square == pytest.approx(expected.chi_square, rel=1e-9)

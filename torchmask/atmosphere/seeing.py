@@ -10,8 +10,7 @@ import torch
 from scipy.special import roots_jacobi
 from torch import Tensor
 
-from torchmask.atmosphere.structure import StructureFunction
-from torchmask.atmosphere.von_karman import STRUCTURE_CONSTANT
+from torchmask.atmosphere.structure import StructureFunction, coherence_distance
 
 
 @dataclass(frozen=True)
@@ -66,7 +65,7 @@ class Seeing:
     @property
     def tau0(self) -> float:
         """Time in which two points of Kolmogorov turbulence change by 1 rad rms against each other [s]."""
-        return math.inf if self.speed == 0 else STRUCTURE_CONSTANT ** (-3 / 5) * self.r0 / self.speed
+        return math.inf if self.speed == 0 else coherence_distance(self.r0) / self.speed
 
     @property
     def is_isotropic(self) -> bool:

@@ -78,6 +78,14 @@ class StructureFunction:
         return STRUCTURE_CONSTANT * root**5 * _clenshaw(series, position)
 
 
+def coherence_distance(r0: float) -> float:
+    """How far [m] a frozen wind carries Kolmogorov turbulence of `r0` [m] until two points have changed by 1 rad rms.
+
+    0.314 r0; over the speed of the wind that is tau0.
+    """
+    return STRUCTURE_CONSTANT ** (-3 / 5) * r0
+
+
 @lru_cache(maxsize=64)
 def _series(longest: float) -> tuple[float, ...]:
     """Return Chebyshev coefficients of the ratio of von Karman's to Kolmogorov's structure function.

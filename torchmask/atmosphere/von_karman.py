@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -80,7 +81,9 @@ def _correlation(x: np.ndarray) -> np.ndarray:
     return np.where(x > 0, 2 ** (1 / 6) / special.gamma(5 / 6) * safe ** (5 / 6) * special.kv(5 / 6, safe), 1.0)
 
 
-def modal_covariance(aperture: Aperture, n_modes: int, r0: float, outer_scale: float) -> Tensor:
+def modal_covariance(
+    aperture: Aperture, n_modes: int, r0: float, outer_scale: float, drift: float | None = None
+) -> Tensor:
     """Return the joint covariance [rad^2] of the Zernike coefficients of all sub-apertures in von Karman turbulence.
 
     Parameters
@@ -93,6 +96,9 @@ def modal_covariance(aperture: Aperture, n_modes: int, r0: float, outer_scale: f
         Fried parameter [m].
     outer_scale : float
         Outer scale of the turbulence [m].
+    drift : float, optional
+        With a distance [m], the covariance of the change of the coefficients while frozen turbulence moves by so much,
+        all directions being equally likely. None: the covariance of the coefficients themselves.
 
     Returns
     -------
@@ -105,11 +111,13 @@ def modal_covariance(aperture: Aperture, n_modes: int, r0: float, outer_scale: f
     Raises
     ------
     ValueError
-        If the aperture is a population of masks, or a scale is not finite and positive.
+        If the aperture is a population of masks, a scale is not finite and positive, or the drift is negative or not
+        finite.
 
     Notes
     -----
     The covariance is the integral of W(f) M_p(f) M_q(f)* over frequencies, with M the Fourier transforms of the modes.
+    For the change, the spectrum is 2 W(f) (1 - J_0(2 pi f drift)) instead of W(f).
     The quadrature has the same form, a Gram matrix, so the result is positive semi-definite to rounding. It is polar:
     Gauss nodes in |f|, denser towards f = 0 where the outer scale bends the spectrum, and uniform angles, which
     converge exponentially once they resolve the longest baseline. The error is 3e-4 of the variances up to radial order
@@ -123,6 +131,8 @@ def modal_covariance(aperture: Aperture, n_modes: int, r0: float, outer_scale: f
     [3.556, 0.161, 0.161]
     """
     require_turbulence(r0, outer_scale)
+    if drift is not None and not (math.isfinite(drift) and drift >= 0):
+        raise ValueError(f"drift is {drift}: it must be finite and at least 0, in m")
     if aperture.centers.ndim != 2:
         raise ValueError(
             f"centers has shape {tuple(aperture.centers.shape)}: one mask, (n_subapertures, 2), is needed; pass the "
@@ -131,27 +141,41 @@ def modal_covariance(aperture: Aperture, n_modes: int, r0: float, outer_scale: f
     centers = aperture.centers.detach().cpu().double()
     bend = math.pi * aperture.outer_diameter / outer_scale + 2 * noll(n_modes)[0]
     shared, highest = _SHARED + bend, (_HIGHEST + bend) / aperture.shape.fineness
-    total = _gram(aperture, n_modes, r0, outer_scale, centers, 0.0, shared)
-    own = _gram(aperture, n_modes, r0, outer_scale, torch.zeros_like(centers[:1]), shared, highest)
+    spectrum = _Spectrum(r0, outer_scale, drift)
+    total = _gram(aperture, n_modes, spectrum, centers, 0.0, shared)
+    own = _gram(aperture, n_modes, spectrum, torch.zeros_like(centers[:1]), shared, highest)
     total = total + torch.kron(torch.eye(len(centers), dtype=own.dtype, device=own.device), own)
     return ((total + total.T) / 2).to(aperture.centers.device)
 
 
-def _gram(
-    aperture: Aperture, n_modes: int, r0: float, outer_scale: float, places: Tensor, start: float, stop: float
-) -> Tensor:
+class _Spectrum(NamedTuple):
+    """Power spectral density of the phase, or of its change over a drift [rad^2 m^2]."""
+
+    r0: float
+    outer_scale: float
+    drift: float | None
+
+    def __call__(self, frequency: Tensor) -> Tensor:
+        phase = von_karman_psd(frequency, self.r0, self.outer_scale)
+        if self.drift is None:
+            return phase
+        return 2 * phase * (1 - torch.special.bessel_j0(2 * math.pi * self.drift * frequency))
+
+
+def _gram(aperture: Aperture, n_modes: int, spectrum: _Spectrum, places: Tensor, start: float, stop: float) -> Tensor:
     """Return the part of the covariance of holes at `places` (N, 2) from `start` <= pi |f| outer_diameter < `stop`."""
     order, diameter = noll(n_modes)[0], aperture.outer_diameter
     points, weights = aperture.shape.quadrature(math.ceil(stop) + order + 16, aperture.subaperture_diameter)
     modes = weights[:, None] * aperture_modes(aperture, points, n_modes)  # (Q, J)
-    reach = float(torch.cdist(places, places).max()) + diameter
+    reach = float(torch.cdist(places, places).max()) + diameter + 2 * (spectrum.drift or 0.0)
     total = modes.new_zeros(len(places) * n_modes, len(places) * n_modes)
-    for frequency, area in _panels(start / (math.pi * diameter), stop / (math.pi * diameter), outer_scale, reach):
+    low, high = start / (math.pi * diameter), stop / (math.pi * diameter)
+    for frequency, area in _panels(low, high, spectrum.outer_scale, reach):
         turns = math.pi * float(frequency[-1])
         n_angles = math.ceil(turns * reach) + 2 * order + 24  # on half a turn, as the other half is the conjugate
         n_known = order + 2 if aperture.shape.is_round else math.ceil(turns * diameter) + order + 20
         transform = _mode_transforms(points, modes, frequency, n_known, n_angles)  # (R, A, J)
-        weight = 2 * math.pi / n_angles * area * von_karman_psd(frequency, r0, outer_scale)
+        weight = 2 * math.pi / n_angles * area * spectrum(frequency)
         transform = weight.sqrt()[:, None, None] * transform
         phasor = _phasor(frequency[:, None, None] * (_directions(n_angles) @ places.T))  # (R, A, N)
         field = (phasor[..., None] * transform[..., None, :]).flatten(0, 1).flatten(1)  # (R A, N J)

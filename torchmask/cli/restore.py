@@ -61,6 +61,8 @@ class Options(BandOptions, StackOptions, OIFITSOptions, WorkerOptions, RunOption
     """Its light [electrons per pixel]; or one constant for each frame, to be found always or if the frames show one."""
     pixel_fill: float | None = None
     """Part of the area of its pitch in which a pixel is sensitive, 1 for gapless pixels; None: pixels are points."""
+    exposure_tau0: float = 0.0
+    """How long a frame lasts [tau0 = 0.314 r0 / wind]: holes then move meanwhile in the model; 0: snapshots."""
     star: Path | None = None
     """Exposures of a star through the same mask, .npz or .fits: first they tell how it lies (`torchmask calibrate`)."""
     refine_geometry: Literal["if-seen", "yes", "no"] = "if-seen"
@@ -205,6 +207,7 @@ def deconvolution(observation: Observation, options: Options) -> MyopicDeconvolu
         **options.band(observation.grid.wavelength),
         static_modes=options.static_modes,
         pixel=pixel_response(options.pixel_fill),
+        exposure_tau0=options.exposure_tau0,
         refine_geometry=REFINEMENTS[options.refine_geometry],
         prior=TotalVariation(options.tv_weight),
         aberration_prior=options.prior,

@@ -7,11 +7,14 @@ import math
 import torch
 from torch import Tensor, nn
 
+from torchmask.atmosphere.structure import coherence_distance
 from torchmask.atmosphere.von_karman import modal_covariance
 from torchmask.optics.aperture import Aperture
 
 _STRENGTH_RANGE = (0.05, 20.0)  # limits of the turbulence's strength relative to its first guess, in (1/r0)^(5/3)
 _LEAST_ERROR = 1e-3  # rad
+_MOVING_MODES = 3  # piston, tip and tilt
+_INSTANTS = (-0.5 / math.sqrt(3), 0.5 / math.sqrt(3))  # the two Gauss nodes, exact for what is cubic in time
 _ROUNDING = 1e-6  # relative rounding error of a covariance that may come from float32
 
 
@@ -27,6 +30,9 @@ class AberrationBasis(nn.Module):
         Number of Zernike modes per sub-aperture, J, from Noll mode 1.
     n_common : int
         How many of the K parameters are common to all frames.
+    motion : (N J, K) tensor, optional
+        Matrix [rad] that gives the change of the coefficients from the beginning to the end of a frame. None: frames
+        are snapshots.
 
     Examples
     --------
@@ -36,10 +42,12 @@ class AberrationBasis(nn.Module):
     """
 
     mixing: Tensor
+    motion: Tensor | None
 
-    def __init__(self, mixing: Tensor, n_modes: int, n_common: int = 0) -> None:
+    def __init__(self, mixing: Tensor, n_modes: int, n_common: int = 0, motion: Tensor | None = None) -> None:
         super().__init__()
         self.register_buffer("mixing", mixing)
+        self.register_buffer("motion", motion)
         self.n_modes: int = n_modes
         self.n_common: int = n_common
 
@@ -58,9 +66,42 @@ class AberrationBasis(nn.Module):
         """How many of the parameters are a frame's own."""
         return self.n_parameters - self.n_common
 
+    @property
+    def instants(self) -> tuple[float, ...]:
+        """Times within a frame, which lasts from -1/2 to 1/2, whose images are averaged with equal weights."""
+        return (0.0,) if self.motion is None else _INSTANTS
+
+    def mixing_at(self, instant: float) -> Tensor:
+        """Return the matrix (N J, K) at an instant of the frame, which lasts from -1/2 to 1/2."""
+        return self.mixing if self.motion is None else self.mixing + instant * self.motion
+
+    def in_motion(self, motion: Tensor) -> AberrationBasis:
+        """Return the basis with M more parameters of each frame, for the change of its coefficients.
+
+        `motion` (N J, M) [rad] is the change for one unit of each. They stand between the frame's other parameters and
+        the common ones.
+        """
+        own, common = self.mixing.tensor_split([self.n_own], dim=1)
+        motion = motion.to(own)
+        mixing = torch.cat([own, torch.zeros_like(motion), common], dim=1)
+        moving = torch.cat([torch.zeros_like(own), motion, torch.zeros_like(common)], dim=1)
+        return AberrationBasis(mixing, self.n_modes, self.n_common, moving)
+
     def coefficients(self, z: Tensor) -> Tensor:
-        """Zernike coefficients (..., N, J) [rad rms] of the parameters (..., K)."""
+        """Zernike coefficients (..., N, J) [rad rms] of the parameters (..., K), in the middle of the frame."""
         return (z @ self.mixing.to(z).T).unflatten(-1, (self.n_subapertures, self.n_modes))
+
+    def change(self, z: Tensor) -> Tensor | None:
+        """Return the change (..., N, J) [rad rms] of the coefficients within a frame; None for snapshots."""
+        if self.motion is None:
+            return None
+        return (z @ self.motion.to(z).T).unflatten(-1, (self.n_subapertures, self.n_modes))
+
+    def parameters_of_change(self, change: Tensor) -> Tensor:
+        """Return the parameters (T, K) whose change is closest to (T, N, J) [rad rms]; all others are zero."""
+        assert self.motion is not None
+        motion = self.motion.double()
+        return change.to(motion).flatten(1) @ torch.linalg.pinv(motion).T
 
     def parameters_of(self, coefficients: Tensor) -> Tensor:
         """Return the parameters (T, K) whose coefficients are closest to (T, N, J), exact except for the mean piston.
@@ -156,6 +197,20 @@ def turbulent_basis(
     return AberrationBasis(torch.cat([own, common], dim=1), total, common.shape[1])
 
 
+def moving_basis(
+    still: AberrationBasis, aperture: Aperture, exposure: float, r0: float, outer_scale: float
+) -> AberrationBasis:
+    """Return the basis `still` with a change of piston, tip and tilt of each hole during an exposure.
+
+    `exposure` is in units of tau0 = 0.314 r0 / wind, `r0` and `outer_scale` are in m. The parameters of the change are
+    white if frozen turbulence of these scales moves in a random direction.
+    """
+    n_modes = min(_MOVING_MODES, still.n_modes)
+    change = whitening(aperture, n_modes, r0, outer_scale, drift=exposure * coherence_distance(r0))
+    change = change.unflatten(0, (still.n_subapertures, n_modes))
+    return still.in_motion(nn.functional.pad(change, (0, 0, 0, still.n_modes - n_modes)).flatten(0, 1))
+
+
 def estimated_basis(aperture: Aperture, n_modes: int, covariance: Tensor) -> AberrationBasis:
     """Return the basis in which errors of coefficients with `covariance` (N J, N J) [rad^2] are white.
 
@@ -170,13 +225,14 @@ def estimated_basis(aperture: Aperture, n_modes: int, covariance: Tensor) -> Abe
     return AberrationBasis(root(covariance.double()), n_modes)
 
 
-def whitening(aperture: Aperture, n_modes: int, r0: float, outer_scale: float) -> Tensor:
+def whitening(aperture: Aperture, n_modes: int, r0: float, outer_scale: float, drift: float | None = None) -> Tensor:
     """L (N J, K) with L L^T the von Karman covariance of all modes, less the piston common to all sub-apertures.
 
     Coefficients a = L z, sub-aperture by sub-aperture, follow von Karman statistics if z is white noise. The mean
-    piston cannot be seen; without it K = N J - 1. r0 and outer_scale in m, L in rad.
+    piston cannot be seen; without it K = N J - 1. r0 and outer_scale in m, L in rad. With a `drift` [m] it is the
+    covariance of the change while turbulence moves so far.
     """
-    covariance = modal_covariance(aperture, n_modes, r0, outer_scale)
+    covariance = modal_covariance(aperture, n_modes, r0, outer_scale, drift)
     n_sub = aperture.n_subapertures
     common = torch.zeros(n_sub, n_modes, dtype=covariance.dtype, device=covariance.device)
     common[:, 0] = n_sub**-0.5

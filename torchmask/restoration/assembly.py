@@ -56,6 +56,7 @@ def assemble_result(
         magnification=state.geometry.magnification,
         geometry_std=_geometry_deviations(objective, state) if refined else None,
         verdict=verdict,
+        motion=model.aberrations.change(state.z),
     )
 
 

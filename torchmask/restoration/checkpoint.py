@@ -110,6 +110,17 @@ class Checkpoint:
     path: Path
     fingerprint: str
 
+    @classmethod
+    def of(
+        cls,
+        path: str | Path | None,
+        objective: MyopicObjective,
+        settings: Sequence[object],
+        known: Sequence[Tensor | None],
+    ) -> Checkpoint | None:
+        """The file at `path`, if there is to be one, of a restoration with these settings."""
+        return None if path is None else cls(Path(path), fingerprint_of(objective, settings, known))
+
     def save(self, progress: Progress) -> None:
         """Write or replace the file."""
         arrays: dict[str, Any] = {name: getattr(progress, name) for name in ("costs", *_NUMBERS)}

@@ -120,7 +120,7 @@ class ExposureModel(nn.Module):
         super().__init__()
         basis = plain_basis(aperture, aberrations) if isinstance(aberrations, int) else aberrations
         band = band or Band.of([grid.wavelength])
-        basis = AberrationBasis(basis.mixing.to(device=device), basis.n_modes, basis.n_common)
+        basis = copy.deepcopy(basis).to(device=device)
         self.window: Window = Window.around(grid, margin)
         self.background: Background = background
         response = None if pixel is None else _half_plane(pixel, self.window.field).to(device)
@@ -166,13 +166,13 @@ class ExposureModel(nn.Module):
 
     def chunks(self, n_frames: int) -> Iterator[slice]:
         """Slices of the frames whose work arrays stay small."""
-        pixels = len(self.band.wavelengths) * math.prod(self.window.field.shape)
+        pixels = self.pupil.n_rasters * math.prod(self.window.field.shape)
         size = max(1, _CHUNK // (2 * self.dtype.itemsize * pixels))
         return (slice(start, min(start + size, n_frames)) for start in range(0, n_frames, size))
 
     def amplitude(self, samples: OpenSamples, field: Tensor) -> Tensor:
         """Focal amplitude (T, wavelength, H', W') of a pupil field (T, P)."""
-        rasters = (len(self.band.wavelengths), *self.window.field.shape)
+        rasters = (self.pupil.n_rasters, *self.window.field.shape)
         pupil = field.new_zeros(len(field), math.prod(rasters)).index_add(1, samples.index, field)
         return torch.fft.fft2(pupil.unflatten(1, rasters))
 
@@ -187,11 +187,11 @@ class ExposureModel(nn.Module):
             spectrum = spectrum * self.response.conj().to(spectrum)
         return torch.fft.irfft2(spectrum, s=self.window.field.shape)
 
-    def through(self, aperture: Aperture) -> ExposureModel:
-        """The same model, aberration basis and all, through another aperture of as many sub-apertures."""
+    def through(self, aperture: Aperture, aberrations: AberrationBasis | None = None) -> ExposureModel:
+        """The same model through another aperture of as many sub-apertures, or with other aberrations."""
         twin = copy.deepcopy(self)
         kwargs = {"dtype": self.dtype, "device": self.device}
-        twin.pupil = SampledPupil(aperture, self.window.field, self.band, self.aberrations, **kwargs)
+        twin.pupil = SampledPupil(aperture, self.window.field, self.band, aberrations or self.aberrations, **kwargs)
         return twin
 
     def psf(self, z: Tensor, samples: OpenSamples | None = None) -> Tensor:

@@ -5,14 +5,12 @@ from __future__ import annotations
 from functools import cached_property
 from typing import NamedTuple
 
-from torchmask.optics.aperture import Aperture
 from torchmask.restoration.calibration import fit_of_frames
 from torchmask.restoration.checkpoint import Ending, Status
-from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.model_error import NO_MODEL_ERROR, LeftOut, expected_error
+from torchmask.restoration.motion import Setting
 from torchmask.restoration.objective import MyopicObjective
-from torchmask.restoration.placement import placed_as
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.traits import Traits
 from torchmask.restoration.verdict import Tolerance, Verdict, judge
@@ -27,12 +25,11 @@ class Comparison(NamedTuple):
 
 
 class Judge:
-    """Verdicts on the endings of one stack, each with the mask where it has found it against what `model` was told."""
+    """Verdicts on the endings of one stack, each with mask and motion as it has found them."""
 
-    def __init__(self, model: ExposureModel, stack: FrameStack, traits: Traits, schedule: Schedule) -> None:
+    def __init__(self, setting: Setting, stack: FrameStack, traits: Traits, schedule: Schedule) -> None:
         least = schedule.missed * stack.change if traits.many_minima else 0.0  # its poor minima are no worse than that
-        self.told: Aperture = model.pupil.aperture
-        self.n_modes: int = model.aberrations.n_modes
+        self.setting: Setting = setting
         self.traits: Traits = traits
         self.alike: float = schedule.alike
         self.contrast: float = stack.contrast
@@ -41,7 +38,7 @@ class Judge:
     def verdict(self, objective: MyopicObjective, ending: Ending) -> Verdict:
         """Whether the frames are explained by what a start, or all of them, ended at."""
         state = ending.state
-        objective = placed_as(objective, self.told, state.geometry)
+        objective = self.setting.objective_at(objective, state)
         pixels = (objective.precision.expand_as(objective.frames) > 0).sum((1, 2))
         chi_square = fit_of_frames(objective, state)[1]
         at_rest = ending.status is not Status.ITERATION_LIMIT
@@ -61,4 +58,4 @@ class Judge:
 
     @cached_property
     def _left_out(self) -> LeftOut:
-        return LeftOut.of(self.told, self.n_modes, self.traits.r0, self.traits.outer_scale)
+        return LeftOut.of(self.setting.told, self.setting.still.n_modes, self.traits.r0, self.traits.outer_scale)

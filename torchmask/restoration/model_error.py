@@ -87,6 +87,7 @@ class LeftOut:
 def expected_error(objective: MyopicObjective, state: State, left_out: LeftOut) -> ModelError:
     """What a fit such as `state` leaves if nothing is wrong with it; always the same for the same state."""
     model, rest = objective.model, left_out.rest
+    rest = rest if model.aberrations.motion is None else rest.in_motion(torch.zeros_like(rest.mixing[:, :0]))
     strength = left_out.strength(objective, state)
     field, kind = model.window.field, {"dtype": model.dtype, "device": model.device}
     high = SampledPupil(model.pupil.aperture, field, model.band, rest, **kind).samples()

@@ -18,7 +18,7 @@ from torchmask.optics.pixel import PixelResponse
 from torchmask.record import Callback
 from torchmask.restoration.assembly import add_deviations, assemble_result
 from torchmask.restoration.background import Background
-from torchmask.restoration.checkpoint import Checkpoint, fingerprint_of
+from torchmask.restoration.checkpoint import Checkpoint
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.frames import Array, FrameStack
 from torchmask.restoration.memory import keep_freed_memory
@@ -31,7 +31,7 @@ from torchmask.restoration.result import RestorationResult
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.solver import Solver
 from torchmask.restoration.starts import Known
-from torchmask.restoration.traits import Refinement, Traits, check_numbers
+from torchmask.restoration.traits import Refinement, Traits, check_numbers, check_samples
 
 
 class MyopicDeconvolution:
@@ -74,6 +74,9 @@ class MyopicDeconvolution:
     pixel : PixelResponse, optional
         How the detector's pixels blur the image: `SquarePixel(fill_factor)`, or `MappedPixel` with a map of their
         sensitivity. The object is restored without it. None: pixels are points.
+    exposure_tau0 : float
+        How long a frame lasts, in units of tau0 = 0.314 r0 / wind. Piston, tip and tilt of every hole may then change
+        evenly during a frame, and coefficients are those in its middle. 0: frames are snapshots.
     refine_geometry : bool, optional
         Whether a turn and an even magnification of the mask are found with the object. None: if the frames say clearly
         that it lies otherwise than told. Frames of a star tell it more precisely, and more of it: `calibrate_mask`.
@@ -131,6 +134,7 @@ class MyopicDeconvolution:
         static_modes: int = 0,
         background: Background | float | Tensor = Background.IF_SEEN,
         pixel: PixelResponse | None = None,
+        exposure_tau0: float = 0.0,
         refine_geometry: bool | None = None,
         prior: Callable[[Tensor], Tensor] | None = None,
         aberration_prior: bool = True,
@@ -157,6 +161,7 @@ class MyopicDeconvolution:
             outer_scale=20 * aperture.mask_diameter if outer_scale is None else outer_scale,
             whitened=aberration_prior,
             pixel=pixel,
+            exposure_tau0=exposure_tau0,
             dtype=dtype,
             device=device,
         )
@@ -253,8 +258,7 @@ class MyopicDeconvolution:
             If noise, border or fringes of the frames do not fit `readout_noise`, the field or the mask's orientation.
         """
         started = time.perf_counter()
-        if n_samples < 0 or n_samples == 1:
-            raise ValueError(f"n_samples is {n_samples}: 0 for no standard deviations, or at least 2")
+        check_samples(n_samples)
         keep_freed_memory()
         stack = self._stack(frames, valid, errors)
         warn_of_orientation(stack.frames, self.recipe.aperture, self.recipe.grid)
@@ -265,11 +269,13 @@ class MyopicDeconvolution:
             objective = MyopicObjective(
                 model, stack.frames, stack.precision, self.prior, free=known.free, parallel=parallel
             )
-            solver = Solver(objective, stack, self._traits(known, seed), self.schedule, self.minimizer, callback)
+            traits, moving = self._traits(known, seed), self.recipe.moving_basis(model.aberrations)
+            solver = Solver(objective, stack, traits, self.schedule, self.minimizer, callback, moving)
+            settings = (replace(traits, max_iterations=0, tolerance=0.0), self.minimizer, self.schedule)
             check_prior(self.prior, model.window.embed(stack.frames.mean(0).clamp(min=0)).double())
-            progress = solver.solve(known, start, self._checkpoint(checkpoint, solver, known))
-            verdict = solver.verdict(progress.ending)
-            result = assemble_result(solver.objective, stack, progress, solver.prior_r0, verdict)
+            progress = solver.solve(known, start, Checkpoint.of(checkpoint, objective, settings, known.tensors))
+            found = (progress, solver.prior_r0, solver.verdict(progress.ending))
+            result = assemble_result(solver.objective, stack, *found)
             if n_samples:
                 result = add_deviations(result, solver.objective, stack, progress, n_samples)
         return replace(result, seconds=time.perf_counter() - started)
@@ -278,14 +284,7 @@ class MyopicDeconvolution:
         grid, aperture = self.recipe.bluest_grid, self.recipe.aperture
         return FrameStack.of(frames, valid, grid, aperture, self.readout_noise, self.background, errors)
 
-    def _checkpoint(self, path: str | Path | None, solver: Solver, known: Known) -> Checkpoint | None:
-        if path is None:
-            return None
-        settings = (replace(solver.traits, max_iterations=0, tolerance=0.0), self.minimizer, self.schedule)
-        return Checkpoint(Path(path), fingerprint_of(solver.objective, settings, known.tensors))
-
     def _traits(self, known: Known, seed: int) -> Traits:
-        blind = known.nothing and self.recipe.whitened
         return Traits(
             many_minima=self.many_minima,
             estimated=known.estimated,
@@ -296,5 +295,6 @@ class MyopicDeconvolution:
             max_iterations=self.max_iterations,
             tolerance=self.tolerance,
             seed=seed,
-            refinement=self.refinement if blind or self.refinement is Refinement.ON else Refinement.OFF,
+            refinement=self.refinement.where(blind=known.nothing and self.recipe.whitened),
+            exposure_tau0=self.recipe.exposure_tau0,
         )

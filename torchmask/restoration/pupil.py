@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 from typing import NamedTuple
@@ -93,6 +94,11 @@ class SampledPupil(nn.Module):
         self.register_buffer("centers", aperture.centers.detach().clone(), persistent=False)
         self.register_load_state_dict_post_hook(_forget)
 
+    @property
+    def n_rasters(self) -> int:
+        """One for each wavelength at each instant of a frame."""
+        return len(self.band.wavelengths) * len(self.aberrations.instants)
+
     def samples(self) -> OpenSamples:
         """The open samples of the aperture where it lies now."""
         centers = self.aperture.centers
@@ -126,18 +132,20 @@ class SampledPupil(nn.Module):
     def _sample(self, centers: Tensor) -> OpenSamples:
         pixels = math.prod(self.grid.shape)
         parts = []
-        for number, (wavelength, share) in enumerate(zip(self.band.wavelengths, self.band.shares, strict=True)):
-            part = self._sample_at(centers, wavelength)
-            weights = math.sqrt(share) * part.weights
+        instants = self.aberrations.instants
+        bands = zip(self.band.wavelengths, self.band.shares, strict=True)
+        for number, ((wavelength, share), instant) in enumerate(itertools.product(bands, instants)):
+            part = self._sample_at(centers, wavelength, instant)
+            weights = math.sqrt(share / len(instants)) * part.weights
             parts.append(part._replace(weights=weights, index=part.index + number * pixels))
         return OpenSamples(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
-    def _sample_at(self, centers: Tensor, wavelength: float) -> OpenSamples:
+    def _sample_at(self, centers: Tensor, wavelength: float, instant: float) -> OpenSamples:
         aperture, grid = self.aperture, replace(self.grid, wavelength=wavelength)
         samples = sample_holes(centers, aperture.shape, aperture.subaperture_diameter, grid, 1)
         modes = zernike_basis(samples, aperture, self.aberrations.n_modes)  # (N, P, J)
         is_open = samples.weights > 0
-        mixing = self.aberrations.mixing.to(modes).unflatten(0, (len(modes), self.aberrations.n_modes))
+        mixing = self.aberrations.mixing_at(instant).to(modes).unflatten(0, (len(modes), self.aberrations.n_modes))
         mixed = torch.einsum("npj,njk->npk", modes, mixing)[is_open]
         weights = samples.weights[is_open]
         # Parseval: this makes the sum of every PSF 1, whatever the phase, as long as holes share no cell.

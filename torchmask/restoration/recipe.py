@@ -12,7 +12,7 @@ from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.band import Band
 from torchmask.optics.pixel import PixelResponse
-from torchmask.restoration.aberrations import AberrationBasis, estimated_basis, turbulent_basis
+from torchmask.restoration.aberrations import AberrationBasis, estimated_basis, moving_basis, turbulent_basis
 from torchmask.restoration.forward import ExposureModel
 
 
@@ -24,6 +24,7 @@ class ModelRecipe:
     r0, outer_scale : of the turbulence [m]
     whitened : whether the parameters are white under the prior; False: they are the coefficients themselves
     pixel : the detector's; None: it samples the image
+    exposure_tau0 : how long a frame lasts [tau0]; 0: frames are snapshots
 
     Raises
     ------
@@ -42,6 +43,7 @@ class ModelRecipe:
     dtype: torch.dtype
     device: torch.device | str | None
     pixel: PixelResponse | None = None
+    exposure_tau0: float = 0.0
 
     def __post_init__(self) -> None:
         shape = tuple(self.aperture.centers.shape)
@@ -53,6 +55,21 @@ class ModelRecipe:
         for name, count, least in (("n_modes", self.frame_modes, 1), ("static_modes", self.static_modes, 0)):
             if count < least:
                 raise ValueError(f"{name} is {count}: it must be a whole number of at least {least}")
+        self._check_exposure()
+
+    def _check_exposure(self) -> None:
+        if not (math.isfinite(self.exposure_tau0) and self.exposure_tau0 >= 0):
+            raise ValueError(
+                f"exposure_tau0 is {self.exposure_tau0}: it must be finite and at least 0, in units of tau0"
+            )
+        if self.exposure_tau0 and not self.whitened:
+            raise ValueError(
+                f"exposure_tau0 is {self.exposure_tau0} without aberration_prior: a change has no size then"
+            )
+        if self.exposure_tau0 and self.aperture.n_subapertures == 1:
+            raise ValueError(
+                f"exposure_tau0 is {self.exposure_tau0}: only masks have motion in their model, leave it out"
+            )
 
     @property
     def n_modes(self) -> int:
@@ -72,6 +89,12 @@ class ModelRecipe:
             )
         aperture = self.aperture if follows_aperture else self.aperture.still()
         return self._build(aperture, basis)
+
+    def moving_basis(self, still: AberrationBasis) -> AberrationBasis | None:
+        """The basis of aberrations that change during an exposure, beside those of `still`; None for snapshots."""
+        if self.exposure_tau0 == 0:
+            return None
+        return moving_basis(still, self.aperture.still(), self.exposure_tau0, self.r0, self.outer_scale)
 
     def estimated_model(self, covariance: Tensor) -> ExposureModel:
         """The model whose parameters are errors of estimated coefficients, of `covariance` (N J, N J) [rad^2].

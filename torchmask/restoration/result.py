@@ -45,6 +45,7 @@ class RestorationResult(Brief):
     magnification : fitted magnification of the mask; 1 if it was not fitted
     geometry_std : (2,) standard deviations of rotation and magnification due to noise, or None
     verdict : whether all this explains the frames; None in files of 0.1
+    motion : (T, N, J) change of the coefficients while a frame lasts [rad rms]; None where frames are snapshots
 
     Examples
     --------
@@ -83,6 +84,7 @@ class RestorationResult(Brief):
     magnification: float = 1.0
     geometry_std: Tensor | None = None
     verdict: Verdict | None = None
+    motion: Tensor | None = None
 
     @property
     def geometry(self) -> MaskGeometry:
@@ -138,6 +140,9 @@ class RestorationResult(Brief):
                 f"mask turned by {math.degrees(self.rotation):.3f} +- {math.degrees(turn):.3f} deg from x to y and "
                 f"magnified by {self.magnification:.5f} +- {scale:.5f} against what was told"
             )
+        if self.motion is not None:
+            piston = self.motion[..., 0] - self.motion[..., 0].mean(1, keepdim=True)
+            lines.append(f"pistons change by {float(piston.square().mean().sqrt()):.2f} rad rms while a frame lasts")
         return "\n".join([*lines, *([] if self.verdict is None else [str(self.verdict)])])
 
 

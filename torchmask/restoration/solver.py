@@ -14,12 +14,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from torch import Tensor
-
-from torchmask.optics.aperture import Aperture
 from torchmask.optics.geometry import MaskGeometry
 from torchmask.record import Callback, Record
 from torchmask.restoration import escapes
+from torchmask.restoration.aberrations import AberrationBasis
 from torchmask.restoration.calibration import recalibrate
 from torchmask.restoration.candidates import Candidates, play_stage
 from torchmask.restoration.checkpoint import Checkpoint, Ending, Progress, Status
@@ -27,8 +25,9 @@ from torchmask.restoration.descent import Variables, descend
 from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.judge import Judge
 from torchmask.restoration.marginal import integrate_aberrations
+from torchmask.restoration.motion import Setting
 from torchmask.restoration.objective import Free, MyopicObjective
-from torchmask.restoration.placement import distance, is_misplaced, placed_as
+from torchmask.restoration.placement import distance, is_misplaced
 from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.result import RestorationResult
 from torchmask.restoration.schedule import Schedule
@@ -58,6 +57,8 @@ class Solver:
     minimizer : Minimizer
     callback : callable, optional
         Gets a `Record` after every iteration.
+    moving : AberrationBasis, optional
+        Aberrations that change while a frame lasts. None: frames are snapshots.
     """
 
     def __init__(
@@ -68,9 +69,10 @@ class Solver:
         schedule: Schedule,
         minimizer: Minimizer,
         callback: Callback | None = None,
+        moving: AberrationBasis | None = None,
     ) -> None:
         self.objective: MyopicObjective = objective
-        self.told: Aperture = objective.model.pupil.aperture
+        self.setting: Setting = Setting.of(objective, moving)
         self.unit: float = stack.unit
         self.traits: Traits = traits
         self.schedule: Schedule = schedule
@@ -80,7 +82,7 @@ class Solver:
         self.first_inflation: float = max(1.0, change / schedule.first_inflation)
         held = traits.prior_on_aberrations and not traits.many_minima  # through a full pupil it was not tried
         self.is_faint: bool = held and Free.OBJECT | Free.ABERRATIONS in objective.free and change < schedule.faint
-        self.judge: Judge = Judge(objective.model, stack, traits, schedule)
+        self.judge: Judge = Judge(self.setting, stack, traits, schedule)
 
     def solve(self, known: Known, start: RestorationResult | None = None, file: Checkpoint | None = None) -> Progress:
         """The restoration from its beginning, an earlier result or a checkpoint to its end."""
@@ -110,6 +112,7 @@ class Solver:
         if start is None:
             return Progress(self._first_candidates(state, self.traits.seed), refinement=self.traits.refinement)
         warm, n_known = start_from_result(self.objective, state, start, self.unit)
+        warm = self.setting.in_motion(warm, self.traits.seed, start.motion)
         self._place(warm)
         progress = Progress(Candidates(warm, 1), escapes=self.schedule.escapes, refinement=self.traits.refinement)
         if n_known < len(warm.z) and Free.ABERRATIONS in self.objective.free:
@@ -134,8 +137,8 @@ class Solver:
         return progress
 
     def _place(self, state: State) -> MyopicObjective:
-        """The objective, with the mask where the state has found it."""
-        self.objective = placed_as(self.objective, self.told, state.geometry)
+        """The objective, with mask and motion as the state has found them."""
+        self.objective = self.setting.objective_at(self.objective, state)
         return self.objective
 
     def _look_at_place(self, progress: Progress) -> None:
@@ -193,21 +196,23 @@ class Solver:
         objective = self._place(state)
         after = float(objective.evaluator(state.calibration)(state.image, state.z).value)
         progress.state, decrease = state, (before - after) / abs(after)
-        is_still = distance(place, state.geometry) < schedule.still
+        at_rest = decrease <= self.traits.tolerance and distance(place, state.geometry) < schedule.still
         self._look_at_place(progress)
         limit = self._limit(progress)
         goes_on = limit is Status.RUNNING
         if goes_on and Free.ABERRATIONS in objective.free and progress.escapes < schedule.escapes:
-            at_rest = progress.iterations == done
-            if at_rest or Free.OBJECT not in objective.free or progress.iterations >= schedule.sharp_after:
+            moved_nothing = progress.iterations == done
+            if moved_nothing or Free.OBJECT not in objective.free or progress.iterations >= schedule.sharp_after:
                 self._escape(progress)
-        elif decrease <= self.traits.tolerance and is_still:
+        elif at_rest and not self.setting.awaits_motion(progress.state):
             progress.status, progress.decrease = Status.CONVERGED, decrease
             return
         progress.status = limit
         if goes_on and schedule.recalibrates:
             sharpen = progress.escapes == schedule.escapes
             progress.state = self._recalibrate(objective, progress.state, sharpen=sharpen)
+        if goes_on and (at_rest or progress.iterations >= schedule.sharp_after):
+            progress.state = self.setting.in_motion(progress.state, self.traits.seed)
 
     def _limit(self, progress: Progress) -> Status:
         """Which iterations are spent, if any are."""
@@ -287,14 +292,7 @@ class Solver:
         step, arrays = len(progress.costs), {}
         if step == 1 or step % 10 == 0:
             image, z = variables()
-            arrays = self.arrays(image, z[: len(self.objective.frames)])
+            coefficients = self.objective.model.aberrations.coefficients(z[: len(self.objective.frames)])
+            arrays = {"object": self.objective.model.window.crop(image) * self.unit, "coefficients": coefficients}
         scalars = {"cost": progress.costs[-1]}
         self.callback(Record("restoration", step, self._last_iteration(progress), scalars, arrays))
-
-    def arrays(self, image: Tensor, z: Tensor) -> dict[str, Tensor]:
-        """Object (H, W) [electrons] and coefficients (T, N, J) [rad rms]."""
-        model = self.objective.model
-        return {
-            "object": model.window.crop(image) * self.unit,
-            "coefficients": model.aberrations.coefficients(z),
-        }

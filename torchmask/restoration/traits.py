@@ -28,6 +28,10 @@ class Refinement(Enum):
             raise ValueError("refine_geometry is True: only a mask has baselines that tell how it lies, leave it out")
         return cls.OFF
 
+    def where(self, *, blind: bool) -> Refinement:
+        """This, or `OFF` where it is left to the frames and something else of them is known: not `blind`."""
+        return self if blind or self is Refinement.ON else Refinement.OFF
+
 
 @dataclass(frozen=True)
 class Traits:
@@ -42,6 +46,7 @@ class Traits:
     tolerance : a segment that lowers the cost by a smaller fraction is the last one
     seed : of random starts
     refinement : whether the mask's place is found too
+    exposure_tau0 : how long a frame lasts [tau0]; 0: frames are snapshots
     """
 
     many_minima: bool
@@ -54,6 +59,7 @@ class Traits:
     tolerance: float
     seed: int
     refinement: Refinement
+    exposure_tau0: float = 0.0
 
 
 def check_numbers(readout_noise: float | None, max_iterations: int, tolerance: float) -> None:
@@ -64,3 +70,9 @@ def check_numbers(readout_noise: float | None, max_iterations: int, tolerance: f
         raise ValueError(
             f"max_iterations is {max_iterations} and tolerance {tolerance}: they must be at least 1 and at least 0"
         )
+
+
+def check_samples(n_samples: int) -> None:
+    """Raise ValueError for a number of samples that tell no standard deviations."""
+    if n_samples < 0 or n_samples == 1:
+        raise ValueError(f"n_samples is {n_samples}: 0 for no standard deviations, or at least 2")

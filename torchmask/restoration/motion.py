@@ -1,0 +1,82 @@
+"""Aberrations that change during an exposure, which lowers the contrast of the fringes.
+
+Each frame has, beside the aberrations at its middle, parameters for their change from its beginning to its end. They
+are white under the covariance that the change has if frozen turbulence moves with the wind, and the image is the mean
+over two instants (`AberrationBasis.in_motion`). Zero change is a stationary point of the cost, because a frame does not tell
+the direction of time, so the search starts from small random changes. It starts only when the object is sharp: before,
+a change that takes the fringes of a hole through whole waves explains the frames of a blurred object as well.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchmask.optics.aperture import Aperture
+from torchmask.restoration.aberrations import AberrationBasis
+from torchmask.restoration.objective import Free, MyopicObjective
+from torchmask.restoration.placement import placed_as
+from torchmask.restoration.state import State
+
+_FIRST = 0.1  # rms of the first changes, relative to their prior
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What an objective is made for and a state may change: how the mask lies, and whether aberrations move.
+
+    told : the mask as the user describes it
+    still : basis of the aberrations of snapshots
+    moving : the same basis with changes during the exposure; None: frames are snapshots
+    """
+
+    told: Aperture
+    still: AberrationBasis
+    moving: AberrationBasis | None = None
+
+    @classmethod
+    def of(cls, objective: MyopicObjective, moving: AberrationBasis | None = None) -> Setting:
+        """Return the setting of an objective of snapshots; known aberrations do not move."""
+        model, is_free = objective.model, Free.ABERRATIONS in objective.free
+        return cls(model.pupil.aperture, model.aberrations, moving if is_free else None)
+
+    def awaits_motion(self, state: State) -> bool:
+        """Whether the aberrations change during the exposure, and the state does not have the change yet."""
+        return self.moving is not None and state.z.shape[1] < self.moving.n_parameters
+
+    def in_motion(self, state: State, seed: int, change: Tensor | None = None) -> State:
+        """Return the state with changes of the aberrations, if it awaits them.
+
+        They are small and random, or for the first T' frames the given `change` (T', N, J) [rad rms].
+        """
+        if self.moving is None or not self.awaits_motion(state):
+            return state
+        size = (len(state.z), self.moving.n_parameters - self.still.n_parameters)
+        generator = torch.Generator().manual_seed(seed)
+        first = _FIRST * torch.randn(size, dtype=state.z.dtype, device="cpu", generator=generator).to(state.z)
+        if change is not None:
+            known = self.moving.parameters_of_change(change.to(first))
+            first[: len(change)] = known[:, self.still.n_own : self.moving.n_own]
+        return replace(state, z=self._widened(state.z, first))
+
+    def objective_at(self, objective: MyopicObjective, state: State) -> MyopicObjective:
+        """Return the objective with its mask and its aberrations as `state` has them."""
+        objective = placed_as(objective, self.told, state.geometry)
+        n_parameters, model, centre = state.z.shape[1], objective.model, objective.centre
+        if self.moving is None or n_parameters == model.aberrations.n_parameters:
+            return objective
+        if n_parameters == self.moving.n_parameters:
+            basis = self.moving
+            centre = self._widened(centre, centre.new_zeros(len(centre), n_parameters - self.still.n_parameters))
+        else:
+            basis = self.still
+            centre = torch.cat([centre[:, : basis.n_own], centre[:, self.moving.n_own :]], dim=1)
+        model = model.through(model.pupil.aperture, basis.to(model.device))
+        return objective.with_changes(model=model, centre=centre)
+
+    def _widened(self, z: Tensor, change: Tensor) -> Tensor:
+        """Insert the parameters (T, M) of a change into z (T, K) of snapshots."""
+        own, common = z.tensor_split([self.still.n_own], dim=1)
+        return torch.cat([own, change, common], dim=1)
