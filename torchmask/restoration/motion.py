@@ -2,9 +2,9 @@
 
 Each frame has, beside the aberrations at its middle, parameters for their change from its beginning to its end. They
 are white under the covariance that the change has if frozen turbulence moves with the wind, and the image is the mean
-over two instants (`AberrationBasis.in_motion`). Zero change is a stationary point of the cost, because a frame does not tell
-the direction of time, so the search starts from small random changes. It starts only when the object is sharp: before,
-a change that takes the fringes of a hole through whole waves explains the frames of a blurred object as well.
+over two instants (`AberrationBasis.in_motion`). Zero change is a stationary point of the cost, because a frame does not
+tell the direction of time, so the search starts from small random changes. It starts only when the object is sharp:
+before, a change that takes the fringes of a hole through whole waves explains the frames of a blurred object as well.
 """
 
 from __future__ import annotations
