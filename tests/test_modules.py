@@ -27,8 +27,9 @@ from torchmask.optics.psf import PSF
 from torchmask.optics.zernike import ZernikePhase
 from torchmask.restoration.aberrations import AberrationBasis, plain_basis
 from torchmask.restoration.forward import ExposureModel
+from torchmask.restoration.given_prior import FunctionPrior
 from torchmask.restoration.objective import MyopicObjective
-from torchmask.restoration.priors import EdgePreserving, FunctionPrior, ObjectPrior, TotalVariation
+from torchmask.restoration.priors import EdgePreserving, ObjectPrior, SmoothVariation, TotalVariation
 from torchmask.restoration.pupil import SampledPupil
 from torchmask.spectra import NoisePSD, PowerLawPSD
 
@@ -150,6 +151,7 @@ MODULES: dict[str, Entry] = {
     ),
     "objective": Entry(lambda: objective(mask()), costly, lambda: objective(moved())),
     "total variation": Entry(TotalVariation, penalised),
+    "total variation with bends": Entry(SmoothVariation, penalised),
     "edge-preserving prior": Entry(EdgePreserving, penalised),
     "prior that is a module": Entry(
         lambda: FunctionPrior(nn.Sequential(nn.Flatten(0), nn.Softplus(), nn.LayerNorm(64, elementwise_affine=False))),

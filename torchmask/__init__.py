@@ -39,7 +39,7 @@ from torchmask.planning.result import ObservationPlan
 from torchmask.restoration.baselines import average_psf, shift_and_add
 from torchmask.restoration.many import restore_many
 from torchmask.restoration.myopic import MyopicDeconvolution
-from torchmask.restoration.priors import EdgePreserving, TotalVariation
+from torchmask.restoration.priors import EdgePreserving, SmoothVariation, TotalVariation
 from torchmask.restoration.result import RestorationResult
 from torchmask.restoration.wiener import multiframe_wiener
 from torchmask.simulation.conditions import Conditions
@@ -79,6 +79,7 @@ __all__ = [
     "SceneOptions",
     "SearchResult",
     "Site",
+    "SmoothVariation",
     "Source",
     "SparseAperture",
     "StackDataset",

@@ -14,10 +14,11 @@ from torchmask.record import Record
 from torchmask.restoration.candidates import several
 from torchmask.restoration.checkpoint import Checkpoint, Ending, Progress, Status, fingerprint_of
 from torchmask.restoration.forward import ExposureModel
+from torchmask.restoration.given_prior import as_prior
 from torchmask.restoration.minimizers import TorchMinimizer
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.objective import Free, MyopicObjective
-from torchmask.restoration.priors import EdgePreserving, TotalVariation, as_prior
+from torchmask.restoration.priors import EdgePreserving, TotalVariation
 from torchmask.restoration.projected_lbfgs import ProjectedLBFGS
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.state import Calibration, State

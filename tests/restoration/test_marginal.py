@@ -10,7 +10,12 @@ from torchmask.optics.aperture import SparseAperture
 from torchmask.restoration.aberrations import turbulent_basis
 from torchmask.restoration.descent import descend
 from torchmask.restoration.forward import ExposureModel
-from torchmask.restoration.marginal import AberrationSampler, integrate_aberrations, laplace_precision
+from torchmask.restoration.marginal import (
+    AberrationSampler,
+    integrate_aberrations,
+    laplace_precision,
+    settle_at_own_scale,
+)
 from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.priors import TotalVariation
 from torchmask.restoration.projected_lbfgs import ProjectedLBFGS, minimize_bounded
@@ -19,6 +24,13 @@ from torchmask.restoration.state import Calibration, State
 
 GRID = Grid.nyquist(1.0, 550e-9, 32, oversampling=1.2)
 BRIEF = Schedule(rounds=4, moves=3, renewal=2, segment=3)
+
+
+class OfOneScale(TotalVariation):
+    """Whatever the object."""
+
+    def suited_to(self, image):
+        return self
 
 
 def one_piston(noise, n_frames, identical=False, weight=1.0):
@@ -34,7 +46,7 @@ def one_piston(noise, n_frames, identical=False, weight=1.0):
     if identical:
         frames = frames[:1].expand_as(frames).clone()
     ones = torch.ones(n_frames, dtype=torch.float64)
-    objective = MyopicObjective(model, frames, torch.tensor([[[noise**-2]]]).double(), TotalVariation(weight))
+    objective = MyopicObjective(model, frames, torch.tensor([[[noise**-2]]]).double(), OfOneScale(weight))
     return objective, State(image, z, Calibration(ones, ones, 1.0))
 
 
@@ -156,3 +168,22 @@ def test_one_seed_one_result_and_a_record_of_every_round(explain):
     assert not torch.equal(first.image, other.image)
     assert [record.step for record in records] == [1, 2, 3, 4] * 3
     assert all(record.stage == "integration" and 0 <= record.scalars["accepted"] <= 1 for record in records)
+
+
+def test_in_the_end_the_object_is_settled_at_its_own_scale(explain):
+    """Nothing pulls at it there: the gradient of misfit and suited prior vanishes, or pushes against the bound."""
+    objective, state = explain()
+    settled = settle_at_own_scale(objective, state, 400)
+    assert torch.equal(settled.z, state.z)
+    prior = objective.prior.suited_to(state.image)
+    slope, power = objective.object_quadratic(state.image, state.z, state.calibration)
+    change = settled.image - state.image
+    curved = torch.fft.irfft2(torch.fft.rfft2(change) * power, s=change.shape)
+
+    def pull(image, data):
+        free = data + prior.value_and_gradient(image)[1]
+        return float(torch.where(image > 0, free, free.clamp(max=0)).abs().max())
+
+    assert pull(settled.image, slope + curved) < 1e-2 * pull(state.image, slope)
+    fixed = MyopicObjective(objective.model, objective.frames, objective.precision, OfOneScale())
+    assert settle_at_own_scale(fixed, state, 5) is state

@@ -7,13 +7,12 @@ import pytest
 import torch
 from torch import nn
 
+from torchmask.restoration.given_prior import FunctionPrior, as_prior, check_prior
 from torchmask.restoration.priors import (
     EdgePreserving,
-    FunctionPrior,
     ObjectPrior,
+    SmoothVariation,
     TotalVariation,
-    as_prior,
-    check_prior,
     divergence,
     gradient,
 )
@@ -59,6 +58,8 @@ class Ridge(ObjectPrior):
 PRIORS = {
     "total variation": TotalVariation,
     "smoother total variation": lambda: TotalVariation(2.0, 0.3),
+    "total variation with bends": SmoothVariation,
+    "more bends": lambda: SmoothVariation(0.3, 2.0, 0.1),
     "edge preserving": EdgePreserving,
     "edge preserving, other threshold": lambda: EdgePreserving(0.7, 0.1),
     "function": lambda: squares,
@@ -116,7 +117,7 @@ def test_curvature_majorises_or_is_the_diagonal_of_the_hessian(make):
         assert bool((found.flatten() >= exact - 1e-12).all())
 
 
-@pytest.mark.parametrize("make", [TotalVariation, partial(TotalVariation, 2.0, 0.3), EdgePreserving])
+@pytest.mark.parametrize("make", [TotalVariation, partial(TotalVariation, 2.0, 0.3), SmoothVariation, EdgePreserving])
 def test_curvature_majorises(make):
     """A quadratic in one pixel with that curvature lies above the prior everywhere and touches it at the image."""
     prior = make()
@@ -148,6 +149,52 @@ def test_total_variation_gradient():
         prior, image = TotalVariation(epsilon=epsilon), rough(5, 6)
         assert (prior.value_and_gradient(image)[1] - exact_gradient(prior, image)).abs().max() < 1e-12
     assert TotalVariation().value_and_gradient(torch.ones(3, 3))[1].abs().max() == 0
+
+
+def test_bends_of_known_images():
+    prior = SmoothVariation(2.0, 0.25, 1e-9)
+    point = torch.zeros(8, 8, dtype=torch.float64)
+    point[3, 3] = 5.0
+    # On the point two second differences of 2 and a mixed one of 1; beside it those of 1, two with a mixed one.
+    bends = 10**0.5 + 2 * 3**0.5 + 2 + 2**0.5
+    assert float(prior(point)) == pytest.approx(2 * 5 * (2 + 2**0.5 + 0.25 * bends), rel=1e-6)
+    assert float(SmoothVariation()(torch.full((4, 4), 3.0))) == 0
+    even = torch.arange(6, dtype=torch.float64) + 2 * torch.arange(5, dtype=torch.float64)[:, None]
+    inside = SmoothVariation(1.0, 1e3).value_and_gradient(even)[1][2, 2:4]  # nothing pulls at an even slope
+    assert float(inside.abs().max()) < 1e-12
+
+
+def test_a_variation_suited_to_an_object_has_the_scale_of_its_gradients():
+    point = torch.zeros(8, 8, dtype=torch.float64)
+    point[3, 3] = 5.0  # gradients of 5, 5 and 5 sqrt 2
+    rate = 3 * (2 + 2**0.5) / (5 * 4)
+    suited = TotalVariation(2.0, 0.3).suited_to(point)
+    assert isinstance(suited, SmoothVariation)
+    assert suited.weight == pytest.approx(2 * rate, rel=1e-12)
+    assert suited.epsilon == 0.3
+    wide = nn.functional.pad(point, (0, 20, 0, 30))  # a dark sky says nothing of the object
+    assert TotalVariation().suited_to(wide).weight == pytest.approx(rate, rel=1e-12)
+
+
+def test_gradients_of_one_rate_are_known_by_it():
+    """Of random gradients, whatever the share of pixels without any; within four standard errors of both moments."""
+    n, rate = 20000, 0.4
+    lengths = torch.distributions.Gamma(2.0, rate).expand((n,))
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        heights = lengths.sample().double()
+    stripes = torch.zeros(1, 4 * n, dtype=torch.float64)
+    stripes[0, ::4] = heights  # each has two slopes, and flat pixels beside it
+    found = TotalVariation().suited_to(stripes).weight
+    assert abs(found / rate - 1) < 4 * (0.5 + (120 / 36 - 1)) ** 0.5 / n**0.5  # of E|g|, and of E|g|^2: 120 / mu^4
+
+
+def test_priors_without_a_scale_stay_as_they_are():
+    flat = torch.full((4, 4), 3.0)
+    for prior in (EdgePreserving(), as_prior(squares), TotalVariation()):
+        assert prior.suited_to(flat) is prior
+    other = EdgePreserving()
+    assert other.suited_to(rough()) is other
 
 
 def test_edge_preserving_is_quadratic_in_slopes_and_linear_in_edges():
@@ -209,6 +256,7 @@ def test_own_gradient_and_curvature_are_used():
 def test_what_a_prior_is_called_tells_it_from_others():
     """A checkpoint goes by it; the repr of a function would hold an address."""
     assert repr(TotalVariation(2.0)) == "TotalVariation(weight=2, epsilon=0.01)"
+    assert repr(SmoothVariation()) == "SmoothVariation(weight=1, bending=0.25, epsilon=0.01)"
     assert repr(EdgePreserving()) == "EdgePreserving(weight=2, threshold=0.5)"
     assert repr(as_prior(squares)).endswith("squares")
     assert "0x" not in repr(as_prior(squares))

@@ -124,7 +124,8 @@ def integrate_aberrations(
     """The likeliest object whatever the aberrations, with the aberrations that fit it best, and the evaluations spent.
 
     It begins where a descent has ended; a weight of the aberrations' prior is needed. `follow_r0` lets that follow the
-    samples. The callback gets a `Record` after every round.
+    samples. In the end the object is settled under a prior of its own scale. The callback gets a `Record` after every
+    round.
     """
     generator = torch.Generator().manual_seed(seed)
     sampler, size, spent = AberrationSampler(objective, state, generator), schedule.move_size, 0
@@ -153,7 +154,25 @@ def integrate_aberrations(
         spent += evaluations
 
     known_object = objective.with_changes(free=objective.free & ~Free.OBJECT)
-    return descend(known_object, replace(state, image=total), schedule.segment, minimizer, count), spent
+    state = descend(known_object, replace(state, image=total), schedule.segment, minimizer, count)
+    suited = settle_at_own_scale(objective, state, schedule.last_settling)
+    if suited is not state:
+        state = descend(known_object, suited, schedule.segment, minimizer, count)
+    return state, spent
+
+
+@torch.no_grad()
+def settle_at_own_scale(objective: MyopicObjective, state: State, n_iterations: int) -> State:
+    """The object under the prior whose scale it suggests itself, for the aberrations as they are.
+
+    It is `state` itself that comes back where the prior knows no scale (`ObjectPrior.suited_to`).
+    """
+    prior = objective.prior.suited_to(state.image)
+    if prior is objective.prior:
+        return state
+    slope, power = objective.object_quadratic(state.image, state.z, state.calibration)
+    slope = slope + objective.model.background.price
+    return replace(state, image=settle_object(state.image, slope, power, prior, n_iterations)[1])
 
 
 def _filter(image: Tensor, response: Tensor) -> Tensor:

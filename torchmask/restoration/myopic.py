@@ -21,10 +21,11 @@ from torchmask.restoration.background import Background
 from torchmask.restoration.checkpoint import Checkpoint
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.frames import Array, FrameStack
+from torchmask.restoration.given_prior import as_prior, check_prior
 from torchmask.restoration.memory import keep_freed_memory
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.parallel import each_on_a_core
-from torchmask.restoration.priors import ObjectPrior, TotalVariation, as_prior, check_prior
+from torchmask.restoration.priors import ObjectPrior, TotalVariation
 from torchmask.restoration.projected_lbfgs import Minimizer, ProjectedLBFGS
 from torchmask.restoration.recipe import ModelRecipe
 from torchmask.restoration.result import RestorationResult
@@ -168,8 +169,7 @@ class MyopicDeconvolution:
         self.refinement: Refinement = Refinement.of(refine_geometry, aperture)
         self.readout_noise: float | None = readout_noise
         self.background: Background | float | Tensor = background
-        self.max_iterations: int = max_iterations
-        self.tolerance: float = tolerance
+        self.max_iterations, self.tolerance = max_iterations, tolerance
         self.prior: ObjectPrior = as_prior(TotalVariation() if prior is None else prior)
         self.minimizer: Minimizer = minimizer or ProjectedLBFGS()
         self.schedule: Schedule = schedule or Schedule()

@@ -45,6 +45,7 @@ class Schedule:
     renewal : rounds after which that approximation is made anew
     memory : share of the averages so far that a round keeps
     settling : iterations that settle the object in a round, at most
+    last_settling : those that settle it in the end, under a prior of its own scale
     """
 
     segment: int = 100
@@ -78,6 +79,7 @@ class Schedule:
     renewal: int = 20
     memory: float = 0.7
     settling: int = 30
+    last_settling: int = 80
 
     def __post_init__(self) -> None:
         stages = [number for number, _ in self.candidates] + [1]
