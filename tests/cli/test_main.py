@@ -87,6 +87,7 @@ UNITS = {
     "true_mask.rotation_deg": r"\[degrees\]",
     "scale": "millimetres on the plate for each metre",
     "width": r"\[m\]",
+    "widths": r"\[m\]",
     "exposure": r"\[s\]",
     "exposures": r"\[s\]",
     "observing_time": r"\[s\]",

@@ -83,6 +83,8 @@ def test_points_are_the_criterion_under_turbulence_pixels_and_sky():
             outer_scale=20.0,
             exposure=choice.exposure,
             wind=10.0,
+            wavelengths=make().band.wavelengths,
+            weights=make().band.shares,
             pixel=SquarePixel(1.0),
             sky=choice.sky,
         )
@@ -142,7 +144,7 @@ def test_the_best_exposure_is_the_vertex_of_a_parabola_of_logarithms():
         return 0.3 * 10 ** (0.2 * (torch.tensor(exposure / 5e-3).log10()) ** 2)
 
     choices = tuple(
-        Choice(3, 0.1, exposure, 10, 1e3, 0.0, float(error(exposure)), 0.1) for exposure in (2e-3, 4e-3, 9e-3)
+        Choice(3, 0.1, exposure, 20e-9, 10, 1e3, 0.0, float(error(exposure)), 0.1) for exposure in (2e-3, 4e-3, 9e-3)
     )
     plan = ObservationPlan(make(), choices, {(3, 0.1): MASK})
     assert plan.best_exposure == pytest.approx(5e-3, rel=1e-5)
@@ -155,6 +157,21 @@ def test_exposures_longer_than_the_observation_are_left_out(quick):
     found = plan_observation(make(), aperture=MASK, exposures=(2e-3, 0.8), n_frequencies=32)
     assert [choice.exposure for choice in found.choices] == [2e-3]
     assert found.left_out[0].startswith("observing_time is 0.5 s, but one frame takes 0.801 s")
+
+
+def test_bands_are_compared_on_the_same_pixels(quick):
+    found = plan_observation(make(), aperture=MASK, exposures=(4e-3,), widths=(80e-9, 20e-9), **TINY)
+    narrow, wide = found.choices
+    assert (narrow.width, wide.width) == (20e-9, 80e-9)
+    assert wide.photons == pytest.approx(4 * narrow.photons)  # a rate of photons grows with the width
+    assert wide.relative_mse < narrow.relative_mse
+    assert found.best_instrument.width == 80e-9
+    floors = [choice.relative_mse - choice.above_floor for choice in found.choices]
+    assert floors[0] == pytest.approx(floors[1], rel=1e-12)
+    assert found.at_edge("width")
+    assert plan_figure(found).axes[-1].get_xlabel() == "width of the band [nm]"
+    with pytest.raises(ValueError, match=r"the band is the filter|give wavelength and width"):
+        plan_observation(make(filter="bessell-V", width=None, wavelength=None), aperture=MASK, widths=(1e-8,))
 
 
 @pytest.mark.parametrize(

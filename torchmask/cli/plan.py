@@ -17,7 +17,7 @@ from torchmask.optics import catalog
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.pupil import Aperture
 from torchmask.planning.plan import plan_observation
-from torchmask.planning.result import ObservationPlan
+from torchmask.planning.result import AXES, ObservationPlan
 from torchmask.viz.figures import mask_figure
 from torchmask.viz.planning import plan_figure
 
@@ -40,6 +40,8 @@ class Options(Instrument, CatalogOptions, RunOptions):
     """To compare [m]; none: 0.5, 0.8 and 1.2 r0."""
     exposures: tuple[float, ...] = ()
     """To compare [s]; none: 0.25, 0.5, 1, 2, 4 and 8 times the coherence time tau0."""
+    widths: tuple[float, ...] = ()
+    """Widths of the band to compare [m]; none: that of the band alone."""
     n_frequencies: int = 128
     """Frequency grid of the criterion, per side."""
     budget: int = 1000
@@ -82,13 +84,14 @@ def run(options: Options) -> None:
             n_subapertures=options.n_subapertures,
             hole_diameters=options.hole_diameters or None,
             exposures=options.exposures or None,
+            widths=options.widths or None,
             aperture=aperture,
             n_frequencies=options.n_frequencies,
             budget=options.budget,
             seed=options.seed,
             callback=output.callback,
         )
-        best = instrument.with_exposure(plan.best.exposure)
+        best = plan.best_instrument
         table = best.describe(float(plan.mask.area))
         output.report("plan", numbers(plan), f"{plan}\n\n{table}\n", plan_figure(plan))
         best.save(output.directory / "instrument.json")
@@ -103,7 +106,7 @@ def numbers(plan: ObservationPlan) -> dict[str, object]:
     return {
         "best": plan.best,
         "best_exposure": plan.best_exposure,
-        "at_edge": {name: plan.at_edge(name) for name in ("n_subapertures", "hole_diameter", "exposure")},
+        "at_edge": {name: plan.at_edge(name) for name in AXES},
         "map": plan.choices,
         "left_out": plan.left_out,
     }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from typing import Any
 
 from torchmask.design.turbulent import TurbulentMSE
 from torchmask.instrument.instrument import Instrument
@@ -45,7 +46,10 @@ def instrument_criterion(
     >>> criterion.n_frames, float(criterion.noise_psd[0, 0])  # 1e9 photons / (s m^2), 0.05 m^2, 2 ms
     (20, 100000.0)
     """
-    air = asdict(instrument.seeing) if turbulence else {}
+    air: dict[str, Any] = {}
+    if turbulence:
+        band = instrument.band
+        air = asdict(instrument.seeing) | {"wavelengths": band.wavelengths, "weights": band.shares}
     fill = instrument.camera.pixel_fill
     return TurbulentMSE(
         instrument.grid(n_pixels),

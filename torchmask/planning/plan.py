@@ -5,12 +5,14 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from torchmask.design.constraint_base import Constraint, Infeasible
 from torchmask.design.constraints import KeepOutDisc
 from torchmask.design.observed import change_light, instrument_criterion
 from torchmask.design.search import search_mask
+from torchmask.grid import ARCSEC
 from torchmask.instrument.instrument import Instrument
 from torchmask.optics.packing import largest_fill_factor
 from torchmask.optics.pupil import Aperture
@@ -27,6 +29,7 @@ def plan_observation(
     n_subapertures: Sequence[int] = (6, 9, 12, 16),
     hole_diameters: Sequence[float] | None = None,
     exposures: Sequence[float] | None = None,
+    widths: Sequence[float] | None = None,
     aperture: Aperture | None = None,
     constraints: Sequence[Constraint] = (),
     n_frequencies: int = 128,
@@ -51,8 +54,10 @@ def plan_observation(
         [m]; None: 0.5, 0.8 and 1.2 r0.
     exposures : sequence of float, optional
         [s]; None: 0.25, 0.5, 1, 2, 4 and 8 tau0.
+    widths : sequence of float, optional
+        Widths of the even band [m], all of them on the pixels that the widest needs; None: the instrument's band.
     aperture : Aperture, optional
-        A mask that exists, or a full pupil, in place of the searches: only the exposure is planned then.
+        A mask that exists, or a full pupil, in place of the searches: only exposure and width are planned then.
     constraints : sequence of Constraint
         Rules of the searches; the central obstruction of the telescope is one already.
     n_frequencies : int
@@ -90,7 +95,8 @@ def plan_observation(
     """
     lengths = _positive("exposures", _default(exposures, _EXPOSURES, instrument.seeing.tau0), "s")
     left_out: list[str] = []
-    exposed = _exposed(instrument, lengths, left_out)
+    bands = [instrument] if widths is None else _bands(instrument, _positive("widths", tuple(widths), "m"))
+    exposed = [one for band in bands for one in _exposed(band, lengths, left_out)]
     if not exposed:
         raise ValueError(f"no exposure is short enough: {left_out[0]}")
     if aperture is None:
@@ -112,7 +118,7 @@ def plan_observation(
     if not masks:
         raise ValueError(f"no point of the map can be built: {'; '.join(left_out)}")
     choices = tuple(_measure(exposed, masks, n_frequencies, callback))
-    return ObservationPlan(instrument, choices, masks, tuple(left_out))
+    return ObservationPlan(instrument, choices, masks, tuple(dict.fromkeys(left_out)))
 
 
 def _default(given: Sequence[float] | None, factors: Sequence[float], unit: float) -> tuple[float, ...]:
@@ -129,6 +135,13 @@ def _whole(values: Sequence[int]) -> tuple[int, ...]:
     if not values or not all(value == int(value) and value >= 2 for value in values) or len(set(values)) < len(values):
         raise ValueError(f"n_subapertures are {tuple(values)}: at least one is needed, none twice, whole, at least 2")
     return tuple(sorted(int(value) for value in values))
+
+
+def _bands(instrument: Instrument, widths: Sequence[float]) -> list[Instrument]:
+    """The instrument with each band, on one grid: errors on different pixels cannot be compared."""
+    scale = instrument.with_width(max(widths)).pixel_scale / ARCSEC
+    known = replace(instrument, camera=replace(instrument.camera, pixel_scale=scale))
+    return [known.with_width(width) for width in widths]
 
 
 def _exposed(instrument: Instrument, lengths: Sequence[float], left_out: list[str]) -> list[Instrument]:
@@ -193,7 +206,8 @@ def _measure(
             error = float(criterion.relative(mask))
             floor = float(criterion.floor(instrument.telescope.diameter) / criterion.object_psd.mean())
             photons, sky = instrument.photons(area), instrument.sky(area)
-            choices.append(Choice(n, hole, instrument.exposure, instrument.frames, photons, sky, error, error - floor))
+            light = instrument.exposure, instrument.width, instrument.frames, photons, sky
+            choices.append(Choice(n, hole, *light, error, error - floor))
             _tell(callback, "plan/map", len(choices), n_steps, error)
     return sorted(choices, key=lambda choice: tuple(getattr(choice, name) for name in AXES))
 

@@ -10,19 +10,21 @@ import numpy as np
 from torchmask.instrument.instrument import Instrument
 from torchmask.optics.pupil import Aperture
 
-AXES = ("n_subapertures", "hole_diameter", "exposure")
+AXES = ("n_subapertures", "hole_diameter", "exposure", "width")
 
 
 @dataclass(frozen=True)
 class Choice:
     """One point of a plan's map.
 
-    hole diameter in metres, exposure in seconds, photons and sky in electrons per frame (of the sky, per pixel)
+    hole diameter in metres, exposure in seconds, width of the band in metres (None for a filter), photons and sky in
+    electrons per frame (of the sky, per pixel)
     """
 
     n_subapertures: int
     hole_diameter: float
     exposure: float
+    width: float | None
     frames: int
     photons: float
     sky: float
@@ -81,6 +83,12 @@ class ObservationPlan:
         line = [c for c in self.choices if all(getattr(c, other) == getattr(best, other) for other in others)]
         return sorted(line, key=lambda choice: getattr(choice, name))
 
+    @property
+    def best_instrument(self) -> Instrument:
+        """The instrument with the exposure and the width of the band of the best point."""
+        found, best = self.instrument.with_exposure(self.best.exposure), self.best
+        return found if best.width in (None, found.width) else found.with_width(best.width)
+
     def at_edge(self, name: str) -> bool:
         """Whether the best point is the first or last along an axis, so that the optimum may lie beyond."""
         line = self.axis(name)
@@ -101,13 +109,13 @@ class ObservationPlan:
         return self.best.exposure * math.exp(-slope / (2 * curvature))
 
     def __str__(self) -> str:
-        best, told = self.best, self.instrument
-        seeing = told.with_exposure(best.exposure).seeing
+        best, told = self.best, self.best_instrument
+        band = "" if best.width is None else f", a band of {1e9 * best.width:.4g} nm"
         lines = [
             f"Least predicted error: {best.relative_mse:.4g}, {best.above_floor:.4g} above what no mask of this "
             f"diameter can avoid, with {best.n_subapertures} holes of {best.hole_diameter:.4g} m "
             f"({best.hole_diameter / told.site.r0:.2g} r0), {best.frames} frames of {1e3 * best.exposure:.4g} ms "
-            f"({best.exposure / seeing.tau0:.2g} tau0) and {best.photons:.4g} photons in each.",
+            f"({best.exposure / told.seeing.tau0:.2g} tau0){band} and {best.photons:.4g} photons in each.",
             f"Best exposure between those of the map: {1e3 * self.best_exposure:.4g} ms.",
             *(
                 f"The best {_WORDS[name]} is at the edge of the map: beyond may be better."
@@ -122,11 +130,17 @@ class ObservationPlan:
         return "\n".join([*lines, *(["", *(f"- {reason}" for reason in self.left_out)] if self.left_out else [])])
 
 
-_WORDS = {"n_subapertures": "number of holes", "hole_diameter": "hole diameter", "exposure": "exposure"}
+_WORDS = {
+    "n_subapertures": "number of holes",
+    "hole_diameter": "hole diameter",
+    "exposure": "exposure",
+    "width": "width of the band",
+}
 _HEADINGS = (
     "N",
     "hole [m]",
     "exposure [ms]",
+    "band [nm]",
     "frames",
     "photons/frame",
     "sky/pixel",
@@ -140,6 +154,7 @@ def _cells(choice: Choice) -> list[str]:
         str(choice.n_subapertures),
         f"{choice.hole_diameter:.4g}",
         f"{1e3 * choice.exposure:.4g}",
+        "-" if choice.width is None else f"{1e9 * choice.width:.4g}",
         str(choice.frames),
         f"{choice.photons:.4g}",
         f"{choice.sky:.4g}",

@@ -16,15 +16,22 @@ if TYPE_CHECKING:
 
 @drawing.styled
 def plan_figure(plan: ObservationPlan) -> Figure:
-    """The predicted error over number and size of holes at the best exposure, and over the exposure for each number.
+    """The predicted error over number and size of holes, over the exposure for each number, and over the width.
 
-    Of one mask, the exposures alone. The best point is marked with a ring.
+    Each panel is at the best of all else; those of one mask or one width are left out. A ring marks the best point.
     """
-    several = len(plan.masks) > 1
-    figure, axes = drawing.row_of_axes([1.25, 1.5] if several else [1.7], height=3.6)
+    several, widths = len(plan.masks) > 1, plan.axis("width")
+    panels = [1.25] * several + [1.5] + [1.2] * (len(widths) > 1)
+    figure, axes = drawing.row_of_axes(panels, height=3.6)
     if several:
         _draw_map(figure, axes[0], plan)
-    _draw_exposures(axes[-1], plan)
+    _draw_exposures(axes[int(several)], plan)
+    if len(widths) > 1:
+        ax, best = axes[-1], plan.best
+        points = [(1e9 * c.width, c.relative_mse) for c in (*widths, best) if c.width is not None]
+        ax.plot(*zip(*points[:-1], strict=True), "o-", color=drawing.COLORS[0], markersize=4)
+        ax.plot(*points[-1], "o", markersize=13, fillstyle="none", color=drawing.COLORS[1])
+        ax.set(xlabel="width of the band [nm]", ylabel="relative MSE", title=f"at {1e3 * best.exposure:.3g} ms")
     return figure
 
 
@@ -34,7 +41,7 @@ def _draw_map(figure: Figure, ax: Axes, plan: ObservationPlan) -> None:
     holes = sorted({hole for _, hole in plan.masks})
     errors = np.full((len(numbers), len(holes)), np.nan)
     for choice in plan.choices:
-        if choice.exposure == best.exposure:
+        if (choice.exposure, choice.width) == (best.exposure, best.width):
             errors[numbers.index(choice.n_subapertures), holes.index(choice.hole_diameter)] = choice.relative_mse
     ax.imshow(errors, origin="lower", cmap="viridis", aspect="auto")
     middle = (np.nanmin(errors) + np.nanmax(errors)) / 2
@@ -52,7 +59,11 @@ def _draw_map(figure: Figure, ax: Axes, plan: ObservationPlan) -> None:
 def _draw_exposures(ax: Axes, plan: ObservationPlan) -> None:
     best = plan.best
     for color, n in zip(drawing.colors(), sorted({n for n, _ in plan.masks}), strict=False):
-        line = [c for c in plan.choices if c.n_subapertures == n and c.hole_diameter == best.hole_diameter]
+        line = [
+            c
+            for c in plan.choices
+            if c.n_subapertures == n and (c.hole_diameter, c.width) == (best.hole_diameter, best.width)
+        ]
         line.sort(key=lambda choice: choice.exposure)
         if line:
             ax.plot(
