@@ -112,6 +112,20 @@ def test_full_pupils_with_a_band_agree_with_the_general_integral():
     assert (found / exact - 1)[exact > 1e-4].abs().max() < 0.02
 
 
+def test_many_small_holes_agree_where_lenses_of_one_hole_end():
+    """At baselines of just below a hole the 20 faint lenses of the holes with themselves add to those of neighbours."""
+    mask = mask_of(20)
+    r0 = mask.subaperture_diameter / 0.4
+    length = torch.stack(torch.meshgrid(*(torch.fft.fftfreq(48) * GRID.period,) * 2, indexing="ij")).norm(dim=0)
+    ratio = length / mask.subaperture_diameter
+    row, column = ((ratio > 0.95) & (ratio < 1)).nonzero().T
+    nu = torch.stack([torch.fft.fftfreq(48)[column], torch.fft.fftfreq(48)[row]], -1)
+    assert len(nu) == 4
+    exact = mean_square_otf(mask, GRID, nu[:2], Seeing(r0))
+    found = criterion_of(r0=r0).expected_power(mask)[row, column][:2]
+    assert (found / exact - 1).abs().max() < 0.03
+
+
 def test_holes_that_overlap_agree_with_the_general_integral():
     mask = SparseAperture([[0.3, 0.0], [0.2, 0.05], [-0.3, 0.1]], 0.16, 1.0)
     row, column, nu = some_frequencies(mask, GRID, 24, 0.1)

@@ -45,14 +45,15 @@ class Lenses(NamedTuple):
 
 
 class Colour(NamedTuple):
-    """What one wavelength of a band needs: its phases over those at the reference, its share of the light, its patches
-    and the modes (M, n_plane) that it takes part in."""
+    """What one wavelength of a band needs: its phases over those at the reference, its share of the light, its patches,
+    the exact T (rows * columns) of a hole with itself and the modes (M, n_plane) that it takes part in."""
 
     scale: float
     share: float
     plan: PatchPlan
     splines: SplinePatches
     slices: Tensor
+    central: Tensor
     modes: Tensor
 
 
@@ -88,7 +89,13 @@ class LensPatches:
             places = torch.stack(torch.meshgrid(x * pixels[0], y * pixels[1], indexing="xy"), -1)
             slices = splines.slices(geometry.shape.otf(places, geometry.diameter)[None]).to(device, dtype)
             self.n_pixels = max(self.n_pixels, len(plan.row) * len(plan.column))
-            self.colours.append(Colour(scale, share, plan, splines, slices, modes[:, index].to(device, dtype)))
+            first = (-plan.reach).ceil().double().cpu()
+            x = (first[0] + torch.arange(len(plan.column))) * pixels[0]
+            y = (first[1] + torch.arange(len(plan.row))) * pixels[1]
+            places = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
+            central = geometry.shape.otf(places, geometry.diameter).flatten().to(device, dtype)
+            own_modes = modes[:, index].to(device, dtype)
+            self.colours.append(Colour(scale, share, plan, splines, slices, central, own_modes))
 
     def __call__(self, centers: Tensor) -> Lenses:
         """Of masks with `centers` (B, N, 2) [m]."""
@@ -114,6 +121,7 @@ class LensPatches:
         place = (baseline + turns) * colour.scale - turns
         corner = (place.detach() - colour.plan.reach).ceil()
         values = colour.splines.weights(corner - place) @ colour.slices
+        values[:, 0] = colour.central  # N holes share it: what a spline makes of its edge would count N times
         return values.unflatten(-1, (len(colour.plan.row), len(colour.plan.column))), corner
 
     def _merged(self, baseline: Tensor, turns: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
