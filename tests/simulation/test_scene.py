@@ -125,7 +125,7 @@ def test_bad_sizes_are_refused(size):
 
 @pytest.mark.parametrize("options", [{"attitude": (10, 0, 0)}, {"attitude": (0, 5, 0)}, {"sun": (0, 0, 1)}])
 def test_images_are_neither_lit_nor_turned_out_of_their_plane(files, options):
-    with pytest.raises(ValueError, match="own light"):
+    with pytest.raises(ValueError, match="an image rotates only in its plane"):
         make_scene((32, 32), 1.0, SceneOptions(path=files / "l.png", **options))
 
 

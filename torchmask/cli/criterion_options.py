@@ -14,8 +14,8 @@ class CriterionOptions(BandOptions):
     """What the criterion knows of the observation."""
 
     criterion: Literal["asymptotic", "turbulent"] = "asymptotic"
-    """Holes that turbulence only shifts in phase, or von Karman turbulence of --r0 within and between them, which the
-    options from --outer-scale to --sky describe further."""
+    """Whether turbulence only shifts the phase of each hole, or is of von Karman's kind within and between holes; the
+    latter needs --r0, and the options below describe it further."""
     r0: float | None = None
     """Fried parameter of the turbulence at the wavelength [m]; the asymptotic criterion warns of wider holes."""
     outer_scale: float | None = None
