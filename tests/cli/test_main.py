@@ -64,6 +64,8 @@ UNITS = {
     "exposure_time": r"\[s\]",
     "crop": r"\[pixels\]",
     "exposure_tau0": r"\[tau0",
+    "wind": r"\[m/s\]",
+    "pixel_fill_factor": "of the area",
     "pixel_fill": "([Pp]art|fraction) of the area",
     "gain": "[Ee]lectrons per adu",
     "saturation": "in its unit",

@@ -19,15 +19,15 @@ class CriterionOptions(BandOptions):
     r0: float | None = None
     """Fried parameter of the turbulence at the wavelength [m]; the asymptotic criterion warns of wider holes."""
     outer_scale: float | None = None
-    """Of the turbulence [m]; None: infinite."""
+    """Outer scale of the turbulence [m]; None: infinite."""
     exposure_time: float = 0.0
-    """Of a frame [s]; needs a wind."""
+    """Duration of a frame [s]; it needs a wind."""
     wind: tuple[float, ...] = ()
-    """Its speed [m/s], all directions being equally likely, or two numbers: towards +x and towards +y."""
+    """Wind speed [m/s], all directions being equally likely, or two numbers: towards +x and towards +y."""
     pixel_fill_factor: float = 0.0
     """Sensitive part of the area of a square pixel, at most 1; 0: pixels are points."""
     sky: float = 0.0
-    """Electrons per pixel and frame."""
+    """Electrons per pixel and frame from the sky."""
 
     def turbulence(self, wavelength: float) -> dict[str, Any] | None:
         """The options as `TurbulentMSE` takes them, None for the asymptotic criterion.
