@@ -126,8 +126,9 @@ def test_help_says_the_unit_of_every_number(command, capsys):
     for name, hint in leaves(options_of(command)):
         if "float" not in str(hint) or name in WITHOUT_UNIT:
             continue
-        flag = f"--{name.replace('_', '-')} "
-        own = text.split(flag, 1)[1].split(" --", 1)[0]
+        # the option itself, with what it takes in capitals or braces, and not where another one mentions it
+        flag = rf"--{re.escape(name.replace('_', '-'))} (?=[A-Z{{\[])"
+        own = re.split(flag, text, maxsplit=1)[1].split(" --", 1)[0]
         assert re.search(UNITS[name], own), (name, own)
 
 
