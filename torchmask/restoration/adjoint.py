@@ -1,6 +1,6 @@
-"""How far a model of the exposures is from the frames, with gradients and curvature by its adjoint, written by hand.
+"""The misfit of the exposure model to the frames, with its gradients and curvature by a hand-written adjoint.
 
-They cost six FFTs a frame (and two more for every further wavelength) in a memory that does not grow with the frames.
+They cost six FFTs per frame, two more for every further wavelength, and memory independent of the number of frames.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from torchmask.restoration.forward import ExposureModel, intensity
 from torchmask.restoration.parallel import Map
 from torchmask.restoration.pupil import OpenSamples
 
-_PROBES = 4  # draws of noise per frame for the curvature
+_PROBES = 4  # noise realisations per frame for the curvature
 
 
 class DataFidelity(NamedTuple):
-    """Half the weighted squared residuals, (T,), and the gradients of their sum; None where not asked for.
+    """Half the weighted squared residuals (T,), and the gradients of their sum; None for those not requested.
 
-    `weight_gradient` (P,) and `basis_gradient` (P, K) are those in the pupil's samples, which follow the mask.
+    `weight_gradient` (P,) and `basis_gradient` (P, K) are those with respect to the pupil's samples.
     """
 
     value: Tensor
@@ -44,30 +44,34 @@ def data_fidelity(
     samples: OpenSamples | None = None,
     parallel: Map = map,
 ) -> DataFidelity:
-    """1/2 sum precision (model + background - frames)^2 of every frame, and its gradients.
+    """Return 1/2 sum precision (model + background - frames)^2 of every frame, and its gradients.
 
     Parameters
     ----------
     model : ExposureModel
+        Model of the exposures.
     image : (H', W') tensor
+        Object on the model's field.
     z : (T, K) tensor
+        Parameters of the aberrations.
     frames : (T, H, W) tensor
+        Exposures, in the unit of the object.
     precision : tensor that broadcasts to the frames' shape, with its first axis of length T or 1
         Inverse noise variance of each pixel, 0 where a pixel is not valid.
     want_object, want_aberrations : bool
         Which gradients to compute.
     samples : OpenSamples, optional
-        Of the pupil where it may lie instead; the gradients in them are computed too. None: where the model has it.
+        Samples of a moved pupil; the gradients with respect to them are computed too. None: those of the model.
     parallel : callable
-        Goes over the frames, a few at a time, as `map` does.
+        Function like `map`, which is applied to a few frames at a time.
     """
     shape, moved = model.window.field.shape, samples is not None
     samples = model.pupil.samples() if samples is None else samples
     spectrum = model.spectrum(image)
     conjugate = spectrum.conj().resolve_conj()
-    phase = samples.phase(z)  # of all frames at once: one large matrix product is faster than many small ones
+    phase = samples.phase(z)  # for all frames at once: one large matrix product is faster than many small ones
 
-    @torch.no_grad()  # which holds for one thread only
+    @torch.no_grad()  # needed here too, as no_grad applies to one thread only
     def compare(part: slice) -> tuple[Tensor | None, ...]:
         field = samples.field(phase[part])
         amplitude = model.amplitude(samples, field)
@@ -99,23 +103,23 @@ def data_fidelity(
 
 
 def pull_back(samples: OpenSamples, field: Tensor, amplitude: Tensor, psf_gradient: Tensor) -> Tensor:
-    """Gradient with respect to the phase (T, P) from that with respect to the PSF (T, H', W')."""
+    """Return the gradient (T, P) with respect to the phase from that with respect to the PSF (T, H', W')."""
     return across(field, pull_back_field(samples, amplitude, psf_gradient))
 
 
 def pull_back_field(samples: OpenSamples, amplitude: Tensor, psf_gradient: Tensor) -> Tensor:
-    """Half the gradient with respect to the pupil field (T, P), its two parts as one complex number."""
+    """Return half the gradient with respect to the pupil field (T, P), real and imaginary part as a complex number."""
     back = torch.fft.ifft2(amplitude * psf_gradient[:, None], norm="forward").flatten(1)
     return back.index_select(1, samples.index)
 
 
 def across(field: Tensor, back: Tensor) -> Tensor:
-    """Gradient (T, P) with respect to the field's phase, from half of that with respect to the field."""
+    """Return the gradient (T, P) with respect to the field's phase, from half of that with respect to the field."""
     return 2 * (back.imag * field.real - back.real * field.imag)
 
 
 def along(field: Tensor, back: Tensor) -> Tensor:
-    """Gradient (T, P) with respect to the logarithm of the field's size."""
+    """Return the gradient (T, P) with respect to the logarithm of the field's modulus."""
     return 2 * (back.real * field.real + back.imag * field.imag)
 
 
@@ -123,10 +127,11 @@ def along(field: Tensor, back: Tensor) -> Tensor:
 def curvature(
     model: ExposureModel, image: Tensor, z: Tensor, precision: Tensor, generator: torch.Generator
 ) -> tuple[Tensor, float]:
-    """Diagonal of the Gauss-Newton Hessian of `data_fidelity`: mean over frames for each z (K,); for an object pixel.
+    """Return the diagonal of the Gauss-Newton Hessian of `data_fidelity`.
 
-    J^T W J is the covariance of J^T W^(1/2) n with white noise n, so a few draws of noise per frame suffice for
-    a diagonal that is averaged over frames (Bekas, Kokiopoulou & Saad, Appl. Numer. Math. 57, 1214, 2007).
+    It is given for each parameter (K,), averaged over frames, and for a pixel of the object, one number. J^T W J is the
+    covariance of J^T W^(1/2) n with white noise n, so a few noise realisations per frame suffice for a diagonal that is
+    averaged over frames (Bekas, Kokiopoulou & Saad, Appl. Numer. Math. 57, 1214, 2007).
     """
     shape, samples = model.window.field.shape, model.pupil.samples()
     conjugate = model.spectrum(image).conj().resolve_conj()

@@ -1,4 +1,4 @@
-"""What a finished restoration hands back, put together from where it ended."""
+"""Assemble the result of a restoration from its final state."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def assemble_result(
     r0: float | None,
     verdict: Verdict | None = None,
 ) -> RestorationResult:
-    """The result of a restoration that has ended; `r0` [m] is that of the aberration basis, None if they are known."""
+    """Return the result of a finished restoration; `r0` [m] is the initial one of the prior, None if it has none."""
     model, state = objective.model, progress.state
     refined = progress.refinement is Refinement.ON
     transmission, weight = state.calibration.transmission, state.calibration.aberration_weight
@@ -61,7 +61,7 @@ def assemble_result(
 
 
 def _geometry_deviations(objective: MyopicObjective, state: State) -> Tensor:
-    """Standard deviations (2,) of rotation [rad] and magnification."""
+    """Return the standard deviations (2,) of rotation [rad] and magnification."""
     scale = torch.tensor([1.0, state.geometry.magnification], dtype=torch.float64, device="cpu")
     return scale * place_deviations(objective, state, objective.model.cutoff).cpu()
 
@@ -73,7 +73,7 @@ def add_deviations(
     progress: Progress,
     n_samples: int,
 ) -> RestorationResult:
-    """The result with standard deviations of the object up to the cut-off and of the coefficients."""
+    """Return the result with standard deviations of the object, up to the cut-off, and of the coefficients."""
     model = objective.model
     image, z = standard_deviations(objective, progress.state, model.cutoff, stack.photon_share, n_samples)
     spread = torch.stack([model.aberrations.coefficients(sample) for sample in z]).square().mean((0, 1)).sqrt()

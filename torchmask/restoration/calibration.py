@@ -1,4 +1,4 @@
-"""What the frames themselves tell between two descents: transmission, noise inflation, strength of the turbulence."""
+"""Recalibration between two descents: transmissions, noise inflation and strength of the turbulence."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ _LEAST_TRANSMISSION = 1e-3
 
 @torch.no_grad()
 def fit_of_frames(objective: MyopicObjective, state: State) -> tuple[Tensor, Tensor]:
-    """The transmission (T,) at which each frame fits best, and the chi-square per pixel (T,) that is left then.
+    """Return the best-fitting transmission of each frame (T,), and the chi-square per pixel (T,) of the residual.
 
-    A background that is free is fitted with it.
+    A free background is fitted at the same time.
     """
     transmissions, squares, background = [], [], objective.model.background
     for part in objective.model.chunks(len(state.z)):
@@ -34,7 +34,7 @@ def fit_of_frames(objective: MyopicObjective, state: State) -> tuple[Tensor, Ten
 
 
 def _fit_transmission(background: Background, model: Tensor, frames: Tensor, precision: Tensor) -> Tensor:
-    """Least squares (T, 1, 1) of `frames` against `model`, with a constant besides where that is free and positive."""
+    """Return the least-squares factor (T, 1, 1) of `model` to `frames`, with a constant if that is free and > 0."""
 
     def slope(x: Tensor, y: Tensor) -> Tensor:
         return (precision * x * y).sum((1, 2), keepdim=True) / (precision * x**2).sum((1, 2), keepdim=True)
@@ -48,11 +48,11 @@ def _fit_transmission(background: Background, model: Tensor, frames: Tensor, pre
 
 
 def recalibrate(objective: MyopicObjective, state: State, power: int | None, *, follow_r0: bool) -> State:
-    """Transmission, noise and, if it is open, strength of the turbulence as the state itself tells them.
+    """Update transmissions and noise and, with `follow_r0`, the strength of the turbulence from the state.
 
-    `power` is None while objects are still being found. Once all is in its place, frames are weighed by that power of
-    how well they fit: 2 through a full pupil, because what is left there comes from another minimum and harms more than
-    white noise of that power; 1 for a mask, where it comes from the modes left out.
+    `power` is None before the object has been found. Afterwards, frames are weighted by that power of their residual
+    variance: 2 for a full pupil, where residuals come from poor minima and are more harmful than white noise of that
+    variance; 1 for a mask, where they come from modes left out.
     """
     state = calibrate(objective, state)
     state = share_noise_inflation(state) if power is None else sharpen_noise_inflation(state, power)
@@ -61,31 +61,31 @@ def recalibrate(objective: MyopicObjective, state: State, power: int | None, *, 
 
 
 def calibrate(objective: MyopicObjective, state: State) -> State:
-    """The state with the transmissions that fit best, 1 on average, and each frame's noise inflation of its own.
+    """Return the state with the best-fitting transmissions, of mean 1, and the noise inflation of each frame.
 
-    What all transmissions have in common is the object's brightness.
+    A factor common to all transmissions belongs to the object's brightness.
     """
     transmission, chi_square = fit_of_frames(objective, state)
     common = transmission.mean()
-    if objective.model.background is not Background.NONE:  # beside which the frames' mean does not tell it
+    if objective.model.background is not Background.NONE:  # else the mean of the frames fixes the brightness already
         state = replace(state, image=state.image * common)
     return state.calibrated(transmission=transmission / common, noise_inflation=chi_square.clamp(min=1))
 
 
 def share_noise_inflation(state: State) -> State:
-    """Common to all frames: those that fit badly are what draws a wrong object to the right one."""
+    """Return the state with the mean noise inflation in all frames, as badly fitted ones pull a wrong object right."""
     inflation = state.calibration.noise_inflation
     return state.calibrated(noise_inflation=inflation.mean().expand_as(inflation).clone())
 
 
 def sharpen_noise_inflation(state: State, power: int) -> State:
-    """Each frame weighed by how well it fits against the best: by the given power of its noise inflation."""
+    """Return the state with noise inflation raised to `power` relative to that of the best frame."""
     inflation = state.calibration.noise_inflation
     return state.calibrated(noise_inflation=inflation**power / inflation.min() ** (power - 1))
 
 
 def follow_turbulence(objective: MyopicObjective, state: State) -> State:
-    """The state whose prior on the aberrations is as strong as they have turned out to be."""
+    """Return the state with the prior on the aberrations adapted to their estimated variance."""
     if Free.ABERRATIONS not in objective.free:
         return state
     strength = objective.model.aberrations.turbulence_strength(state.z)
@@ -93,7 +93,7 @@ def follow_turbulence(objective: MyopicObjective, state: State) -> State:
 
 
 def unwrap_pistons(objective: MyopicObjective, state: State) -> State:
-    """The state without needless full waves on the pistons, which the frames of one wavelength cannot tell."""
+    """Return the state without full waves of piston, which the frames of one wavelength cannot show."""
     known = Free.ABERRATIONS not in objective.free or not state.calibration.aberration_weight
     if known or len(objective.model.band.wavelengths) > 1:
         return state

@@ -1,8 +1,8 @@
-"""A tournament of many first aberrations for every frame of a full pupil, of which the better ones live on.
+"""A tournament of random initial aberrations for every frame of a full pupil, of which the best are kept.
 
-Phase retrieval over a full pupil has many minima, most of them poor, and even the true object does not lead a random
-start into a good one. So all candidates of all frames evolve together with one object, from blurred to sharp, and
-half of each frame's candidates are dropped at the end of every stage.
+Phase retrieval over a full pupil has many local minima, most of them poor, and a random start rarely reaches a good one
+even with the true object. All candidates of all frames are therefore fitted together with one object, from blurred to
+sharp, and the worse half of each frame's candidates is dropped at the end of every stage.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ from torchmask.restoration.state import Calibration, State
 
 @dataclass(frozen=True)
 class Candidates:
-    """A state that holds several candidates for each frame: T first ones, T second ones, and so on.
+    """A state with several candidates for each frame: the first of all T frames, then the second, and so on.
 
-    n_each : candidates for each frame; 1: the state is that of the frames themselves
+    state : state of all candidates, as if each were a frame
+    n_each : number of candidates for each frame; 1: the state is that of the frames themselves
     """
 
     state: State
@@ -33,16 +34,16 @@ Descend = Callable[[MyopicObjective, State], State]
 
 
 def several(state: State, n_each: int) -> Candidates:
-    """So many copies of `state` as candidates."""
+    """Return `n_each` copies of `state` as candidates."""
     now = state.calibration
     repeated = Calibration(now.transmission.repeat(n_each), now.noise_inflation.repeat(n_each), now.aberration_weight)
     return Candidates(replace(state, z=state.z.repeat(n_each, 1), calibration=repeated), n_each)
 
 
 def with_candidates(objective: MyopicObjective, n_each: int) -> MyopicObjective:
-    """The objective with every frame `n_each` times, in single precision.
+    """Return the objective with every frame `n_each` times, in single precision.
 
-    The object's prior counts as many times, so that it holds the same balance.
+    The object's prior counts as many times, so that its weight relative to the misfit is the same.
     """
     model = objective.model.single()
     single = MyopicObjective(
@@ -65,7 +66,7 @@ def play_stage(
     descend: Descend,
     recalibrate: Descend = calibrate,
 ) -> Candidates:
-    """One stage of a tournament: all candidates descend, are calibrated, and the best `n_kept` of each frame are left.
+    """Play one stage: all candidates descend and are calibrated, and the best `n_kept` of each frame are kept.
 
     `objective` is that of the frames themselves.
     """
@@ -75,13 +76,13 @@ def play_stage(
 
 
 def select(crowded: MyopicObjective, candidates: Candidates, n_kept: int) -> Candidates:
-    """The best candidates of each frame, the very best first; `crowded` is the objective of all of them."""
+    """Return the best `n_kept` candidates of each frame, best first; `crowded` is the objective of all candidates."""
     state = candidates.state
     costs = crowded.frame_costs(state.image, state.z, state.calibration).unflatten(0, (candidates.n_each, -1))
     return Candidates(state.of_frames(_rows(costs.argsort(0)[:n_kept])), n_kept)
 
 
 def _rows(numbers: Tensor) -> Tensor:
-    """Places of the candidates `numbers` (kept, T) of each frame among all candidates."""
+    """Return the indices, among all candidates, of the candidates `numbers` (kept, T) of each frame."""
     n_frames = numbers.shape[1]
     return (numbers * n_frames + torch.arange(n_frames, device=numbers.device)).flatten()

@@ -1,4 +1,4 @@
-"""One descent of object and aberrations, as a minimiser with bounds sees it: one scaled vector."""
+"""One descent in object and aberrations, which a bounded minimiser sees as one scaled vector."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from torchmask.restoration.placement import information, largest_magnification, 
 from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.state import State
 
-_OBJECT_STEP = 0.3  # of the object's scale against that of the aberrations: measured, a factor of 3 either way is worse
-_LEAST_CURVATURE = 1e-6  # of the largest: directions that neither data nor prior hold are left with a finite scale
+_OBJECT_STEP = 0.3  # factor on the object's scale relative to that of the aberrations: 3 times more or less is worse
+_LEAST_CURVATURE = 1e-6  # of the largest, for a finite scale of directions that neither data nor prior constrain
 _PROBE_SEED = 0
 
 Variables = Callable[[], tuple[Tensor, Tensor]]
 Listener = Callable[[float, int, Variables], None]
-"""Told (cost, evaluations since the last time, function giving (image, z)) after every iteration."""
+"""Called with (cost, evaluations since the last call, function that returns (image, z)) after every iteration."""
 
 
 def descend(
     objective: MyopicObjective, state: State, n_iterations: int, minimizer: Minimizer, listener: Listener
 ) -> State:
-    """Lower the objective from `state` for at most `n_iterations`, its calibration as it is, the object positive.
+    """Minimise the objective from `state` for at most `n_iterations`, with fixed calibration and an object >= 0.
 
-    Where the mask's place is free, the state that comes back holds its geometry: the objective has to be placed there
+    If the mask's geometry is free, the returned state has a new one, for which the objective must be updated
     (`placement.placed_as`).
     """
     moves = Free.PLACE in objective.free
@@ -64,16 +64,16 @@ def descend(
 
 
 def place_scale(objective: MyopicObjective, state: State) -> Tensor:
-    """The unit (2,) in which the misfit curves by one along a step of the mask."""
+    """Return the units (2,) in which the misfit has unit curvature along a step of the mask."""
     slopes = slopes_of_frames(objective.model, state.image, state.z)
     return information(slopes, objective.scaled_data(state.calibration)[1]).diagonal().rsqrt()
 
 
 def scales(objective: MyopicObjective, state: State) -> tuple[Tensor, Tensor]:
-    """Units in which the diagonal of the Hessian is about one, for image (H', W') and z (K,).
+    """Return units of image (H', W') and z (K,) in which the diagonal of the Hessian is about one.
 
-    Curvature of the aberrations is measured by probes; that of the object is the energy of the PSFs and what its prior
-    says, which tells flat pixels from edges.
+    The curvature in the aberrations is estimated with random probes; that in the object is the energy of the PSFs plus
+    the curvature of the prior, which differs between flat parts and edges.
     """
     generator = torch.Generator().manual_seed(_PROBE_SEED)
     precision = objective.scaled_data(state.calibration)[1]

@@ -1,10 +1,10 @@
-"""Two ways out of a local minimum, which no descent takes.
+"""Two ways out of local minima that a descent does not find.
 
-Frames: with the object known, the aberrations of a frame are a small problem of their own, so several random starts
-are cheap. The object's place between the pixels: the frames cannot tell it, as a shift of the object and opposite tilts
-of all frames make the same images. The priors on the object can, because edges and points that lie on the pixels have
-the least total variation and no negative side lobes; a descent hardly moves along this direction, so the best place is
-looked for directly.
+Outlying frames: for a fixed object, the aberrations of a frame are a small separate problem, for which several random
+starts are cheap. Sub-pixel position of the object: the frames do not constrain it, as a shift of the object and the
+opposite tilt of all frames give the same images. The prior on the object does, because edges and points that are
+centred on pixels have the least total variation and no negative side lobes. A descent hardly moves along this
+direction, so the best position is searched directly.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ def restart_outlier_frames(
     minimizer: Minimizer,
     seed: int,
 ) -> tuple[State, int]:
-    """Aberrations of outlying frames from the best of several random starts, and the evaluations that it took.
+    """Refit the aberrations of outlying frames from several random starts; return the state and the evaluations spent.
 
-    A frame keeps its aberrations unless others lower its cost; it is `state` itself that comes back if all do.
+    A frame keeps its aberrations unless a start ends at a lower cost; if all keep theirs, `state` itself is returned.
     """
     inflation = calibrate(objective, state).calibration.noise_inflation
     lost = (inflation > schedule.outlying * inflation.quantile(0.25)).nonzero().flatten()
@@ -52,12 +52,12 @@ def restart_outlier_frames(
 
     now = state.of_frames(lost)
     best, least = now.z, part.frame_costs(now.image, now.z, now.calibration)
-    spread = float((state.z - objective.centre).square().mean(1).sqrt().median())  # whatever lost frames have come to
+    spread = float((state.z - objective.centre).square().mean(1).sqrt().median())  # robust against the lost frames
     for _ in range(schedule.restarts):
         noise = torch.randn(now.z.shape, dtype=now.z.dtype, device="cpu", generator=generator).to(now.z)
         fresh = basis.with_common_of(part.centre + spread * noise, now.z)
         trial = replace(now, z=fresh).with_noise_inflation(first_inflation)
-        for _ in range(schedule.restart_rounds):  # of falling noise, without which most starts fall into poor minima
+        for _ in range(schedule.restart_rounds):  # the noise falls, else most starts end in poor minima
             trial = descend(part, trial, schedule.restart_iterations, minimizer, count)
             left = calibrate(part, trial).calibration.noise_inflation
             trial = trial.calibrated(noise_inflation=left)
@@ -73,10 +73,10 @@ def restart_outlier_frames(
 
 
 def centre_on_pixels(objective: MyopicObjective, state: State, schedule: Schedule) -> State:
-    """The state moved by less than a pixel to where the cost is least, or `state` itself.
+    """Return the state shifted by less than a pixel to the lowest cost, or `state` itself if that is not lower.
 
-    For each position the object is settled in the quadratic approximation of the misfit in the object, for known PSFs
-    and a full field: that needs no more frames, only FFTs of the object.
+    At each position the object is fitted with the misfit approximated as quadratic, for known PSFs and a full field,
+    which needs FFTs of the object only, not of the frames.
     """
     gradient, power = objective.object_quadratic(state.image, state.z, state.calibration)
 
@@ -100,7 +100,7 @@ def centre_on_pixels(objective: MyopicObjective, state: State, schedule: Schedul
 def settle_object(
     centre: Tensor, gradient: Tensor, power: Tensor, prior: ObjectPrior, max_iterations: int
 ) -> tuple[float, Tensor]:
-    """Minimise <gradient, o - centre> + 1/2 |o - centre|^2_power + prior(o) over o >= 0: (value, o)."""
+    """Minimise <gradient, o - centre> + 1/2 |o - centre|^2_power + prior(o) over o >= 0; return (value, o)."""
     start = centre.clamp(min=0)
     scale = (power.mean() + prior.curvature(start)).rsqrt()
 
@@ -118,10 +118,10 @@ def settle_object(
 
 
 def tilt(model: ExposureModel, offset: tuple[float, float]) -> Tensor:
-    """The parameters (K,) that move every image by `offset` (dy, dx) pixels, as closely as the modes can."""
+    """Return the parameters (K,) that shift every image by `offset` (dy, dx) pixels, as closely as the modes allow."""
     samples = model.pupil.samples()
     phase = 2 * math.pi * (samples.positions * samples.positions.new_tensor([offset[1], offset[0]])).sum(-1)
-    # A constant phase does nothing; it may take up the mean piston, which the modes need not contain.
+    # A constant phase has no effect, so it is fitted too: the modes need not include the mean piston.
     modes = torch.cat([samples.basis, samples.chromaticity[:, None]], dim=1).double()
     q, r = torch.linalg.qr(modes)
     return torch.linalg.lstsq(r.cpu(), (q.T @ phase.double()).cpu()[:, None], driver="gelsd").solution[:-1, 0].to(q)

@@ -1,7 +1,7 @@
-"""The image formation that a restoration inverts: object and aberrations in, frames out.
+"""The forward model of a restoration: frames from an object and aberrations.
 
-It is composed of parts, each an object of its own: the sampled pupil with its aberrations and its band, and the window
-through which the frames see a wider object.
+It is composed of the sampled pupil, with its aberrations and its band, and of the window of the frames within the wider
+field of the object.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from torchmask.restoration.aberrations import AberrationBasis, plain_basis
 from torchmask.restoration.background import Background
 from torchmask.restoration.pupil import OpenSamples, SampledPupil
 
-MARGIN = 0.25  # of the frames' width, by which the object's field is wider at least
-_CHUNK = 2**20  # bytes of one complex work array: it stays in a core's cache
+MARGIN = 0.25  # minimum by which the object's field is wider, as a fraction of the frames' width
+_CHUNK = 2**20  # bytes of one complex work array, which then stays in a core's cache
 
 
 @dataclass(frozen=True)
 class Window:
     """The pixels of the frames within the wider field of the object.
 
-    Light may come from beyond the frames and leave them; only their own pixels are compared.
+    Light may enter the frames from outside and leave them; only the pixels of the frames are compared.
 
     Examples
     --------
@@ -44,39 +44,42 @@ class Window:
 
     @classmethod
     def around(cls, grid: Grid, margin: float = MARGIN) -> Window:
-        """The window of frames on `grid` in a field at least (1 + margin) times as wide, of fast FFTs."""
+        """Return the window of frames on `grid` in a field at least (1 + margin) times as wide, with fast FFTs."""
         rows, columns = (fast_size(math.ceil(side * (1 + margin))) for side in grid.shape)
         return cls(grid, Grid((rows, columns), grid.pixel_scale, grid.wavelength))
 
     def crop(self, image: Tensor) -> Tensor:
-        """The frames' pixels (..., H, W) of images (..., H', W')."""
+        """Return the frames' pixels (..., H, W) of images (..., H', W')."""
         return image[..., : self.grid.shape[0], : self.grid.shape[1]]
 
     def embed(self, image: Tensor) -> Tensor:
-        """Images (..., H', W') that hold `image` (..., H, W), and zero in the margin."""
+        """Pad images (..., H, W) with a margin of zeros to (..., H', W')."""
         rows, columns = self.field.shape
         return nn.functional.pad(image, (0, columns - image.shape[-1], 0, rows - image.shape[-2]))
 
 
 class ExposureModel(nn.Module):
-    """Frames y_t = window(p * h_t * o), p the pixel, h_t = sum_w share_w |FFT(P_w exp(i B_w z_t))|^2 with unit sum.
+    """Forward model of the exposures, y_t = window(p * h_t * o).
+
+    p is the response of a pixel and h_t = sum_w share_w |FFT(P_w exp(i B_w z_t))|^2 the PSF, of unit sum.
 
     Parameters
     ----------
     aperture : Aperture
-        One aperture, centres (N, 2). Its samples are followed where it moves, and differentiable in its centres.
+        One aperture, centres (N, 2). If its centres change, so do the samples, which are differentiable in them.
     grid : Grid
-        Of the frames, H x W.
+        Grid of the frames, H x W.
     aberrations : AberrationBasis or int
-        What the parameters z stand for; a number J: the Noll modes 1 to J of every sub-aperture themselves.
+        Basis of the aberrations with parameters z, or a number J: the Noll modes 1 to J of every sub-aperture.
     band : Band, optional
-        None: the wavelength of the grid. Aberrations are path differences: coefficients are rad at that wavelength.
+        Wavelengths of the light. None: that of the grid. Aberrations are path differences, and coefficients are in rad
+        at the wavelength of the grid.
     margin : float
         The object's field is at least (1 + margin) times as wide as the frames.
     background : Background
-        What frames may hold besides; `forward` makes them without.
+        Background that frames may have; `forward` does not include it.
     pixel : PixelResponse, optional
-        Of the detector. None: pixels sample the image at their centres.
+        Response of the detector's pixels. None: pixels sample the image at their centres.
 
     Raises
     ------
@@ -86,11 +89,11 @@ class ExposureModel(nn.Module):
     Notes
     -----
     `forward(object, z)` takes an object (H', W') on `window.field` and z (T, K), and returns frames (T, H, W),
-    differentiable by autograd in both and in the centres of the aperture. `restoration.adjoint` holds gradients of the
-    misfit that cost less.
+    differentiable by autograd in both and in the centres of the aperture. `restoration.adjoint` computes the gradients
+    of the misfit at less cost.
 
-    The attenuation of the image by the cells of the pupil samples, which `PSF` divides out, is left in: on a field of
-    this size it stands in for the light that leaves the field, and fits end-to-end simulations better.
+    Unlike `PSF`, the model keeps the attenuation of the image by the finite cells of the pupil samples: on a field of
+    this size it represents the light that leaves the field, and fits end-to-end simulations better.
 
     Examples
     --------
@@ -129,75 +132,75 @@ class ExposureModel(nn.Module):
 
     @property
     def aberrations(self) -> AberrationBasis:
-        """What the parameters z stand for."""
+        """Basis of the aberrations with parameters z."""
         return self.pupil.aberrations
 
     @property
     def band(self) -> Band:
-        """The wavelengths of the model."""
+        """Wavelengths of the model."""
         return self.pupil.band
 
     @property
     def dtype(self) -> torch.dtype:
-        """In which frames are made."""
+        """Data type of the frames."""
         return self.pupil.basis.dtype
 
     @property
     def device(self) -> torch.device:
-        """On which frames are made."""
+        """Device of the frames."""
         return self.pupil.basis.device
 
     def single(self) -> ExposureModel:
-        """The same model with its arrays in float32, on the very same aberration basis."""
+        """Return the model with its arrays in float32, which shares the aberration basis."""
         twin = copy.deepcopy(self).float()
         twin.pupil.aberrations = self.aberrations
         return twin
 
     @property
     def cutoff(self) -> float:
-        """Highest frequency that the frames can tell of an object [cycles/pixel]."""
+        """Highest spatial frequency that the aperture transmits and the pixels sample [cycles/pixel]."""
         return min(0.5, self.window.grid.cutoff(self.pupil.aperture.extent))
 
     def beside(self, background: Background) -> ExposureModel:
-        """The same model, arrays and all, of frames that may hold such a background."""
+        """Return the model for frames with the given background; it shares all arrays."""
         twin = copy.copy(self)
         twin.background = background
         return twin
 
     def chunks(self, n_frames: int) -> Iterator[slice]:
-        """Slices of the frames whose work arrays stay small."""
+        """Return slices of the frames whose work arrays fit into a core's cache."""
         pixels = self.pupil.n_rasters * math.prod(self.window.field.shape)
         size = max(1, _CHUNK // (2 * self.dtype.itemsize * pixels))
         return (slice(start, min(start + size, n_frames)) for start in range(0, n_frames, size))
 
     def amplitude(self, samples: OpenSamples, field: Tensor) -> Tensor:
-        """Focal amplitude (T, wavelength, H', W') of a pupil field (T, P)."""
+        """Return the focal amplitude (T, wavelength, H', W') of a pupil field (T, P)."""
         rasters = (self.pupil.n_rasters, *self.window.field.shape)
         pupil = field.new_zeros(len(field), math.prod(rasters)).index_add(1, samples.index, field)
         return torch.fft.fft2(pupil.unflatten(1, rasters))
 
     def spectrum(self, image: Tensor) -> Tensor:
-        """Fourier transform (..., H', W'/2 + 1) of objects (..., H', W'), as the detector's pixels see it."""
+        """Return the Fourier transform (..., H', W'/2 + 1) of objects (..., H', W') convolved with the pixel."""
         spectrum = torch.fft.rfft2(image.to(self.dtype))
         return spectrum if self.response is None else spectrum * self.response.to(spectrum)
 
     def spectrum_adjoint(self, spectrum: Tensor) -> Tensor:
-        """The adjoint of `spectrum`, up to the normalisation of the FFT: what pulls back to objects (..., H', W')."""
+        """Apply the adjoint of `spectrum`, up to the normalisation of the FFT; returns (..., H', W')."""
         if self.response is not None:
             spectrum = spectrum * self.response.conj().to(spectrum)
         return torch.fft.irfft2(spectrum, s=self.window.field.shape)
 
     def through(self, aperture: Aperture, aberrations: AberrationBasis | None = None) -> ExposureModel:
-        """The same model through another aperture of as many sub-apertures, or with other aberrations."""
+        """Return the model with another aperture of as many sub-apertures, or with other aberrations."""
         twin = copy.deepcopy(self)
         kwargs = {"dtype": self.dtype, "device": self.device}
         twin.pupil = SampledPupil(aperture, self.window.field, self.band, aberrations or self.aberrations, **kwargs)
         return twin
 
     def psf(self, z: Tensor, samples: OpenSamples | None = None) -> Tensor:
-        """PSFs (T, H', W') of the optics, of unit sum, origin at [0, 0], for z (T, K).
+        """Return the PSFs (T, H', W') of the optics for z (T, K), of unit sum, with the origin at [0, 0].
 
-        `samples` are those of a pupil that lies elsewhere; None: where the model has it.
+        `samples` are those of a moved pupil; None: those of the model's own.
         """
         samples = samples or self.pupil.samples()
         return intensity(self.amplitude(samples, samples.field(samples.phase(z))))
@@ -208,13 +211,13 @@ class ExposureModel(nn.Module):
 
 
 def intensity(amplitude: Tensor) -> Tensor:
-    """(T, H', W') of amplitudes (T, wavelength, H', W')."""
+    """Return the intensity (T, H', W') of amplitudes (T, wavelength, H', W'), summed over wavelengths."""
     power = amplitude.real**2 + amplitude.imag**2
     return power[:, 0] if power.shape[1] == 1 else power.sum(1)
 
 
 def _half_plane(pixel: PixelResponse, field: Grid) -> Tensor:
-    """The transfer function (H', W'/2 + 1) of pixels on the frequencies of a real FFT."""
+    """Return the transfer function (H', W'/2 + 1) of pixels on the frequencies of a real FFT."""
     rows, columns = field.shape
     like = {"dtype": torch.float64, "device": "cpu"}
     nu_y, nu_x = torch.fft.fftfreq(rows, **like), torch.fft.rfftfreq(columns, **like)
@@ -222,7 +225,7 @@ def _half_plane(pixel: PixelResponse, field: Grid) -> Tensor:
 
 
 def fast_size(n: int) -> int:
-    """The least even number of at least `n` without prime factors beyond 5: a fast FFT.
+    """Return the smallest even number >= `n` with no prime factor above 5, for which FFTs are fast.
 
     >>> fast_size(128), fast_size(154)
     (128, 160)

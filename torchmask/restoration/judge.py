@@ -1,4 +1,4 @@
-"""Judge where the starts of one restoration have ended, and which of two is the better one."""
+"""Verdicts on the starts of one restoration, and the choice of the better of two."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from torchmask.restoration.verdict import Tolerance, Verdict, judge
 
 
 class Comparison(NamedTuple):
-    """The better of two endings, the verdict on it, and whether both have found the same."""
+    """The better of two endings, the verdict on it, and whether both leave the same residual."""
 
     best: Ending
     verdict: Verdict
@@ -25,10 +25,10 @@ class Comparison(NamedTuple):
 
 
 class Judge:
-    """Verdicts on the endings of one stack, each with mask and motion as it has found them."""
+    """Judges the endings of a stack's starts, each with the mask geometry and motion that it found."""
 
     def __init__(self, setting: Setting, stack: FrameStack, traits: Traits, schedule: Schedule) -> None:
-        least = schedule.missed * stack.change if traits.many_minima else 0.0  # its poor minima are no worse than that
+        least = schedule.missed * stack.change if traits.many_minima else 0.0  # allows for its usual minima
         self.setting: Setting = setting
         self.traits: Traits = traits
         self.alike: float = schedule.alike
@@ -36,18 +36,18 @@ class Judge:
         self.tolerance: Tolerance = Tolerance(schedule.model_errors, schedule.chance, least)
 
     def verdict(self, objective: MyopicObjective, ending: Ending) -> Verdict:
-        """Whether the frames are explained by what a start, or all of them, ended at."""
+        """Return the verdict on whether the ending of one start, or of all, explains the frames."""
         state = ending.state
         objective = self.setting.objective_at(objective, state)
         pixels = (objective.precision.expand_as(objective.frames) > 0).sum((1, 2))
         chi_square = fit_of_frames(objective, state)[1]
         at_rest = ending.status is not Status.ITERATION_LIMIT
-        # A full pupil has so many modes that its poor minima, and not what is left out, decide: `tolerance` knows.
+        # For a full pupil poor minima, not modes left out, dominate the residual; `tolerance` allows for them.
         error = NO_MODEL_ERROR if self.traits.many_minima else expected_error(objective, state, self._left_out)
         return judge(chi_square, pixels, self.contrast, error, self.tolerance, at_rest=at_rest)
 
     def compare(self, objective: MyopicObjective, now: Ending, rival: Ending | None) -> Comparison:
-        """The present ending beside the best of the earlier ones, if there is one."""
+        """Compare the present ending with the best of the earlier ones, if there is one."""
         after = self.verdict(objective, now)
         if rival is None:
             return Comparison(now, after, alike=False)

@@ -1,4 +1,4 @@
-"""The model of the exposures to first order: what small changes of object and aberrations do to the frames."""
+"""The exposure model to first order: changes of the frames for small changes of object and aberrations."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from torchmask.restoration.pupil import OpenSamples
 
 
 class Linearization:
-    """J of `model` at an object (H', W') and aberrations (T, K), and its adjoint; both work on S changes at once.
+    """Jacobian J of `model` at an object (H', W') and aberrations (T, K), and its adjoint, for S changes at once.
 
-    Amplitudes and transfer functions of all frames are kept: 24 bytes a pixel of the field, frame and wavelength.
+    It stores amplitudes and transfer functions of all frames, 24 bytes per pixel of the field, frame and wavelength.
     """
 
     @torch.no_grad()
@@ -31,7 +31,7 @@ class Linearization:
         self.transfers: list[Tensor] = [torch.fft.rfft2(intensity(amplitude)) for amplitude in self.amplitudes]
 
     def forward(self, image: Tensor, z: Tensor) -> Tensor:
-        """Changes of the frames (S, T, H, W) for those of the object (S, H', W') and the aberrations (S, T, K)."""
+        """Return J times changes of the object (S, H', W') and the aberrations (S, T, K), as frames (S, T, H, W)."""
         model, samples, shape = self.model, self.samples, self.model.window.field.shape
         spectra = model.spectrum(image)
 
@@ -49,7 +49,7 @@ class Linearization:
         return torch.cat(list(self.parallel(part_of, range(len(self.parts)))), dim=1)
 
     def adjoint(self, frames: Tensor) -> tuple[Tensor, Tensor]:
-        """J^T of (S, T, H, W), as changes of the object (S, H', W') and of the aberrations (S, T, K)."""
+        """Return J^T times frames (S, T, H, W), as objects (S, H', W') and aberrations (S, T, K)."""
         model, samples, shape = self.model, self.samples, self.model.window.field.shape
         conjugate = self.spectrum.conj().resolve_conj()
 

@@ -1,11 +1,11 @@
-"""The object that is likeliest whatever the aberrations, which faint frames leave uncertain.
+"""Marginal estimation of the object: the aberrations, which faint frames leave uncertain, are integrated out.
 
-The object that is likeliest together with the aberrations of all frames is biased: every frame brings as many unknowns
-as the last one, and each bends to the noise of its own frame (Neyman & Scott, Econometrica 16, 1, 1948; for blind
-deconvolution Levin et al., IEEE Trans. Pattern Anal. 33, 2354, 2011). So the aberrations are integrated out, by
-expectation maximisation: the object is settled on the misfit averaged over samples of the aberrations, and these are
-moved on at the new object. Both averages forget the past little by little (stochastic approximation; Delyon, Lavielle &
-Moulines, Ann. Stat. 27, 94, 1999).
+A joint estimate of the object and the aberrations of all frames is biased: every frame brings as many new unknowns,
+which are fitted to its noise (Neyman & Scott, Econometrica 16, 1, 1948; for blind deconvolution Levin et al., IEEE
+Trans. Pattern Anal. 33, 2354, 2011). The aberrations are therefore integrated out by expectation maximisation: the
+object minimises the misfit averaged over samples of the aberrations, which are then moved on for the new object. The
+averages forget earlier samples gradually (stochastic approximation; Delyon, Lavielle & Moulines, Ann. Stat. 27, 94,
+1999).
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.state import State
 
-_ACCEPTED = 0.8  # of the moves: larger ones are refused too often, smaller ones lead nowhere
-_ADAPTED = 1.05  # factor on their size after a round
-_KEPT = 0.5  # of the momentum
+_ACCEPTED = 0.8  # target share of accepted moves: larger ones are rejected too often, smaller ones explore too slowly
+_ADAPTED = 1.05  # factor by which their size changes after a round
+_KEPT = 0.5  # fraction of the momentum kept after a move
 
 
 class AberrationSampler:
-    """Samples of the aberrations of every frame for a given object, by Hamiltonian Monte Carlo.
+    """Sampler of the aberrations of every frame for a given object, by Hamiltonian Monte Carlo.
 
-    One leapfrog step a move, after which part of the momentum is kept (Horowitz, Phys. Lett. B 268, 247, 1991). A
-    frame's moves are accepted or refused by themselves, since frames depend on each other through the object only. They
-    are taken in units of Laplace's approximation at the state in which the sampler is made. Aberrations common to all
-    frames stay as they are.
+    A move is one leapfrog step, after which part of the momentum is kept (Horowitz, Phys. Lett. B 268, 247, 1991).
+    Moves are accepted or rejected for each frame separately, since frames depend on each other only through the object.
+    Their metric is Laplace's approximation at the state for which the sampler is made. Aberrations common to all frames
+    stay fixed.
     """
 
     def __init__(self, objective: MyopicObjective, state: State, generator: torch.Generator) -> None:
@@ -48,7 +48,7 @@ class AberrationSampler:
         self.momentum: Tensor = self._normal(state.z)
 
     def sample(self, state: State, n_moves: int, size: float) -> tuple[Tensor, float]:
-        """The aberrations (T, K) after so many moves of `size` standard deviations, and the share accepted."""
+        """Return the aberrations (T, K) after `n_moves` of `size` standard deviations, and the share accepted."""
         z, momentum = state.z, self.momentum
         energy, slope = self._energy(state, z)
         accepted = 0.0
@@ -68,7 +68,7 @@ class AberrationSampler:
         return z, accepted
 
     def _energy(self, state: State, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Misfit and prior of each frame (T,), and their gradient (T, own parameters)."""
+        """Return misfit plus prior of each frame (T,), and the gradient in its own parameters (T, n_own)."""
         objective = self.objective
         frames, precision = objective.scaled_data(state.calibration)
         misfit = data_fidelity(
@@ -93,7 +93,7 @@ class AberrationSampler:
 
 @torch.no_grad()
 def laplace_precision(objective: MyopicObjective, state: State) -> Tensor:
-    """Gauss-Newton Hessian (T, K, K) of the cost in each frame's own K aberrations, for the object as it is."""
+    """Return the Gauss-Newton Hessian (T, K, K) of the cost in each frame's own K aberrations, for a fixed object."""
     model, z = objective.model, state.z
     n_own = model.aberrations.n_own
     precision = objective.scaled_data(state.calibration)[1]
@@ -101,7 +101,7 @@ def laplace_precision(objective: MyopicObjective, state: State) -> Tensor:
     still = state.image.expand(n_own, *state.image.shape) * 0
     each = torch.eye(n_own, z.shape[1], dtype=z.dtype, device=z.device)[:, None]
 
-    @torch.no_grad()  # which holds for one thread only
+    @torch.no_grad()  # needed here too, as no_grad applies to one thread only
     def of_frame(t: int) -> Tensor:
         changes = Linearization(model, state.image, z[t : t + 1]).forward(still, each)[:, 0]
         changes = (changes * precision[t if len(precision) > 1 else 0].sqrt()).flatten(1).to(z)
@@ -121,11 +121,11 @@ def integrate_aberrations(
     seed: int,
     follow_r0: bool,
 ) -> tuple[State, int]:
-    """The likeliest object whatever the aberrations, with the aberrations that fit it best, and the evaluations spent.
+    """Return the marginal estimate of the object with its best-fitting aberrations, and the number of evaluations.
 
-    It begins where a descent has ended; a weight of the aberrations' prior is needed. `follow_r0` lets that follow the
-    samples. In the end the object is settled under a prior of its own scale. The callback gets a `Record` after every
-    round.
+    `state` is the end of a descent, with a positive weight of the aberrations' prior; with `follow_r0` this weight is
+    estimated from the samples. At the end the object is fitted again under a prior with the scale that it suggests. The
+    callback is called with a `Record` after every round.
     """
     generator = torch.Generator().manual_seed(seed)
     sampler, size, spent = AberrationSampler(objective, state, generator), schedule.move_size, 0
@@ -163,9 +163,9 @@ def integrate_aberrations(
 
 @torch.no_grad()
 def settle_at_own_scale(objective: MyopicObjective, state: State, n_iterations: int) -> State:
-    """The object under the prior whose scale it suggests itself, for the aberrations as they are.
+    """Fit the object under a prior with the scale that it suggests, for fixed aberrations.
 
-    It is `state` itself that comes back where the prior knows no scale (`ObjectPrior.suited_to`).
+    Returns `state` itself if the prior has no scale (`ObjectPrior.suited_to`).
     """
     prior = objective.prior.suited_to(state.image)
     if prior is objective.prior:

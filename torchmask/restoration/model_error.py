@@ -1,8 +1,8 @@
-"""What the aberrations that a basis leaves out add to the chi-square of frames that are otherwise explained.
+"""The expected contribution to the chi-square of aberrations that the basis leaves out.
 
-Turbulence has no last mode. What the modes beyond the basis do to the frames is drawn at random, for the object and the
-aberrations that were found and turbulence as strong as these say it is; what the modes of the basis would fit of it is
-taken off, to first order. On simulated stacks that is what a good fit leaves: docs/restoration.md.
+Turbulence has infinitely many modes. The effect of the modes beyond the basis on the frames is simulated, for the
+restored object and aberrations and for turbulence of the strength that these show; the part that the modes of the basis
+would fit is removed to first order. On simulated stacks this is the residual of a good fit, see docs/restoration.md.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.pupil import SampledPupil
 from torchmask.restoration.state import State
 
-_ORDERS = 5  # radial orders beyond the basis: light that higher ones scatter falls beside the usual fields
-_FRAMES = 8  # that are tried, spread over the stack
-_ROUNDING = 1e-9  # of a change's squared length, which holds those that are alike
+_ORDERS = 5  # radial orders beyond the basis: light scattered by higher ones falls outside the usual fields
+_FRAMES = 8  # number of frames simulated, spread over the stack
+_ROUNDING = 1e-9  # regularises tangents that are nearly parallel, relative to their squared length
 
 
 class ModelError(NamedTuple):
-    """What to expect of the chi-square of explained frames.
+    """Expected deviation of the chi-square of a good fit from that of noise alone.
 
-    excess : added to the chi-square per pixel by what the basis leaves out
-    fitted : numbers of each frame that its noise takes part in, which its degrees of freedom lack
-    phase : rms of what the basis leaves out, over a sub-aperture [rad]
+    excess : chi-square per pixel that the modes beyond the basis add
+    fitted : effective number of parameters fitted to each frame, by which its degrees of freedom are fewer
+    phase : rms of the modes beyond the basis, over a sub-aperture [rad]
     """
 
     excess: float
@@ -50,9 +50,10 @@ NO_MODEL_ERROR = ModelError(0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class LeftOut:
-    """The aberrations of turbulence that have no place in a basis, white under their prior.
+    """The aberrations of turbulence that a basis leaves out, white under their prior.
 
-    own : of the modes of the basis; rest : of the `_ORDERS` radial orders beyond them, given the former
+    own : basis of the modes that are included
+    rest : basis of the `_ORDERS` radial orders beyond them, conditional on the former
     """
 
     own: AberrationBasis
@@ -60,9 +61,9 @@ class LeftOut:
 
     @classmethod
     def of(cls, aperture: Aperture, n_modes: int, r0: float, outer_scale: float) -> LeftOut:
-        """For the first `n_modes` of each sub-aperture, and turbulence of `r0` and `outer_scale` [m].
+        """Return the bases for the first `n_modes` of each sub-aperture, and turbulence of `r0` and `outer_scale` [m].
 
-        Holes are taken one by one: what is beyond the first modes of one says nothing of another.
+        Holes are taken as independent, as their higher modes are hardly correlated.
         """
         hole, n_sub = aperture, aperture.n_subapertures
         if isinstance(aperture, SparseAperture):
@@ -79,13 +80,13 @@ class LeftOut:
         return cls(turbulent_basis(aperture, n_modes, 0, r0, outer_scale), rest)
 
     def strength(self, objective: MyopicObjective, state: State) -> float:
-        """Variance of the aberrations found over that at `r0`; 1 where no mode tells."""
+        """Return the variance of the restored aberrations over that expected at `r0`; 1 if no mode constrains it."""
         coefficients = objective.model.aberrations.coefficients(state.z)
         return self.own.turbulence_strength(self.own.parameters_of(coefficients)) or 1.0
 
 
 def expected_error(objective: MyopicObjective, state: State, left_out: LeftOut) -> ModelError:
-    """What a fit such as `state` leaves if nothing is wrong with it; always the same for the same state."""
+    """Return the expected model error of a good fit such as `state`; it is the same for every call."""
     model, rest = objective.model, left_out.rest
     rest = rest if model.aberrations.motion is None else rest.in_motion(torch.zeros_like(rest.mixing[:, :0]))
     strength = left_out.strength(objective, state)
@@ -96,7 +97,7 @@ def expected_error(objective: MyopicObjective, state: State, left_out: LeftOut) 
     drawn = torch.randn(len(chosen), rest.n_parameters, dtype=torch.float64, generator=generator, device="cpu")
     phases = high.phase(math.sqrt(strength) * drawn.to(model.device))
 
-    @torch.no_grad()  # which holds for one thread only
+    @torch.no_grad()  # needed here too, as no_grad applies to one thread only
     def of_frame(number: int) -> tuple[float, float]:
         part = slice(chosen[number], chosen[number] + 1)
         return _excess_of_frame(objective.of_frames(part), state.of_frames(part), phases[number])
@@ -108,7 +109,7 @@ def expected_error(objective: MyopicObjective, state: State, left_out: LeftOut) 
 
 
 def _excess_of_frame(frame: MyopicObjective, state: State, phase: Tensor) -> tuple[float, float]:
-    """The excess and the count of `ModelError` for one frame whose light has another `phase` (P,) [rad] besides."""
+    """Return `excess` and `fitted` of `ModelError` for one frame with an additional `phase` (P,) [rad]."""
     model, samples = frame.model, frame.model.pupil.samples()
     spectrum, found = model.spectrum(state.image), samples.phase(state.z)
 
@@ -127,9 +128,10 @@ def _excess_of_frame(frame: MyopicObjective, state: State, phase: Tensor) -> tup
 
 
 def _tangents(frame: MyopicObjective, state: State, made: Tensor, root: Tensor) -> tuple[Tensor, Tensor]:
-    """Changes (K, H W) of one frame in units of its noise, and how strongly a prior holds each, both to unit length.
+    """Return the derivatives (K, H W) of one frame in units of its noise, and the curvature of their priors (K,).
 
-    They are those by its transmission, its background and its own aberrations, where these are free.
+    The derivatives are those in its transmission, and in its background and its own aberrations where these are free;
+    both are scaled to derivatives of unit length.
     """
     model, z = frame.model, state.z
     rows = [made]

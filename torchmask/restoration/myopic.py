@@ -1,4 +1,4 @@
-"""Myopic deconvolution: the object and the aberrations of every frame, together."""
+"""Myopic deconvolution: joint estimation of the object and the aberrations of every frame."""
 
 from __future__ import annotations
 
@@ -43,69 +43,70 @@ class MyopicDeconvolution:
 
         1/2 sum_t || (g_t window(h_t(a_t) * o) + b_t - y_t) / sigma ||^2  +  prior(o)  +  1/2 ||z||^2
 
-    from the clipped mean frame on, with the background b_t that fits best. `torchmask.restoration.solver` tells the
-    course of it: how the noise sigma and the transmissions g_t are brought up to date on the way, and how it leaves
-    local minima. Through a mask and of faint frames, where this object is biased, it ends at the one that is likeliest
-    whatever the aberrations (`torchmask.restoration.marginal`).
+    starting from the clipped mean frame, with the best-fitting background b_t. `torchmask.restoration.solver` describes
+    the algorithm: how it updates the noise sigma and the transmissions g_t, and how it escapes from local minima. For
+    faint frames through a mask, where this joint estimate of the object is biased, the aberrations are integrated out
+    at the end (`torchmask.restoration.marginal`).
 
     Parameters
     ----------
     aperture : Aperture
-        One that moves or trains is followed: a restoration takes it where it lies when it begins.
+        Mask or full pupil. If its centres change (a mask that trains), each restoration uses them as they are then.
     grid : Grid
-        Of the frames.
+        Grid of the frames.
     n_modes : int, optional
-        Zernike modes per sub-aperture, Noll 1 to n_modes. None: 6, or 231 for a full pupil.
-    r0, outer_scale : float, optional
-        Of the turbulence [m]. None: r0 is estimated from the restored aberrations, and the outer scale is taken as 20
-        mask diameters.
+        Number of Zernike modes per sub-aperture, from Noll index 1. None: 6, or 231 for a full pupil.
+    r0 : float, optional
+        Fried parameter of the turbulence [m]. None: it is estimated from the restored aberrations.
+    outer_scale : float, optional
+        Outer scale of the turbulence [m]. None: 20 mask diameters.
     readout_noise : float, optional
-        [electrons rms per pixel]. None: the noise is measured beyond the cut-off frequency.
-    wavelengths, weights : sequence of float, optional
-        A broad band as a few wavelengths [m] (None: that of the grid), and the light of each, any positive numbers
-        (None: equal). Coefficients are rad at the wavelength of the grid, and path differences the same for all.
+        Read-out noise [electrons rms per pixel]. None: the noise is measured beyond the cut-off frequency.
+    wavelengths : sequence of float, optional
+        Wavelengths [m] that represent a broad band. None: that of the grid. Coefficients are in rad at the wavelength
+        of the grid; path differences are the same at all wavelengths.
+    weights : sequence of float, optional
+        Relative flux at each wavelength, any positive numbers. None: equal.
     static_modes : int
-        Zernike modes per sub-aperture, Noll 1 to static_modes, of aberrations common to all frames, such as the
-        telescope's, besides the `n_modes` of each. Their prior is turbulence with r0 as wide as a hole, whatever `r0`.
-        Coefficients then have max(n_modes, static_modes) modes, and are the sum of both.
+        Number of Zernike modes per sub-aperture, Noll 1 to static_modes, of aberrations common to all frames (of the
+        telescope), besides the `n_modes` of each frame. Their prior is turbulence with r0 equal to the sub-aperture
+        diameter. Coefficients are the sum of both, with max(n_modes, static_modes) modes.
     background : Background, float or tensor
-        Light on every pixel that is not the object's: with `Background.PER_FRAME` a constant of its own in each frame,
-        which is found with the object, by default if the frames show a sky, with `Background.NONE` never; or what is
-        known of it [electrons per pixel], a number or a tensor that broadcasts to the frames. Its noise always counts.
+        Uniform light that does not come from the object, see `Background`; or the known background [electrons per
+        pixel], a number or a tensor that broadcasts to the frames. Its photon noise is taken into account.
     pixel : PixelResponse, optional
-        How the detector's pixels blur the image: `SquarePixel(fill_factor)`, or `MappedPixel` with a map of their
-        sensitivity. The object is restored without it. None: pixels are points.
+        Blur by the detector's pixels: `SquarePixel(fill_factor)`, or `MappedPixel` with a map of their sensitivity. The
+        restored object is free of it. None: pixels are points.
     exposure_tau0 : float
-        How long a frame lasts, in units of tau0 = 0.314 r0 / wind. Piston, tip and tilt of every hole may then change
-        evenly during a frame, and coefficients are those in its middle. 0: frames are snapshots.
+        Exposure time of a frame in units of tau0 = 0.314 r0 / wind. Piston, tip and tilt of every hole then change
+        linearly during a frame; coefficients are those at mid-exposure. 0: frames are snapshots.
     refine_geometry : bool, optional
-        Whether a turn and an even magnification of the mask are found with the object. None: if the frames say clearly
-        that it lies otherwise than told. Frames of a star tell it more precisely, and more of it: `calibrate_mask`.
+        Whether to estimate a rotation and magnification of the mask too. None: only if the frames clearly show that it
+        is misplaced. Frames of a star give both more precisely (`calibrate_mask`).
     prior : callable
-        Of the object: a function or module that maps an image (H', W'), in units of the stack's mean pixel and on a
-        field somewhat wider than the frames, to a scalar that PyTorch differentiates. At hand are `TotalVariation` and
-        `EdgePreserving`. If it has methods `gradient(image)` and `curvature(image)`, they are used.
+        Prior on the object: a function or module that maps an image (H', W'), in units of the stack's mean pixel and on
+        a field somewhat wider than the frames, to a differentiable scalar, such as `TotalVariation` (the default) or
+        `EdgePreserving`. Methods `gradient(image)` and `curvature(image)` are used if it has them.
     aberration_prior : bool
-        False leaves out 1/2 ||z||^2; z are the Zernike coefficients then.
+        False: leave out 1/2 ||z||^2; z are then the Zernike coefficients themselves.
     max_iterations : int
-        Of all starts together; one takes 1000 at most. A start whose verdict is that it does not explain the frames may
-        have missed the object: up to three more begin at random aberrations, until one explains them or two end alike,
-        and the best is kept.
+        Maximum number of iterations over all starts, each of which takes at most 1000. If a start does not explain the
+        frames, up to three more start from random aberrations, until one does or two agree; the best is kept.
     tolerance : float
-        Converged when 100 iterations lower the cost by less than this fraction.
+        The restoration has converged when 100 iterations lower the cost by less than this fraction.
     minimizer : Minimizer
-        What descends: `ProjectedLBFGS`, or an optimiser of PyTorch by `TorchMinimizer`.
+        `ProjectedLBFGS` (the default), or an optimiser of PyTorch in a `TorchMinimizer`.
     schedule : Schedule
-        When the restoration does what.
+        Numbers that control the course of the restoration.
     dtype : torch.dtype
-        Of the model; float32 takes half the time. Object, aberrations and cost are always kept in float64.
+        Data type of the model; float32 takes half the time. Object, aberrations and cost are always float64.
 
     Raises
     ------
     ValueError
-        For numbers out of range, and for a grid that the aperture cannot be sampled on.
+        If a number is out of range, or the grid samples the aperture too coarsely.
     TypeError
-        If the prior cannot be called.
+        If the prior is not callable.
 
     Examples
     --------
@@ -157,7 +158,7 @@ class MyopicDeconvolution:
             Band.of([grid.wavelength] if wavelengths is None else wavelengths, weights),
             frame_modes=(231 if self.many_minima else 6) if n_modes is None else n_modes,
             static_modes=static_modes,
-            # Masks are made for holes of about r0; a full pupil that needs a restoration spans several.
+            # The holes of a mask are usually about r0 wide; a full pupil that needs a restoration spans several r0.
             r0=aperture.subaperture_diameter / (7 if self.many_minima else 1) if r0 is None else r0,
             outer_scale=20 * aperture.mask_diameter if outer_scale is None else outer_scale,
             whitened=aberration_prior,
@@ -177,20 +178,20 @@ class MyopicDeconvolution:
 
     @property
     def n_modes(self) -> int:
-        """J, Zernike modes per sub-aperture of the coefficients that come back."""
+        """Number J of Zernike modes per sub-aperture in the restored coefficients."""
         return self.recipe.n_modes
 
     @property
     def model(self) -> ExposureModel:
-        """The model of the exposures, with the aperture where it lies now."""
+        """Model of the exposures, with the present centres of the aperture."""
         if not torch.equal(self._model.pupil.aperture.centers, self.recipe.aperture.centers.detach()):
             self._model = self.recipe.turbulent_model()
         return self._model
 
     def objective(self, frames: Array, *, valid: Array | None = None, errors: Array | None = None) -> MyopicObjective:
-        """The cost of object and aberrations behind `frames` (T, H, W) [electrons], to minimise in a way of your own.
+        """Return the cost of object and aberrations for `frames` (T, H, W) [electrons], for a minimiser of your own.
 
-        It is differentiable in the centres of the aperture too. Arguments and errors as for `restore`.
+        It is differentiable in the centres of the aperture too. The arguments and errors are those of `restore`.
         """
         stack = self._stack(frames, valid, errors)
         model = self.recipe.turbulent_model(follows_aperture=True).beside(stack.free)
@@ -217,45 +218,44 @@ class MyopicDeconvolution:
         Parameters
         ----------
         frames : (T, H, W) tensor or array
-            Single pixels may be negative (read-out noise).
+            Exposures. Pixels may be negative (read-out noise).
         valid : (H, W) or (T, H, W) boolean tensor or array, optional
-            False where a pixel is dead or saturated; it is left out, whatever its value.
+            False where a pixel is dead or saturated; it is ignored, whatever its value.
         errors : (H, W) or (T, H, W) tensor or array, optional
-            Standard deviations of the pixels' noise [electrons] that were measured. None: the same for all pixels.
+            Measured standard deviations of the pixels' noise [electrons]. None: the same for all pixels.
         coefficients : (T, N, J) tensor, optional
-            Known aberrations [rad rms], which stay as they are: non-blind deconvolution.
+            Known aberrations [rad rms], which stay fixed: non-blind deconvolution.
         covariance : (N J, N J) tensor, optional
-            Of the errors of `coefficients` [rad^2], sub-aperture by sub-aperture, the same for all frames, such as a
-            wave-front sensor has: they are refined then, with these errors as their prior in place of turbulence.
-            Errors below 1 mrad count as 1 mrad.
+            Covariance of the errors of `coefficients` [rad^2], ordered by sub-aperture, the same for all frames. The
+            coefficients are then refined, with these errors as their prior. Errors below 1 mrad count as 1 mrad.
         known_object : (H, W) tensor, optional
-            Known object, up to its flux, which stays as it is: only the aberrations are restored.
+            Known object, up to its flux, which stays fixed: only the aberrations are restored.
         start : RestorationResult, optional
-            Goes on from there (warm start). It may come from the first T' <= T of these frames: the aberrations of the
-            new frames are then fitted to its object before everything is refined together.
+            Earlier result to continue from (warm start). It may come from the first T' <= T of these frames: the
+            aberrations of the new frames are then fitted to its object before everything is refined together.
         n_samples : int
-            Drawn from the posterior for the standard deviations of object and coefficients, which cost about as much
-            as 50 iterations each; 8 are enough. 0: no standard deviations.
+            Number of posterior samples for the standard deviations of object and coefficients; each costs about as much
+            as 50 iterations, and 8 are enough. 0: no standard deviations.
         seed : int
-            Of the random starts and candidates, and of the samples of aberrations that are integrated out.
+            Seed of the random starts and candidates, and of the samples of aberrations that are integrated out.
         checkpoint : path, optional
-            An .npz file, written every 100 iterations. If it exists, the restoration goes on from it, and ends in the
-            same result as if it had never been interrupted.
+            An .npz file, written every 100 iterations. If it exists, the restoration resumes from it, and ends in the
+            same result as if it had not been interrupted.
         callback : callable, optional
-            Gets a `Record` after every iteration; every tenth holds the object and the coefficients.
+            Called with a `Record` after every iteration; every tenth includes the object and the coefficients.
 
         Raises
         ------
         ValueError
-            If a shape is wrong, a valid pixel or what is known is not finite, one of `errors` not positive, a frame or
-            the known object holds no light, both object and aberrations are known, `covariance` is not one or stands
-            without coefficients or beside static modes, the prior is no finite and differentiable scalar, or the
+            If a shape is wrong, a valid pixel or a known value is not finite, one of `errors` is not positive, a frame
+            or the known object has no light, both object and aberrations are known, `covariance` is not a covariance or
+            comes without coefficients or with static modes, the prior is not a finite, differentiable scalar, or the
             checkpoint is damaged or belongs to other frames, settings or known values.
 
         Warns
         -----
         UserWarning
-            If noise, border or fringes of the frames do not fit `readout_noise`, the field or the mask's orientation.
+            If noise, border or fringes of the frames contradict `readout_noise`, the field or the mask's orientation.
         """
         started = time.perf_counter()
         check_samples(n_samples)

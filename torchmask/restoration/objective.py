@@ -1,4 +1,4 @@
-"""What a restoration minimises: the cost of an object and of the aberrations of every frame."""
+"""The cost that a restoration minimises over the object and the aberrations of every frame."""
 
 from __future__ import annotations
 
@@ -18,21 +18,24 @@ from torchmask.restoration.state import Calibration
 
 
 class Free(Flag):
-    """What of an objective may change; the rest is known."""
+    """Unknowns of an objective that may change; the others are known."""
 
     OBJECT = auto()
     ABERRATIONS = auto()
-    """Those of each frame."""
+    """Aberrations of each frame."""
     COMMON = auto()
-    """Those common to all frames."""
+    """Aberrations common to all frames."""
     PLACE = auto()
-    """How the mask lies: a turn and a magnification."""
+    """Geometry of the mask: a rotation and a magnification."""
 
 
 class CostAndGradients(NamedTuple):
-    """The cost, a scalar, and its gradients (H', W') and (T, K): zero where nothing is free.
+    """The cost and its gradients, which are zero in what is not free.
 
-    place_gradient : (2,) in a step of the mask; None where no step is made
+    value : scalar cost
+    object_gradient : (H', W') gradient in the object
+    aberration_gradient : (T, K) gradient in the parameters of the aberrations
+    place_gradient : (2,) gradient in a step of the mask; None if no step is given
     """
 
     value: Tensor
@@ -42,31 +45,36 @@ class CostAndGradients(NamedTuple):
 
 
 class MyopicObjective(nn.Module):
-    """1/2 sum precision / inflation (transmission * model + background - frames)^2 + prior(image) + hold.
+    """Negative log-posterior of an object and of the aberrations of every frame.
 
-    The hold is weight/2 |z - centre|^2. A background that is free is always the one that fits best, and beside it the
-    object pays for its light (`Background`).
+        1/2 sum precision / inflation (transmission * model + background - frames)^2 + prior(image)
+        + weight/2 |z - centre|^2
 
-    `forward(image, z)` returns it as a scalar that autograd differentiates in the image, in z and in the centres of
-    the model's aperture, as often as wanted: the mask may move or train while the matrix of the aberration basis stays
-    what it was made as. `value_and_gradients` are the same value and first gradients in image and z at a fraction of
-    the time and memory, by the adjoint.
+    A free background is always the best-fitting one, with a small penalty on the object's light (`Background`).
+
+    `forward(image, z)` returns the cost as a scalar that autograd differentiates, to any order, in the image, in z and
+    in the centres of the model's aperture; the matrix of the aberration basis stays fixed when the centres change.
+    `value_and_gradients` gives the same value and its first gradients in image and z at a fraction of the time and
+    memory, by the adjoint.
 
     Parameters
     ----------
     model : ExposureModel
+        Model of the exposures.
     frames : (T, H, W) tensor
-        In units of their mean.
+        Exposures in units of their mean.
     precision : tensor that broadcasts to the frames' shape, with its first axis of length T or 1
         Inverse noise variance of each pixel in those units, 0 where it is not valid.
     prior : ObjectPrior
+        Prior on the object.
     centre : (T, K) tensor, optional
         Expected aberrations. None: zero.
     free : Free
+        Unknowns to optimise.
     prior_copies : int
-        How many times the object's prior counts, where the same frame stands in `frames` so many times.
+        Factor on the object's prior, for `frames` that contain every frame so many times.
     parallel : callable
-        How to go over the frames, as `map` does.
+        Function like `map`, which is applied to a few frames at a time.
 
     Examples
     --------
@@ -116,7 +124,7 @@ class MyopicObjective(nn.Module):
     def with_changes(
         self, *, model: ExposureModel | None = None, centre: Tensor | None = None, free: Free | None = None
     ) -> MyopicObjective:
-        """The objective with another model, other expected aberrations or something else free."""
+        """Return the objective with another model, other expected aberrations or other unknowns free."""
         return MyopicObjective(
             model or self.model,
             self.frames,
@@ -129,7 +137,7 @@ class MyopicObjective(nn.Module):
         )
 
     def of_frames(self, part: slice | Tensor, *, free: Free | None = None, prior_copies: int = 1) -> MyopicObjective:
-        """The objective of some of the frames, any of them several times."""
+        """Return the objective of some of the frames, which may be repeated."""
         return MyopicObjective(
             self.model,
             self.frames[part],
@@ -142,7 +150,7 @@ class MyopicObjective(nn.Module):
         )
 
     def neutral_calibration(self) -> Calibration:
-        """Frames as bright as they are, noise as it is said to be, aberrations as strong as their prior says."""
+        """Return the calibration with transmissions from the frames' mean light, and noise and priors as given."""
         light = self.frames - self.model.background.first_guess(self.frames)
         transmission = light.mean((1, 2)).double()
         return Calibration(transmission / transmission.mean(), torch.ones_like(transmission), 1.0)
@@ -157,13 +165,13 @@ class MyopicObjective(nn.Module):
         return misfit + self.prior_copies * (self.prior(image) + self.model.background.price * image.sum()) + hold
 
     def value_and_gradients(self, image: Tensor, z: Tensor, calibration: Calibration | None = None) -> CostAndGradients:
-        """The cost and its gradients in `image` (H', W') and `z` (T, K), by the adjoint."""
+        """Return the cost and its gradients in `image` (H', W') and `z` (T, K), by the adjoint."""
         return self.evaluator(calibration or self.neutral_calibration())(image, z)
 
     def evaluator(self, calibration: Calibration) -> Callable[..., CostAndGradients]:
-        """`value_and_gradients` for one calibration, whose frames are scaled once.
+        """Return `value_and_gradients` as a function for one calibration, for which the frames are scaled only once.
 
-        A third argument, a step (2,), turns [rad] and shrinks the mask from where it lies (`placed.PlacedSamples`).
+        Its third argument is a step (2,) that rotates [rad] and shrinks the mask (`placed.PlacedSamples`).
         """
         frames, precision = self.scaled_data(calibration)
         by_object = Free.OBJECT in self.free
@@ -206,7 +214,7 @@ class MyopicObjective(nn.Module):
         return value + price * image.sum(), slope + price
 
     def _within_free(self, gradient: Tensor) -> Tensor:
-        """The gradient (T, K) of a function of the common aberrations' mean, which keeps equal what is equal."""
+        """Return the gradient (T, K), zero in what is not free and equal in all frames for common aberrations."""
         basis = self.model.aberrations
         if Free.ABERRATIONS not in self.free:
             gradient = basis.with_common_of(torch.zeros_like(gradient), gradient)
@@ -217,13 +225,16 @@ class MyopicObjective(nn.Module):
         return basis.with_common_of(gradient, torch.zeros_like(gradient[:1]))
 
     def scaled_data(self, calibration: Calibration) -> tuple[Tensor, Tensor]:
-        """Frames and precision with the transmission g taken to the data: (frames / g, precision g^2 / inflation)."""
+        """Return frames and precision for unit transmission, frames / g and precision g^2 / inflation."""
         transmission = calibration.transmission[:, None, None].to(self.frames)
         inflation = calibration.noise_inflation[:, None, None].to(transmission)
         return self.frames / transmission, self.precision * (transmission**2 / inflation)
 
     def aberration_weight(self, calibration: Calibration, z: Tensor) -> float | Tensor:
-        """Weight of a frame's (z - centre)^2 / 2: common aberrations do not follow the turbulence, and count once."""
+        """Return the weight of a frame's (z - centre)^2 / 2.
+
+        Common aberrations count once in all frames, and their weight does not follow the turbulence.
+        """
         n_common, value = self.model.aberrations.n_common, calibration.aberration_weight
         if not n_common:
             return value
@@ -232,16 +243,16 @@ class MyopicObjective(nn.Module):
         return weight
 
     def frame_costs(self, image: Tensor, z: Tensor, calibration: Calibration) -> Tensor:
-        """Misfit of each frame and prior of its aberrations, (T,)."""
+        """Return misfit plus prior of the aberrations for each frame (T,)."""
         frames, precision = self.scaled_data(calibration)
         misfit = data_fidelity(self.model, image, z, frames, precision, want_object=False, want_aberrations=False)
         return misfit.value.to(z) + 0.5 * (self.aberration_weight(calibration, z) * (z - self.centre) ** 2).sum(1)
 
     @torch.no_grad()
     def object_quadratic(self, image: Tensor, z: Tensor, calibration: Calibration) -> tuple[Tensor, Tensor]:
-        """The misfit as a quadratic function of the object: gradient (H', W') and Hessian over frequencies.
+        """Return gradient (H', W') and Hessian (H', W'/2 + 1) of the misfit in the object, for known aberrations.
 
-        The gradient is exact, the Hessian (H', W'/2 + 1) that of a full field, which is diagonal in frequency.
+        The gradient is exact; the Hessian is that of frames as large as the field, which is diagonal in frequency.
         """
         frames, precision = self.scaled_data(calibration)
         slope = data_fidelity(

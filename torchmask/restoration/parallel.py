@@ -1,4 +1,4 @@
-"""Frames side by side on the processor's cores."""
+"""Process frames in parallel on the processor's cores."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 @contextmanager
 def each_on_a_core(device: torch.device) -> Iterator[Map]:
-    """A `map` whose calls run on as many threads as torch may use, one core each.
+    """Provide a `map` whose calls run on as many threads as torch may use, one core each.
 
-    The arrays of a few frames are too small to be shared between cores: torch's own threads then cost more than they
-    bring. For the time of the context torch uses one thread, so that what runs in it does not depend on their number.
+    The arrays of a few frames are too small for torch's own threads, which cost more time than they save. Within the
+    context torch uses one thread, so that results do not depend on the number of threads.
     """
     n_threads = torch.get_num_threads()
     if device.type != "cpu" or n_threads == 1:

@@ -1,4 +1,4 @@
-"""The samples of a mask that has been turned and shrunk, and what leads back from them."""
+"""The pupil samples of a mask that has been rotated and shrunk, and gradients with respect to that step."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torchmask.restoration.pupil import OpenSamples, SampledPupil
 
 
 def moved_centers(centers: Tensor, step: Tensor) -> Tensor:
-    """Centres (N, 2) turned from x to y by step[0] [rad] and divided by exp(step[1]); differentiable in both."""
+    """Rotate centres (N, 2) from x to y by step[0] [rad] and divide them by exp(step[1]); differentiable in both."""
     turn, scale = step[0], (-step[1]).exp()
     cosine, sine = scale * turn.cos(), scale * turn.sin()
     x, y = centers.to(step).unbind(-1)
@@ -17,9 +17,9 @@ def moved_centers(centers: Tensor, step: Tensor) -> Tensor:
 
 
 class PlacedSamples:
-    """The open samples of a pupil whose sub-apertures have been turned and shrunk about the origin by `step` (2,).
+    """The open samples of a pupil whose sub-aperture centres are rotated and shrunk about the origin by `step` (2,).
 
-    samples : OpenSamples, detached
+    samples : the samples, detached from the graph
     """
 
     def __init__(self, pupil: SampledPupil, step: Tensor) -> None:
@@ -29,6 +29,6 @@ class PlacedSamples:
         self.samples: OpenSamples = OpenSamples(*(values.detach() for values in self._moved))
 
     def pull_back(self, weights: Tensor, basis: Tensor) -> Tensor:
-        """The gradient (2,) in the step, from those in the samples' weights (P,) and basis (P, K)."""
+        """Return the gradient (2,) in the step from those in the samples' weights (P,) and basis (P, K)."""
         (slope,) = torch.autograd.grad((self._moved.weights, self._moved.basis), self._step, (weights, basis))
         return slope

@@ -1,10 +1,9 @@
-"""How a mask lies, found together with object and aberrations: a turn and an even magnification.
+"""Rotation and magnification of a mask, estimated together with object and aberrations.
 
-A turn shifts every baseline across itself, and a magnification along itself; no aberration does that. So the frames of
-any object tell both, once its restoration has become sharp. They are described by a step (2,): the turn from x to y
-[rad] and the shrinkage, minus the logarithm of the magnification, by which the mask still has to move from where the
-model has it. Holes stay as they are while a step is looked for, and are turned and magnified with the mask when it is
-taken.
+A rotation changes every baseline perpendicular to itself, and a magnification along itself; no aberration does that.
+The frames of any object therefore show both, once its restoration is sharp. They are described by a step (2,) from the
+geometry in the model: the rotation from x to y [rad], and the shrinkage, minus the logarithm of the magnification. The
+shape of the holes is kept while a step is sought, and is rotated and magnified with the mask when the step is taken.
 """
 
 from __future__ import annotations
@@ -24,14 +23,14 @@ from torchmask.restoration.placed import PlacedSamples
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.state import State
 
-_STEP = 1e-4  # for the slope of the frames: a hundredth of a pupil sample or less
+_STEP = 1e-4  # of the finite differences: a hundredth of a pupil sample or less
 
 
 class Misplacement(NamedTuple):
-    """What the frames tell to first order of how the mask lies, with everything else as it is.
+    """First-order estimate of the error of the mask's geometry, with everything else fixed.
 
-    step : (2,) turn [rad] and shrinkage that lower the misfit most
-    gain : by how much
+    step : (2,) rotation [rad] and shrinkage that minimise the misfit
+    gain : decrease of the misfit
     """
 
     step: Tensor
@@ -39,13 +38,13 @@ class Misplacement(NamedTuple):
 
     @property
     def size(self) -> float:
-        """How far the step moves holes, over their distance from the centre."""
+        """Displacement of the holes by the step, over their distance from the centre."""
         return math.hypot(*self.step.tolist())
 
 
 @torch.no_grad()
 def slopes_of_frames(model: ExposureModel, image: Tensor, z: Tensor) -> Tensor:
-    """Derivatives (2, T, H, W) of the frames in the step at zero, by central differences."""
+    """Return the derivatives (2, T, H, W) of the frames with respect to the step, at zero, by central differences."""
 
     def made(step: Tensor) -> Tensor:
         samples = PlacedSamples(model.pupil, step).samples
@@ -57,7 +56,7 @@ def slopes_of_frames(model: ExposureModel, image: Tensor, z: Tensor) -> Tensor:
 
 @torch.no_grad()
 def misplacement(objective: MyopicObjective, state: State) -> Misplacement:
-    """The Gauss-Newton step of the mask alone: the rest, which could follow, makes it longer."""
+    """Return the Gauss-Newton step of the mask alone; jointly with object and aberrations it would be larger."""
     model = objective.model
     frames, precision = objective.scaled_data(state.calibration)
     made = torch.cat([model(state.image, state.z[part]) for part in model.chunks(len(state.z))])
@@ -69,25 +68,25 @@ def misplacement(objective: MyopicObjective, state: State) -> Misplacement:
 
 
 def is_misplaced(objective: MyopicObjective, state: State, schedule: Schedule) -> bool:
-    """Whether the frames say clearly that the mask lies elsewhere."""
+    """Return whether the frames clearly show that the mask's geometry is wrong."""
     found = misplacement(objective, state)
     return found.gain > schedule.misplaced_gain and found.size > schedule.misplaced
 
 
 def information(slopes: Tensor, precision: Tensor) -> Tensor:
-    """What frames of this precision tell of the step if everything else is known: the matrix (2, 2) of `slopes`."""
+    """Return the Fisher information (2, 2) of the step from the frames' `slopes`, if everything else is known."""
     weighted = (precision.sqrt() * slopes).double().flatten(1)
     return weighted @ weighted.T
 
 
 def largest_magnification(model: ExposureModel) -> float:
-    """By which the mask may still grow before its image is undersampled."""
+    """Return the magnification of the mask at which its image becomes undersampled, at least 1."""
     period = model.window.grid.period * model.band.shortest / model.window.grid.wavelength
     return max(1.0, 0.5 * period / model.pupil.aperture.extent)
 
 
 def placed_as(objective: MyopicObjective, told: Aperture, geometry: MaskGeometry) -> MyopicObjective:
-    """The objective whose mask, `told`, lies by `geometry`."""
+    """Return the objective with the mask `told` transformed by `geometry`."""
     aperture = told if geometry == MaskGeometry() or not isinstance(told, SparseAperture) else geometry.apply(told)
     if torch.equal(aperture.centers, objective.model.pupil.aperture.centers):
         return objective
@@ -95,12 +94,12 @@ def placed_as(objective: MyopicObjective, told: Aperture, geometry: MaskGeometry
 
 
 def distance(one: MaskGeometry, other: MaskGeometry) -> float:
-    """How far holes lie apart in two geometries, over their distance from the centre, at most."""
+    """Return the largest displacement of a hole between two geometries, over its distance from the centre."""
     return float(torch.linalg.matrix_norm(one.matrix - other.matrix, 2))
 
 
 def moved(state: State, step: Tensor) -> State:
-    """The state whose mask has made the step."""
+    """Return the state with the mask moved by the step."""
     turn, shrinkage = step.tolist()
     factor = math.exp(-shrinkage)
     matrix = MaskGeometry(turn, factor, factor).matrix @ state.geometry.matrix

@@ -1,13 +1,13 @@
-"""How far a restoration can be trusted: standard deviations of object and aberrations, by Laplace's approximation.
+"""Standard deviations of the restored object and aberrations, by Laplace's approximation.
 
-Around the restoration the cost is taken as quadratic, the misfit by its Gauss-Newton Hessian in object and aberrations
-jointly, so that each carries the uncertainty of the other. Total variation has no useful curvature: nearly infinite in
-flat parts, zero across edges. In its place stands the Gaussian prior that the restored object suggests: independent
-gradients, whose variance follows their local mean square, that of what has been lost included (by expectation
-maximisation).
+The cost is approximated as quadratic around the restoration, with the Gauss-Newton Hessian of the misfit in object and
+aberrations jointly, so that each includes the uncertainty of the other. Total variation has no useful curvature: it is
+nearly infinite in flat parts and zero across edges. It is replaced by the Gaussian prior that the restored object
+suggests: independent gradients, whose variance is their local mean square, including the part lost in the restoration
+(by expectation maximisation).
 
-Samples of the posterior solve the quadratic problem with data and priors drawn anew (Papandreou & Yuille, Adv. Neural
-Inf. Process. Syst. 23, 1858, 2010), by conjugate gradients.
+A sample of the posterior is the solution of the quadratic problem with perturbed data and priors (Papandreou & Yuille,
+Adv. Neural Inf. Process. Syst. 23, 1858, 2010), by conjugate gradients.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ from torchmask.restoration.placement import slopes_of_frames
 from torchmask.restoration.priors import divergence, gradient
 from torchmask.restoration.state import State
 
-_REACH = 0.7  # resolution elements (1 / cut-off) over which gradients are alike: 0.5 to 1.4 tried, docs/restoration.md
-_ROUNDS, _FEW = 3, 6  # of expectation maximisation, and its samples, which the mean over the reach makes enough
-_LEAST = 1e-6  # of the largest: dark parts have a prior too, and aberrations without curvature a scale and a hold
-_BATCH = 8  # samples at once, each of which takes the memory of several stacks
-_ITERATIONS = 50  # of conjugate gradients: variances of what is below the cut-off are within 3 % of their limit then
+_REACH = 0.7  # smoothing of the gradients' variance [1 / cut-off]: 0.5 to 1.4 tried, see docs/restoration.md
+_ROUNDS, _FEW = 3, 6  # rounds and samples of expectation maximisation; few suffice, as they are smoothed
+_LEAST = 1e-6  # of the largest value: minimum, for a finite prior in dark parts and a finite scale of all aberrations
+_BATCH = 8  # samples drawn at once, each of which takes the memory of several stacks
+_ITERATIONS = 50  # of conjugate gradients: variances below the cut-off are then within 3 % of their limit
 
 
 def standard_deviations(
     objective: MyopicObjective, state: State, cutoff: float, photon_share: float, n_samples: int
 ) -> tuple[Tensor, Tensor]:
-    """Of the object (H', W') below `cutoff` [cycles/pixel], and `n_samples` (S, T, K) of the aberrations.
+    """Return standard deviations (H', W') of the object below `cutoff` [cycles/pixel], and samples of the aberrations.
 
-    The samples scatter around zero as the truth does around `state`; what is not free does not vary. The variance of
-    the object is averaged over the reach of its prior, for which few samples are enough. `photon_share` is the part of
-    the noise variance that is photon noise, which bright pixels have more of.
+    The `n_samples` samples (S, T, K) scatter around zero as the truth does around `state`; what is not free does not
+    vary. The variance of the object is smoothed by the width of its prior, so that few samples suffice. `photon_share`
+    is the fraction of the noise variance that is photon noise, which is larger in bright pixels.
     """
     generator = torch.Generator().manual_seed(0)
     reach = _REACH / cutoff
@@ -55,9 +55,9 @@ def standard_deviations(
 
 
 def place_deviations(objective: MyopicObjective, state: State, cutoff: float) -> Tensor:
-    """Standard deviations (2,) of the mask's turn [rad] and shrinkage, with all else as uncertain as it is.
+    """Return standard deviations (2,) of the mask's rotation [rad] and shrinkage, marginal over object and aberrations.
 
-    What object and aberrations can imitate of the frames' slopes tells nothing of the mask (Schur's complement).
+    Changes of the frames that object and aberrations can imitate carry no information on the mask (Schur complement).
     """
     generator = torch.Generator().manual_seed(0)
     _, power = objective.object_quadratic(state.image, state.z, state.calibration)
@@ -70,7 +70,7 @@ def place_deviations(objective: MyopicObjective, state: State, cutoff: float) ->
 
 
 def _gradient_prior(power: Tensor, image: Tensor, reach: float, generator: torch.Generator) -> Tensor:
-    """Inverse variance (H', W') of each component of the object's gradient, from its local mean over `reach` pixels."""
+    """Return the inverse variance (H', W') of each component of the object's gradient, smoothed by `reach` pixels."""
     known = _energy(image)
     least = _LEAST * float(known.max())
     prior = 2 / smooth(known, reach).clamp(min=least)
@@ -83,12 +83,12 @@ def _gradient_prior(power: Tensor, image: Tensor, reach: float, generator: torch
 
 
 def _bias(image: Tensor, slope: Tensor, power: Tensor, prior: Tensor) -> Tensor:
-    """How far the mean of the posterior lies from the restored object, whose prior was another one, for known PSFs."""
+    """Return the posterior mean minus the restored object, for known PSFs; they differ as their priors do."""
     return _solve_for_object(power, prior, -(slope + _curvature(image, prior))[None])[0]
 
 
 def _solve_for_object(power: Tensor, prior: Tensor, right: Tensor) -> Tensor:
-    """Objects (S, H', W') at which data and prior pull with `right` (S, H', W'), for known PSFs."""
+    """Solve for the objects (S, H', W') whose gradient of misfit and prior is `right` (S, H', W'), for known PSFs."""
     return conjugate_gradients(
         lambda x: _filter(x, power) + _curvature(x, prior), right, _object_preconditioner(power, prior), _ITERATIONS
     )
@@ -103,12 +103,12 @@ def _sample(
     n_samples: int,
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
-    """Samples of object (S, H', W') and aberrations (S, T, K), given the gradients' inverse variances `prior`."""
+    """Draw samples of object (S, H', W') and aberrations (S, T, K), given the gradients' inverse variances `prior`."""
     model, precision = objective.model, objective.scaled_data(state.calibration)[1]
     joint = JointHessian(objective, state, power, prior, generator)
     brightness = model(state.image, state.z).clamp(min=0)
     share = photon_share / state.calibration.noise_inflation[:, None, None].to(brightness)
-    variance = 1 + share * (brightness / brightness.mean() - 1)  # over that which the misfit assumes
+    variance = 1 + share * (brightness / brightness.mean() - 1)  # relative to the one that the misfit assumes
     noise = (precision * variance).sqrt() * _white((n_samples, *objective.frames.shape), brightness, generator)
     by_image, by_z = joint.tangent.adjoint(noise)
     by_image = by_image + _prior_noise(prior, n_samples, generator)
@@ -117,7 +117,7 @@ def _sample(
 
 
 class JointHessian:
-    """The Hessian of the cost in object and aberrations jointly, by Gauss and Newton, with the Gaussian prior above.
+    """Gauss-Newton Hessian of the cost in object and aberrations jointly, with the Gaussian prior of this module.
 
     z_prior : (K,) curvature of the aberrations' prior
     """
@@ -138,7 +138,7 @@ class JointHessian:
         self._shapes = state.image.shape, state.z.shape
 
     def solve(self, by_image: Tensor, by_z: Tensor) -> tuple[Tensor, Tensor]:
-        """Objects (S, H', W') and aberrations (S, T, K) that the Hessian takes to these; what is not free stays 0."""
+        """Solve for objects (S, H', W') and aberrations (S, T, K) with this right-hand side; what is not free is 0."""
         found = conjugate_gradients(self._apply, self._join(by_image, by_z), self._precondition, _ITERATIONS)
         return self._split(found)
 
@@ -162,9 +162,10 @@ class JointHessian:
 
 
 def _object_preconditioner(power: Tensor, prior: Tensor) -> Operator:
-    """About the inverse of the Hessian in the object, which is diagonal in frequency once the prior is levelled out.
+    """Return an approximate inverse of the Hessian in the object.
 
-    In the variable x / scale the prior is the same everywhere, and the misfit what it is where the object is bright.
+    In the variable x / scale the prior is uniform, so that the Hessian is nearly diagonal in frequency; the misfit is
+    taken as it is where the object is bright.
     """
     scale = prior.rsqrt()
     level = (scale**4).mean() / (scale**2).mean()
@@ -181,13 +182,13 @@ def _white(shape: tuple[int, ...], like: Tensor, generator: torch.Generator) -> 
 
 
 def _prior_noise(precision: Tensor, n_samples: int, generator: torch.Generator) -> Tensor:
-    """Samples (S, H', W') whose covariance is the prior's Hessian."""
+    """Draw samples (S, H', W') whose covariance is the prior's Hessian."""
     shape = (n_samples, *precision.shape)
     return divergence(*(precision.sqrt() * _white(shape, precision, generator) for _ in range(2)))
 
 
 def _curvature(x: Tensor, prior: Tensor) -> Tensor:
-    """The prior's Hessian times x."""
+    """Return the prior's Hessian times x."""
     return divergence(*(prior * slope for slope in gradient(x)))
 
 
@@ -201,7 +202,7 @@ def _energy(image: Tensor) -> Tensor:
 
 
 def smooth(image: Tensor, width: float) -> Tensor:
-    """Convolve (..., H, W) with a Gaussian of standard deviation `width` [pixels], periodic."""
+    """Convolve images (..., H, W) periodically with a Gaussian of standard deviation `width` [pixels]."""
     nu_y = torch.fft.fftfreq(image.shape[-2], dtype=image.dtype, device=image.device)[:, None]
     nu_x = torch.fft.rfftfreq(image.shape[-1], dtype=image.dtype, device=image.device)
     return _filter(image, torch.exp(-2 * (math.pi * width) ** 2 * (nu_y**2 + nu_x**2)))

@@ -1,7 +1,7 @@
-"""Limited-memory quasi-Newton descent under lower bounds, on torch tensors.
+"""Limited-memory BFGS with lower bounds, on torch tensors.
 
-The iterates, the corrections and the products with them stay on the device of the start: nothing passes through the
-host but one number per evaluation.
+The iterates, the corrections and the products with them stay on the device of the start; only scalars are copied to the
+host.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-_SUFFICIENT = 1e-4  # of the decrease that the slope promises (Armijo)
+_SUFFICIENT = 1e-4  # required fraction of the decrease that the slope predicts (Armijo)
 _CURVED = 2.2e-16  # a correction is kept if s . y exceeds this times y . y
 _BACKTRACKS = 20
 
 Cost = Callable[[Tensor], tuple[float, Tensor]]
-"""x (n,) -> (value, gradient (n,))."""
+"""Function of x (n,) that returns (value, gradient (n,))."""
 AfterIteration = Callable[[Tensor, float, int], None]
-"""Gets (x, value, evaluations so far)."""
+"""Function called with (x, value, number of evaluations so far)."""
 
 
 @dataclass(frozen=True)
 class Minimum:
-    """Where a descent ended: the point (n,), its cost, iterations and evaluations, and whether and why it stopped."""
+    """Outcome of a descent: final point (n,) and cost, iterations and evaluations, and whether and why it stopped."""
 
     x: Tensor
     value: float
@@ -36,7 +36,7 @@ class Minimum:
 
 
 class Minimizer(Protocol):
-    """Whatever lowers a cost from a start, under lower bounds (-inf where there is none)."""
+    """Function that minimises a cost from a start, under lower bounds (-inf where there is none)."""
 
     def __call__(
         self, cost: Cost, start: Tensor, lower: Tensor, *, max_iterations: int, callback: AfterIteration | None = None
@@ -45,7 +45,7 @@ class Minimizer(Protocol):
 
 @dataclass(frozen=True)
 class ProjectedLBFGS:
-    """`minimize_bounded` as a `Minimizer`; `n_corrections` pairs of steps and gradient changes are kept."""
+    """`minimize_bounded` as a `Minimizer`, which keeps `n_corrections` pairs of steps and gradient changes."""
 
     n_corrections: int = 20
 
@@ -58,23 +58,23 @@ class ProjectedLBFGS:
 
 
 class Corrections:
-    """The last `size` pairs of steps s and changes of gradient y, and the Hessian B = theta - W M W^T that they make.
+    """The last `size` pairs of steps s and gradient changes y, and the approximate Hessian B = theta - W M W^T.
 
-    The compact form of Byrd, Nocedal & Schnabel, Math. Program. 63, 129 (1994): W = [Y, theta S].
+    This is the compact form of Byrd, Nocedal & Schnabel, Math. Program. 63, 129 (1994), with W = [Y, theta S].
     """
 
     def __init__(self, size: int, like: Tensor) -> None:
         self._size = size
         self._pairs = like.new_zeros(2 * size, like.numel())  # the y, then the s
         self._products = like.new_zeros(2 * size, 2 * size)  # of the pairs with each other
-        # The same over the free variables only, brought up to date by those that have changed sides: few in a step.
+        # The same over the free variables only, updated by those that enter or leave a bound: few in a step.
         self._free = torch.ones_like(like, dtype=torch.bool)
         self._free_products = like.new_zeros(2 * size, 2 * size)
         self._order: list[int] = []  # oldest first
         self._theta = 1.0
 
     def add(self, step: Tensor, change: Tensor) -> None:
-        """Remember one pair, unless its curvature is not positive, and forget the oldest when there are too many."""
+        """Add a pair, if its curvature is positive, and drop the oldest when there are too many."""
         curvature, energy = float(step @ change), float(change @ change)
         if not curvature > _CURVED * energy:
             return
@@ -87,7 +87,7 @@ class Corrections:
                 table[index] = table[:, index] = self._pairs @ seen
 
     def forget(self) -> None:
-        """Start anew from the identity."""
+        """Drop all pairs, so that the approximate Hessian is the identity."""
         self._order.clear()
         self._theta = 1.0
 
@@ -95,9 +95,9 @@ class Corrections:
         return len(self._order)
 
     def solve(self, gradient: Tensor, free: Tensor) -> Tensor:
-        """B^-1 restricted to the free variables, times their gradient; 0 elsewhere (Byrd et al. 1995, eq. 5.11).
+        """Solve B d = gradient over the free variables, with d = 0 elsewhere (Byrd et al. 1995, eq. 5.11).
 
-        `free` (n,) is boolean.
+        `gradient` and the boolean `free` have shape (n,), and so has the result d.
         """
         gradient, theta = gradient * free, self._theta
         if not self._order:
@@ -135,27 +135,29 @@ def minimize_bounded(
 ) -> Minimum:
     """Minimise `cost` over x >= `lower` by L-BFGS with two-metric projection.
 
-    Variables that lie on their bound and are pushed against it stay there for the iteration; the quasi-Newton step of
-    the others is followed along its projection on the bounds until the cost has fallen enough.
+    Variables at their bound that the gradient pushes against it stay there for the iteration; the others follow a
+    backtracking line search along the quasi-Newton step, projected onto the bounds.
 
     Parameters
     ----------
     cost : callable
-        x (n,) -> (value, gradient (n,)).
+        Function of x (n,) that returns (value, gradient (n,)).
     start : (n,) tensor
-        Clipped to the bounds.
+        Starting point, which is clipped to the bounds.
     lower : (n,) tensor
-        -inf where there is no bound.
-    max_iterations, max_evaluations : int
-        Default of the second: four times the first.
+        Lower bounds, -inf where there is none.
+    max_iterations : int
+        Maximum number of iterations.
+    max_evaluations : int, optional
+        Maximum number of evaluations of the cost. None: four times `max_iterations`.
     n_corrections : int
-        Pairs of steps and gradient changes kept.
+        Number of pairs of steps and gradient changes to keep.
     gradient_tolerance : float
-        Stops when no component of the projected gradient is larger.
+        Converged when no component of the projected gradient is larger.
     cost_tolerance : float
-        Stops when an iteration lowers the cost by a smaller fraction of it.
+        Converged when an iteration lowers the cost by a smaller fraction of it.
     callback : callable, optional
-        Gets (x, value, evaluations so far) after every iteration.
+        Called with (x, value, number of evaluations so far) after every iteration.
 
     Raises
     ------
@@ -192,7 +194,7 @@ def minimize_bounded(
         if iteration == max_iterations:
             return end(f"{max_iterations} iterations")
         direction = -memory.solve(gradient, free)
-        # Without corrections the length of the gradient says nothing: a first step of at most one unit.
+        # Without corrections the length of the gradient has no scale: limit the first step to one unit.
         step = 1.0 if len(memory) else min(1.0, 1 / float(direction.norm()))
         accepted = None
         for _ in range(_BACKTRACKS):
@@ -225,7 +227,7 @@ def minimize_bounded(
 
 
 def require_vectors(start: Tensor, lower: Tensor) -> None:
-    """Raise ValueError unless a start and its bounds are of one shape (n,)."""
+    """Raise ValueError unless a start and its bounds have the same shape (n,)."""
     if start.ndim != 1 or start.shape != lower.shape:
         raise ValueError(
             f"start and lower have shapes {tuple(start.shape)} and {tuple(lower.shape)}: both must be (n,)"
@@ -239,5 +241,5 @@ def require_finite(value: float) -> None:
 
 
 def _shorter(slope: float, rise: float) -> float:
-    """Factor on the step at which the parabola through value, slope and trial is least, within [0.1, 0.5]."""
+    """Return the factor on the step that minimises the parabola through value, slope and trial, within [0.1, 0.5]."""
     return min(max(0.5 * slope / (slope - rise), 0.1), 0.5) if rise < float("inf") else 0.1

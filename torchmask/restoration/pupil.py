@@ -1,4 +1,4 @@
-"""The open samples of a pupil: how a phase in few parameters becomes a complex field at every wavelength."""
+"""The open samples of a pupil: the complex field at every wavelength from a few parameters of its phase."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from torchmask.restoration.aberrations import AberrationBasis
 
 
 class OpenSamples(NamedTuple):
-    """The P open samples of a pupil, those of all wavelengths in one row.
+    """The P open samples of a pupil, concatenated over wavelengths.
 
-    weights : (P,) amplitude, scaled such that every PSF has unit sum
-    index : (P,) place in the flattened rasters of all wavelengths
+    weights : (P,) amplitude, scaled so that every PSF has unit sum
+    index : (P,) index in the flattened rasters of all wavelengths
     basis : (P, K) phase [rad] of one unit of each aberration parameter
-    positions : (P, 2) place (x, y) in the pupil as a frequency [cycles/pixel]
-    chromaticity : (P,) phase of a path difference that makes 1 rad at the wavelength of the grid
+    positions : (P, 2) position (x, y) in the pupil as a spatial frequency [cycles/pixel]
+    chromaticity : (P,) phase [rad] of a path difference of 1 rad at the wavelength of the grid
     """
 
     weights: Tensor
@@ -35,28 +35,30 @@ class OpenSamples(NamedTuple):
     chromaticity: Tensor
 
     def phase(self, z: Tensor) -> Tensor:
-        """Phase (T, P) [rad] of the parameters z (T, K)."""
+        """Return the phase (T, P) [rad] of the parameters z (T, K)."""
         return z.to(self.basis.dtype) @ self.basis.T
 
     def field(self, phase: Tensor) -> Tensor:
-        """Complex field (T, P) of a phase (T, P)."""
+        """Return the complex field (T, P) of a phase (T, P) [rad]."""
         return torch.complex(self.weights * phase.cos(), self.weights * phase.sin())  # faster than torch.polar
 
 
 class SampledPupil(nn.Module):
-    """An aperture laid on the rasters that an FFT takes to the image, one raster for each wavelength of a band.
+    """An aperture sampled on rasters whose FFT is the focal amplitude, one raster for each wavelength of a band.
 
-    `samples()` follows the aperture: while its centres train they are differentiable in them, and once it has moved
-    they are evaluated anew. The matrix of the aberration basis stays what it was made as.
+    `samples()` uses the present centres of the aperture: it is differentiable in them if they require a gradient, and
+    resamples the aperture when they have changed. The matrix of the aberration basis stays fixed.
 
     Parameters
     ----------
     aperture : Aperture
         One aperture, centres (N, 2).
     field : Grid
-        On which images are made.
+        Grid of the images.
     band : Band
+        Wavelengths of the light.
     aberrations : AberrationBasis
+        Basis of the phase in each sub-aperture.
 
     Raises
     ------
@@ -96,11 +98,11 @@ class SampledPupil(nn.Module):
 
     @property
     def n_rasters(self) -> int:
-        """One for each wavelength at each instant of a frame."""
+        """Number of rasters: one for each wavelength at each instant of a frame."""
         return len(self.band.wavelengths) * len(self.aberrations.instants)
 
     def samples(self) -> OpenSamples:
-        """The open samples of the aperture where it lies now."""
+        """Return the open samples of the aperture at its present centres."""
         centers = self.aperture.centers
         if centers.requires_grad and torch.is_grad_enabled():
             self._require_sampling()
@@ -113,9 +115,9 @@ class SampledPupil(nn.Module):
         return OpenSamples(self.weights, self.index, self.basis, self.positions, self.chromaticity)
 
     def samples_at(self, centers: Tensor) -> OpenSamples:
-        """The open samples of the same sub-apertures at other `centers` (N, 2) [m], differentiable in them.
+        """Return the open samples of the same sub-apertures at other `centers` (N, 2) [m], differentiable in them.
 
-        Whether the image is aliased is not looked at.
+        It does not check for undersampling of the image.
         """
         sampled = self._sample(centers)
         return OpenSamples(
@@ -148,7 +150,7 @@ class SampledPupil(nn.Module):
         mixing = self.aberrations.mixing_at(instant).to(modes).unflatten(0, (len(modes), self.aberrations.n_modes))
         mixed = torch.einsum("npj,njk->npk", modes, mixing)[is_open]
         weights = samples.weights[is_open]
-        # Parseval: this makes the sum of every PSF 1, whatever the phase, as long as holes share no cell.
+        # By Parseval's theorem this gives every PSF unit sum for any phase, unless holes share a cell.
         scale = weights.norm() * math.prod(grid.shape) ** 0.5
         positions = (samples.offsets + centers[:, None])[is_open] / grid.period
         ratio = self.grid.wavelength / wavelength
@@ -157,5 +159,5 @@ class SampledPupil(nn.Module):
 
 
 def _forget(pupil: SampledPupil, keys: object) -> None:
-    """Have the samples evaluated anew: another aberration basis may have been loaded."""
+    """Force new samples after loading a state dict, which may have another aberration basis."""
     pupil.centers.fill_(math.nan)

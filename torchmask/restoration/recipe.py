@@ -1,4 +1,4 @@
-"""What a model of the exposures is made from: the instrument and the aberrations it is assumed to have."""
+"""The recipe for a model of the exposures: the instrument and its assumed aberrations."""
 
 from __future__ import annotations
 
@@ -20,16 +20,23 @@ from torchmask.restoration.forward import ExposureModel
 class ModelRecipe:
     """Aperture, grid and band of the exposures, and the prior on their aberrations.
 
-    frame_modes, static_modes : Zernike modes per sub-aperture of each frame, and of what all frames have in common
-    r0, outer_scale : of the turbulence [m]
+    aperture : one aperture, centres (N, 2)
+    grid : grid of the frames
+    band : wavelengths of the light
+    frame_modes : number of Zernike modes per sub-aperture of each frame
+    static_modes : number of Zernike modes per sub-aperture that are common to all frames
+    r0 : Fried parameter of the turbulence [m]
+    outer_scale : outer scale of the turbulence [m]
     whitened : whether the parameters are white under the prior; False: they are the coefficients themselves
-    pixel : the detector's; None: it samples the image
-    exposure_tau0 : how long a frame lasts [tau0]; 0: frames are snapshots
+    dtype : data type of the model
+    device : device of the model
+    pixel : response of the detector's pixels; None: they sample the image at their centres
+    exposure_tau0 : exposure time of a frame [tau0]; 0: frames are snapshots
 
     Raises
     ------
     ValueError
-        For a population of apertures, and numbers that are out of range.
+        If several apertures are given, or a number is out of range.
     """
 
     aperture: Aperture
@@ -64,25 +71,28 @@ class ModelRecipe:
             )
         if self.exposure_tau0 and not self.whitened:
             raise ValueError(
-                f"exposure_tau0 is {self.exposure_tau0} without aberration_prior: a change has no size then"
+                f"exposure_tau0 is {self.exposure_tau0} without aberration_prior: the prior says how large changes are"
             )
         if self.exposure_tau0 and self.aperture.n_subapertures == 1:
             raise ValueError(
-                f"exposure_tau0 is {self.exposure_tau0}: only masks have motion in their model, leave it out"
+                f"exposure_tau0 is {self.exposure_tau0}: the model has motion for masks only, leave it out"
             )
 
     @property
     def n_modes(self) -> int:
-        """J, Zernike modes per sub-aperture of the coefficients."""
+        """Number J of Zernike modes per sub-aperture of the coefficients."""
         return max(self.frame_modes, self.static_modes)
 
     @property
     def bluest_grid(self) -> Grid:
-        """That of the shortest wavelength, whose cut-off is the highest."""
+        """Grid at the shortest wavelength, which has the highest cut-off."""
         return replace(self.grid, wavelength=self.band.shortest)
 
     def turbulent_model(self, *, follows_aperture: bool = False) -> ExposureModel:
-        """The model with aberrations of turbulence, for the aperture where it lies now, or wherever it goes."""
+        """Return the model with aberrations by turbulence.
+
+        It keeps the present centres of the aperture, or with `follows_aperture` uses those at each evaluation.
+        """
         with torch.no_grad():
             basis = turbulent_basis(
                 self.aperture, self.frame_modes, self.static_modes, self.r0, self.outer_scale, whitened=self.whitened
@@ -91,18 +101,18 @@ class ModelRecipe:
         return self._build(aperture, basis)
 
     def moving_basis(self, still: AberrationBasis) -> AberrationBasis | None:
-        """The basis of aberrations that change during an exposure, beside those of `still`; None for snapshots."""
+        """Return the basis `still` extended by changes during an exposure; None for snapshots."""
         if self.exposure_tau0 == 0:
             return None
         return moving_basis(still, self.aperture.still(), self.exposure_tau0, self.r0, self.outer_scale)
 
     def estimated_model(self, covariance: Tensor) -> ExposureModel:
-        """The model whose parameters are errors of estimated coefficients, of `covariance` (N J, N J) [rad^2].
+        """Return the model whose parameters are errors of estimated coefficients, with `covariance` (N J, N J) [rad^2].
 
-        Raises ValueError if the covariance has another shape or is not one, or there are static modes.
+        Raises ValueError if the matrix has another shape or is not a covariance, or if there are static modes.
         """
         if self.static_modes:
-            raise ValueError("covariance is given with static_modes: what is common to all frames is in the estimate")
+            raise ValueError("covariance is given with static_modes: the estimate includes static aberrations already")
         basis = estimated_basis(self.aperture, self.n_modes, covariance)
         return self._build(self.aperture.still(), basis)
 

@@ -1,4 +1,4 @@
-"""When a restoration does what: every number that decides it, in one place."""
+"""All numbers that control the course of a restoration."""
 
 from __future__ import annotations
 
@@ -11,41 +11,42 @@ _NO_LIMIT = 10**9  # iterations
 
 @dataclass(frozen=True)
 class Schedule:
-    """The course of a restoration, in iterations of its descents. All values were measured: docs/restoration.md.
+    """Numbers that control the course of a restoration. How the defaults were chosen is told in docs/restoration.md.
 
-    segment : iterations between two recalibrations of scales, transmissions, noise and turbulence
-    recalibrates : whether transmissions, noise and turbulence are, beside the scales of the variables
-    start_iterations : of one start, at most
-    sharp_after : iterations after which the object is sharp enough to look for its place and for lost frames
-    escapes : how often that is done in one start, at most
-    first_inflation : the first noise variance is what the mean frame leaves unexplained over this
-    start_rms : of the first whitened aberrations of a full pupil, and of further starts
-    start_rms_unwhitened : the same in rad, where the aberrations have no prior
+    segment : number of iterations between two recalibrations of scales, transmissions, noise and turbulence
+    recalibrates : whether to recalibrate transmissions, noise and turbulence; the scales of the variables always are
+    start_iterations : maximum number of iterations of one start
+    sharp_after : number of iterations after which the object is sharp enough to escape from local minima
+    escapes : maximum number of escapes in one start, each of which restarts outlying frames and shifts the object
+    first_inflation : the initial noise variance is the residual variance of the mean frame divided by this
+    start_rms : rms of the initial whitened aberrations of a full pupil, and of further starts of a mask
+    start_rms_unwhitened : the same in rad, for aberrations without a prior
     candidates : stages of a full pupil's tournament, as (candidates for each frame, iterations); each stage keeps
-        half of them, the last one the best
-    model_errors : a fit may leave so many times what modes beyond the aberration basis are expected to leave: with
-        more, the object is another one
-    chance : standard deviations of the stack's chi-square that it may leave besides
-    missed : share of the change from frame to frame that may be left through a full pupil, if that is more
-    starts : how many there are, at most, for objects that were missed
-    alike : relative difference of what two starts leave unexplained, below which they have found the same
-    outlying : a frame is lost if its residual variance is so many times that of the frames that fit well
-    restarts, restart_rounds, restart_iterations : random aberrations that a lost frame is started from, rounds of
-        falling noise, iterations of a round
-    pixel_steps : by which the object is moved along each axis to find its place between the pixels
-    pixel_iterations : that settle the object at such a place, at most
-    misplaced_gain, misplaced : the mask's place is looked for if moving it promises to lower the cost by more than the
-        first, and it has to move by more than the second, over the holes' distance from the centre
-    farthest : a mask that is found farther away than this is taken as told again
-    still : it has come to rest where a segment moves it by less than this
+        the better half of the candidates, the last stage the best one
+    model_errors : the object counts as missed if the excess chi-square is larger than this number times that expected
+        of modes beyond the aberration basis
+    chance : allowance for chance that is added to this limit, in standard deviations of the stack's chi-square
+    missed : for a full pupil, minimum of the allowed excess, as a fraction of the change from frame to frame
+    starts : maximum number of starts, where the object was missed
+    alike : relative difference of the excess chi-square of two starts below which they count as the same
+    outlying : a frame is outlying if its residual variance is larger than this number times that of well-fitted frames
+    restarts : number of random starts of the aberrations of an outlying frame
+    restart_rounds : number of rounds of such a start, over which the assumed noise falls
+    restart_iterations : number of iterations of such a round
+    pixel_steps : steps [pixels] along each axis by which the object is shifted to find its best sub-pixel position
+    pixel_iterations : maximum number of iterations that fit the object at such a position
+    misplaced_gain : the mask's geometry is refined if its first-order step lowers the cost by more than this
+    misplaced : and if that step moves holes by more than this fraction of their distance from the centre
+    farthest : a mask found displaced by more than this fraction is reset to the given geometry
+    still : the geometry has converged when a segment moves holes by less than this fraction
     faint : change from frame to frame, in noise variances, below which the aberrations are integrated out at the end
-    rounds, moves : of that integration, and moves of the aberrations' samples in a round; the object is the mean of
-        the later half of the rounds
-    move_size : of the first moves, in standard deviations of Laplace's approximation
-    renewal : rounds after which that approximation is made anew
-    memory : share of the averages so far that a round keeps
-    settling : iterations that settle the object in a round, at most
-    last_settling : those that settle it in the end, under a prior of its own scale
+    rounds : number of rounds of that integration; the object is the mean of the second half of them
+    moves : number of moves of the aberrations' samples in a round
+    move_size : size of the first moves, in standard deviations of Laplace's approximation
+    renewal : number of rounds after which that approximation is recomputed
+    memory : weight of the earlier rounds in the running averages
+    settling : maximum number of iterations that fit the object in a round
+    last_settling : maximum number of iterations that fit it at the end, under a prior of its own scale
     """
 
     segment: int = 100
@@ -91,11 +92,11 @@ class Schedule:
 
     @classmethod
     def plain(cls) -> Schedule:
-        """One bounded L-BFGS on one cost: nothing is repaired, moved, weighed anew or drawn at random on its way.
+        """Return the schedule of one bounded L-BFGS descent on a fixed cost, without recalibration or escapes.
 
-        The noise is what it is said to be from the first iteration on, frames are divided by their mean light, and
-        there is one start: from zero aberrations through a mask, from small random ones through a full pupil, for which
-        zero is a saddle point. The descent begins anew every 1000 iterations as long as those lower the cost.
+        The noise variance is the given one from the first iteration, transmissions are the mean light of the frames,
+        and there is one start: from zero aberrations for a mask, from small random ones for a full pupil, for which
+        zero is a saddle point. The descent restarts every 1000 iterations as long as those lower the cost.
         """
         return cls(
             segment=1000,
@@ -110,9 +111,9 @@ class Schedule:
 
     @property
     def n_candidates(self) -> int:
-        """How many candidates a tournament begins with; 1 without one."""
+        """Number of candidates at the beginning of a tournament; 1 without a tournament."""
         return self.candidates[0][0] if self.candidates else 1
 
     def stage_iterations(self, n_candidates: int) -> int:
-        """The iterations of the stage with so many candidates."""
+        """Return the number of iterations of the stage with this number of candidates."""
         return dict(self.candidates)[n_candidates]

@@ -1,12 +1,12 @@
-"""The course of a restoration: start, tournament, descend and recalibrate, escape, start again.
+"""The algorithm of a restoration: start, tournament, descent with recalibration, escapes, and further starts.
 
-A mask's first start is from zero aberrations, that of a full pupil a tournament of random candidates. Segments of
-descent follow each other. Between two, what the frames tell of themselves is brought up to date: scales, transmissions,
-the strength of the turbulence, and the noise, which falls from what the mean frame leaves unexplained to what it is, or
-to what the model cannot explain, if that is more. Once the object is sharp, frames and object escape from local minima;
-when nothing moves any more, each frame counts as it fits. A start ends when a segment brings nothing more or its
-iterations are spent; if it has missed the object, which its verdict tells, another one begins from random aberrations,
-and the best is kept. Of faint frames, the aberrations are integrated out of what has been found.
+The first start is from zero aberrations for a mask, and a tournament of random candidates for a full pupil. The descent
+proceeds in segments. Between two of them, the scales of the variables, the transmissions, the strength of the
+turbulence and the noise are updated; the assumed noise falls from the residual of the mean frame to the true noise, or
+to the residual of the model, if that is larger. Once the object is sharp, frames and object escape from local minima;
+when nothing changes any more, each frame is weighted by how well it fits. A start ends when a segment gains nothing or
+its iterations are used up. If its verdict is that it missed the object, another one starts from random aberrations, and
+the best is kept. For faint frames, the aberrations are integrated out at the end.
 """
 
 from __future__ import annotations
@@ -50,15 +50,17 @@ class Solver:
     Parameters
     ----------
     objective : MyopicObjective
-        Of the stack, with what is known taken from `free`.
+        Cost for the stack, with everything that is known excluded from `free`.
     stack : FrameStack
-    traits : Traits
-    schedule : Schedule
+        Frames to restore.
+    traits, schedule : Traits, Schedule
+        Properties of the problem, and the numbers that control the course.
     minimizer : Minimizer
+        Minimiser of each descent.
     callback : callable, optional
-        Gets a `Record` after every iteration.
+        Called with a `Record` after every iteration.
     moving : AberrationBasis, optional
-        Aberrations that change while a frame lasts. None: frames are snapshots.
+        Aberrations that change during a frame. None: frames are snapshots.
     """
 
     def __init__(
@@ -80,19 +82,19 @@ class Solver:
         self.callback: Callback | None = callback
         change = stack.change
         self.first_inflation: float = max(1.0, change / schedule.first_inflation)
-        held = traits.prior_on_aberrations and not traits.many_minima  # through a full pupil it was not tried
+        held = traits.prior_on_aberrations and not traits.many_minima  # not tried for a full pupil
         self.is_faint: bool = held and Free.OBJECT | Free.ABERRATIONS in objective.free and change < schedule.faint
         self.judge: Judge = Judge(self.setting, stack, traits, schedule)
 
     def solve(self, known: Known, start: RestorationResult | None = None, file: Checkpoint | None = None) -> Progress:
-        """The restoration from its beginning, an earlier result or a checkpoint to its end."""
+        """Run a restoration to its end, from scratch, from an earlier result or from a checkpoint."""
         begun = self.begin(known, start)
         if file is not None and (saved := file.load(self.objective.frames.device)) is not None:
             begun = saved
             if begun.status is Status.ITERATION_LIMIT and len(begun.costs) < self.traits.max_iterations:
-                begun.status = Status.RUNNING  # there are more iterations than before: go on
+                begun.status = Status.RUNNING  # the limit has been raised since
         blind = known.nothing and start is None
-        # Without a prior a poor fit is the method's own.
+        # Without a prior on the aberrations a poor fit is to be expected, and more starts would not help.
         may_start_again = blind and self.traits.prior_on_aberrations and len(self.objective.frames) > 1
         ended = self.run(begun, may_start_again, file.save if file is not None else lambda progress: None)
         if self.is_faint and ended.status is not Status.ITERATION_LIMIT:
@@ -105,9 +107,9 @@ class Solver:
         return ended
 
     def begin(self, known: Known, start: RestorationResult | None) -> Progress:
-        """The progress of a restoration that has not begun, or goes on from an earlier result."""
+        """Return the initial progress of a restoration, from scratch or from an earlier result."""
         state = self._first_state(known)
-        if known.covariance is not None:  # the errors are those of what is expected
+        if known.covariance is not None:  # the prior is centred on the estimated aberrations
             self.objective = self.objective.with_changes(centre=state.z)
         if start is None:
             return Progress(self._first_candidates(state, self.traits.seed), refinement=self.traits.refinement)
@@ -123,7 +125,7 @@ class Solver:
         return progress
 
     def run(self, progress: Progress, may_start_again: bool, save: Callable[[Progress], None]) -> Progress:
-        """Go on until the restoration ends; `save` is called after every segment."""
+        """Continue until the restoration ends; `save` is called after every segment."""
         while progress.status is Status.RUNNING:
             if progress.candidates.n_each > 1:
                 self._play(progress)
@@ -137,12 +139,12 @@ class Solver:
         return progress
 
     def _place(self, state: State) -> MyopicObjective:
-        """The objective, with mask and motion as the state has found them."""
+        """Update the objective to the mask geometry and motion found in the state, and return it."""
         self.objective = self.setting.objective_at(self.objective, state)
         return self.objective
 
     def _look_at_place(self, progress: Progress) -> None:
-        """Decide whether the mask's place is found too, once the object is sharp enough to tell it."""
+        """Decide whether to refine the mask's geometry, once the object is sharp enough to show an error in it."""
         if progress.refinement is Refinement.IF_SEEN and progress.iterations >= self.schedule.sharp_after:
             asked = not self.is_faint and is_misplaced(self.objective, progress.state, self.schedule)
             progress.refinement = Refinement.ON if asked else Refinement.OFF
@@ -153,7 +155,7 @@ class Solver:
         return first_state(self.objective, z, known.object, self.first_inflation, weight)
 
     def _has_tournament(self) -> bool:
-        """Zero is a saddle point of a full pupil: the sign of the even modes of a symmetric pupil cannot be seen."""
+        """Zero is a saddle point for a full pupil: a symmetric pupil does not show the sign of the even modes."""
         return self.traits.many_minima and not self.traits.estimated and Free.ABERRATIONS in self.objective.free
 
     def _start_rms(self) -> float:
@@ -161,7 +163,7 @@ class Solver:
         return schedule.start_rms if self.traits.prior_on_aberrations else schedule.start_rms_unwhitened
 
     def _first_candidates(self, state: State, seed: int) -> Candidates:
-        """The first start of a mask is from zero aberrations, every other one from random ones."""
+        """Return the first start of a mask from zero aberrations, every other one from random aberrations."""
         if self._has_tournament():
             return random_candidates(self.objective, state, self.schedule.n_candidates, self._start_rms(), seed)
         if seed == self.traits.seed:
@@ -169,7 +171,7 @@ class Solver:
         return random_candidates(self.objective, state, 1, self._start_rms(), seed)
 
     def _play(self, progress: Progress) -> None:
-        """One stage of the tournament, which ends it if no iterations are left."""
+        """Play one stage of the tournament; end the tournament if no iterations are left."""
         n_each = progress.candidates.n_each
         n_iterations = self.schedule.stage_iterations(n_each)
         played = play_stage(
@@ -185,12 +187,12 @@ class Solver:
         progress.candidates = played
 
     def _advance(self, progress: Progress) -> None:
-        """One segment, then what is brought up to date between two."""
+        """Descend for one segment, then update what changes between two segments."""
         schedule, state, done = self.schedule, progress.state, progress.iterations
         objective = self._place(state)
         before, place = float(objective.evaluator(state.calibration)(state.image, state.z).value), state.geometry
         found = self._descend(progress, objective, state, schedule.segment)
-        is_lost = distance(found.geometry, MaskGeometry()) > schedule.farthest  # nothing tells where the mask lies
+        is_lost = distance(found.geometry, MaskGeometry()) > schedule.farthest  # the frames do not constrain it
         progress.refinement = Refinement.OFF if is_lost else progress.refinement
         state = state if is_lost else found
         objective = self._place(state)
@@ -215,13 +217,13 @@ class Solver:
             progress.state = self.setting.in_motion(progress.state, self.traits.seed)
 
     def _limit(self, progress: Progress) -> Status:
-        """Which iterations are spent, if any are."""
+        """Return which limit on iterations has been reached, or RUNNING."""
         if len(progress.costs) >= self.traits.max_iterations:
             return Status.ITERATION_LIMIT
         return Status.RUNNING if progress.iterations < self.schedule.start_iterations else Status.START_LIMIT
 
     def _last_iteration(self, progress: Progress) -> int:
-        """Of the present start, counted over all."""
+        """Return the number of the present start's last iteration, counted over all starts."""
         return min(progress.began + self.schedule.start_iterations, self.traits.max_iterations)
 
     def _descend(self, progress: Progress, objective: MyopicObjective, state: State, n_iterations: int) -> State:
@@ -232,7 +234,7 @@ class Solver:
             progress.n_evaluations += evaluations * n_each
             self._report(progress, variables)
 
-        if progress.refinement is Refinement.ON and progress.iterations:  # blind, nothing tells where the mask lies
+        if progress.refinement is Refinement.ON and progress.iterations:  # the first blurred object does not show it
             objective = objective.with_changes(free=objective.free | Free.PLACE)
         left = self._last_iteration(progress) - len(progress.costs)
         return descend(objective, state, min(n_iterations, left), self.minimizer, listen)
@@ -242,9 +244,9 @@ class Solver:
         return recalibrate(objective, state, power if sharpen else None, follow_r0=self.traits.r0_is_open)
 
     def _escape(self, progress: Progress) -> None:
-        """Lost frames start anew, and the object moves between the pixels; if nothing moves, there is no next time.
+        """Restart outlying frames, and shift the object by a fraction of a pixel; if nothing changes, never try again.
 
-        Frames of a full pupil have had their starts, unless they began where a sensor saw them.
+        Frames of a full pupil already had many starts in the tournament, unless they started from a sensor's estimate.
         """
         progress.escapes += 1
         state = progress.state
@@ -256,14 +258,14 @@ class Solver:
             progress.n_evaluations += evaluations
         if Free.OBJECT in self.objective.free:
             state = escapes.centre_on_pixels(self.objective, state, self.schedule)
-        if state is progress.state:  # all is where it belongs
+        if state is progress.state:  # nothing has changed: no further attempt
             progress.escapes = self.schedule.escapes
         progress.state = state
 
     def _judge_start(self, progress: Progress) -> None:
-        """At the end of a start: the best so far is kept, and another one begins if that has missed the object.
+        """At the end of a start, keep the best so far, and begin another one if that has missed the object.
 
-        Two that end alike have found what there is to be found.
+        If two starts agree, no further one is made.
         """
         best, verdict, progress.alike = self.judge.compare(self.objective, progress.ending, progress.rival)
         missed = verdict.finding is Finding.NOT_EXPLAINED
@@ -278,12 +280,12 @@ class Solver:
 
     @property
     def prior_r0(self) -> float | None:
-        """r0 of the prior on the aberrations at first [m]; None if that is not of turbulence, or they are known."""
+        """Initial r0 of the prior on the aberrations [m]; None if they are known or have another prior or none."""
         known = self.traits.estimated or Free.ABERRATIONS not in self.objective.free
         return self.traits.r0 if self.traits.prior_on_aberrations and not known else None
 
     def verdict(self, ending: Ending) -> Verdict:
-        """Whether the frames are explained by what a start, or all of them, ended at."""
+        """Return the verdict on whether the ending of one start, or of all, explains the frames."""
         return self.judge.verdict(self.objective, ending)
 
     def _report(self, progress: Progress, variables: Variables) -> None:

@@ -1,4 +1,4 @@
-"""Where a restoration begins: the mean frame and no aberrations, what is known, random draws, an earlier result."""
+"""Starting points of a restoration: the mean frame, known values, random aberrations, or an earlier result."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from torchmask.restoration.state import Calibration, State
 
 @dataclass(frozen=True)
 class Known:
-    """What is known before a restoration begins, each None where it is not.
+    """Values that are known before a restoration begins; None for those that are not.
 
     coefficients : (T, N, J) aberrations [rad rms]
-    covariance : (N J, N J) [rad^2] of their errors; None: they are exact
-    object : (H, W), up to its flux
+    covariance : (N J, N J) covariance of their errors [rad^2]; None: they are exact
+    object : (H, W) object, up to its flux
     """
 
     coefficients: Tensor | None = None
@@ -32,15 +32,15 @@ class Known:
     object: Tensor | None = None
 
     def check(self) -> None:
-        """Raise ValueError unless something is left to restore and nothing hangs in the air."""
+        """Raise ValueError if nothing is left to restore, or a covariance comes without coefficients."""
         if self.covariance is not None and self.coefficients is None:
-            raise ValueError("covariance is given without coefficients: it is that of their errors, give both")
+            raise ValueError("covariance is given without coefficients: it describes their errors, give both")
         if self.coefficients is not None and self.object is not None and self.covariance is None:
             raise ValueError("coefficients and known_object are both given: nothing is left to restore")
 
     @property
     def tensors(self) -> tuple[Tensor | None, ...]:
-        """All that is known."""
+        """All known values."""
         return self.coefficients, self.covariance, self.object
 
     @property
@@ -50,12 +50,12 @@ class Known:
 
     @property
     def nothing(self) -> bool:
-        """Whether all of it is open."""
+        """Whether neither aberrations nor object are known."""
         return self.coefficients is None and self.object is None
 
     @property
     def free(self) -> Free:
-        """What a restoration may change."""
+        """Unknowns that a restoration estimates."""
         free = Free.OBJECT | Free.ABERRATIONS | Free.COMMON
         if self.object is not None:
             free &= ~Free.OBJECT
@@ -65,7 +65,7 @@ class Known:
 
 
 def expected_parameters(objective: MyopicObjective, coefficients: Tensor | None) -> Tensor:
-    """The parameters (T, K) of known coefficients (T, N, J), or zero.
+    """Return the parameters (T, K) of known coefficients (T, N, J), or zero for None.
 
     Raises ValueError if the coefficients have another shape or are not finite.
     """
@@ -83,9 +83,9 @@ def expected_parameters(objective: MyopicObjective, coefficients: Tensor | None)
 def first_state(
     objective: MyopicObjective, z: Tensor, known_object: Tensor | None, first_inflation: float, aberration_weight: float
 ) -> State:
-    """The clipped mean frame, or the object that is known, with the aberrations z (T, K).
+    """Return the state with the clipped mean frame, or the known object, and the aberrations z (T, K).
 
-    Raises ValueError if the known object has another shape than the frames, is not finite or holds no light.
+    Raises ValueError if the known object has another shape than the frames, is not finite or has no light.
     """
     window, model = objective.model.window, objective.model
     neutral = objective.neutral_calibration()
@@ -104,7 +104,7 @@ def first_state(
 
 
 def random_candidates(objective: MyopicObjective, state: State, n_each: int, rms: float, seed: int) -> Candidates:
-    """So many candidates with random aberrations for each frame of `state`."""
+    """Return `n_each` candidates with random aberrations for each frame of `state`."""
     candidates = several(state, n_each)
     z = objective.model.aberrations.draw(candidates.state.z, rms, torch.Generator().manual_seed(seed))
     return Candidates(replace(candidates.state, z=z), n_each)
@@ -113,10 +113,10 @@ def random_candidates(objective: MyopicObjective, state: State, n_each: int, rms
 def start_from_result(
     objective: MyopicObjective, state: State, start: RestorationResult, unit: float
 ) -> tuple[State, int]:
-    """`state` with the object and the aberrations of an earlier restoration, and how many frames that knew.
+    """Return `state` with the object and aberrations of an earlier result, and the number of frames of that result.
 
-    The frames that it did not know keep the aberrations of `state`. Raises ValueError if the earlier restoration is one
-    of more frames, another mask or another field.
+    Further frames keep the aberrations of `state`. Raises ValueError if the earlier result has more frames, another
+    mask or another field.
     """
     basis, field_shape = objective.model.aberrations, tuple(state.image.shape)
     known, expected = len(start.coefficients), (basis.n_subapertures, basis.n_modes)
@@ -145,9 +145,9 @@ def fit_new_frames(
     minimizer: Minimizer,
     seed: int,
 ) -> tuple[State, int]:
-    """The aberrations of the frames from `n_known` on fitted to the object of `state`, and the evaluations it took.
+    """Fit the aberrations of the frames from `n_known` on to the object of `state`; return it and the evaluations.
 
-    `rms` is that of random first candidates; None: one start from the aberrations they have.
+    `rms` is the rms of random initial candidates; None: one start from the aberrations in `state`.
     """
     n_frames, spent = len(state.z), 0
 

@@ -1,4 +1,4 @@
-"""What decides the course of a restoration beside its frames and its schedule."""
+"""Properties of the problem that decide the course of a restoration, besides its frames and its schedule."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torchmask.optics.aperture import Aperture, SparseAperture
 
 
 class Refinement(Enum):
-    """Whether a restoration finds how the mask lies, a turn and a magnification, together with the object."""
+    """Whether a restoration estimates a rotation and magnification of the mask together with the object."""
 
     OFF = "the mask lies as told"
     IF_SEEN = "found if the frames say clearly that it lies otherwise"
@@ -18,35 +18,36 @@ class Refinement(Enum):
 
     @classmethod
     def of(cls, refine: bool | None, aperture: Aperture) -> Refinement:
-        """What a caller's True, False or None stand for; an aperture without baselines has nothing to be seen by.
+        """Return the member for a caller's True, False or None; always `OFF` for an aperture without baselines.
 
-        Raises ValueError for True with such an aperture.
+        Raises ValueError for True with such an aperture, which does not show its geometry.
         """
         if isinstance(aperture, SparseAperture) and aperture.n_subapertures > 1:
             return cls.IF_SEEN if refine is None else cls.ON if refine else cls.OFF
         if refine:
-            raise ValueError("refine_geometry is True: only a mask has baselines that tell how it lies, leave it out")
+            raise ValueError("refine_geometry is True: only a mask has baselines that show its geometry, leave it out")
         return cls.OFF
 
     def where(self, *, blind: bool) -> Refinement:
-        """This, or `OFF` where it is left to the frames and something else of them is known: not `blind`."""
+        """Return this member, or `OFF` in place of `IF_SEEN` for a restoration that is not `blind`."""
         return self if blind or self is Refinement.ON else Refinement.OFF
 
 
 @dataclass(frozen=True)
 class Traits:
-    """What a solver must know of the problem beside its objective.
+    """Properties of the problem that a solver needs besides its objective.
 
-    many_minima : of a full pupil, which needs a tournament of candidates
-    estimated : the aberrations are known with errors, whose prior takes the place of turbulence
-    prior_on_aberrations : whether they have one at all
-    r0_is_open : the strength of the turbulence follows the aberrations
-    r0, outer_scale : of the turbulence at first [m]
-    max_iterations : of all starts together
-    tolerance : a segment that lowers the cost by a smaller fraction is the last one
-    seed : of random starts
-    refinement : whether the mask's place is found too
-    exposure_tau0 : how long a frame lasts [tau0]; 0: frames are snapshots
+    many_minima : whether the cost has many minima, as for a full pupil, so that a tournament of candidates is needed
+    estimated : whether the aberrations are known with errors, which are their prior in place of turbulence
+    prior_on_aberrations : whether the aberrations have a prior
+    r0_is_open : whether the strength of the turbulence is estimated from the aberrations
+    r0 : initial Fried parameter of the turbulence [m]
+    outer_scale : outer scale of the turbulence [m]
+    max_iterations : maximum number of iterations over all starts
+    tolerance : the restoration has converged when a segment lowers the cost by a smaller fraction
+    seed : seed of the random starts
+    refinement : whether to refine the mask's geometry
+    exposure_tau0 : exposure time of a frame [tau0]; 0: frames are snapshots
     """
 
     many_minima: bool
@@ -73,6 +74,6 @@ def check_numbers(readout_noise: float | None, max_iterations: int, tolerance: f
 
 
 def check_samples(n_samples: int) -> None:
-    """Raise ValueError for a number of samples that tell no standard deviations."""
+    """Raise ValueError for a number of samples that does not allow standard deviations."""
     if n_samples < 0 or n_samples == 1:
-        raise ValueError(f"n_samples is {n_samples}: 0 for no standard deviations, or at least 2")
+        raise ValueError(f"n_samples is {n_samples}: it must be 0, for no standard deviations, or at least 2")
