@@ -74,7 +74,7 @@ def test_a_mistake_is_one_line_and_nothing_is_written(write, tmp_path, capsys):
     text = tmp_path / "text.fits"
     text.write_text("no FITS")
     for arguments, message in (
-        ((), "there is nothing to look at: give OIFITS files"),
+        ((), "there are no files to search: give OIFITS files"),
         ((tmp_path / "none.fits",), "there is no file"),
         ((text,), "is no OIFITS file"),
         ((star, star, star, "--star", star, star), "--star names 2 files for 3 of the object"),

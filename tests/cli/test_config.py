@@ -83,7 +83,7 @@ def test_paths_that_exist_become_absolute_and_places_of_results_are_not_stored(t
         ("inner: {siz: 1.0}", r"unknown key inner.siz; known keys are inner.size, inner.count, inner.sun$"),
         ("out: here", "unknown key out"),
         ("inner: 3", "inner is 3"),
-        ("- 1", r"the file holds \[1\]"),
+        ("- 1", r"the file contains \[1\]"),
         ("wavelength: long", "wavelength is 'long': a number is needed"),
         ("wavelength: null", "wavelength is None: a number is needed"),
         ("wavelength: true", "wavelength is True: a number is needed"),

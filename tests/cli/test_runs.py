@@ -448,13 +448,13 @@ def test_an_interrupted_restoration_goes_on_to_the_same_result(runs, tmp_path, m
     refused(["restore", "--resume", tmp_path / "cut", "--tv-weight", "2"], tmp_path, capsys, "other frames or settings")
     refused(["restore", "--resume", runs / "simulate"], tmp_path, capsys, "it is for simulate, not for restore")
     (tmp_path / "rest/resume.npz").unlink()
-    refused(["restore", "--resume", tmp_path / "rest"], tmp_path, capsys, "no .*resume.npz to go on from")
+    refused(["restore", "--resume", tmp_path / "rest"], tmp_path, capsys, "no .*resume.npz to resume from")
     refused(["restore", "--resume", tmp_path / "none"], tmp_path, capsys, "there is no config file .*none/config.yaml")
 
 
 def test_a_resumed_restoration_is_one(runs, tmp_path, capsys):
     stacks = [runs / "simulate/stack.npz", tmp_path / "other.npz"]
-    refused(["restore", *stacks, "--resume", runs / "restore"], tmp_path, capsys, "--resume goes on with one stack")
+    refused(["restore", *stacks, "--resume", runs / "restore"], tmp_path, capsys, "--resume continues one stack")
 
 
 @pytest.fixture(scope="module")

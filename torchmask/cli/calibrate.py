@@ -1,4 +1,4 @@
-"""`torchmask calibrate`: how a mask lies, from exposures of a star."""
+"""`torchmask calibrate`: measure the geometry of a mask from exposures of a star."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Options(StackOptions, RunOptions):
 
 
 def run(options: Options) -> None:
-    """Measure, write and print."""
+    """Measure the geometry, write it and print it."""
     if not options.stacks:
         raise ValueError("no exposures of a star are given: give .npz or FITS files")
     seen = read_stack(options.stacks, options)
@@ -59,7 +59,7 @@ def calibrate_on(
 ) -> MaskCalibration:
     """Measure the mask's geometry on exposures of a star. Raises ValueError as `calibrate_mask` or for a full pupil."""
     if not isinstance(star.aperture, SparseAperture):
-        raise ValueError("--mask is a full pupil: only a mask has fringes to be calibrated by")
+        raise ValueError("--mask is a full pupil: only a mask has fringes, which calibration needs")
     return calibrate_mask(
         star.frames,
         star.aperture,

@@ -1,7 +1,7 @@
-"""`torchmask codesign`: design a mask, observe a scene through turbulence with it, restore the image, compare.
+"""`torchmask codesign`: design a mask, simulate and restore an observation with it, and compare with a full pupil.
 
-The rival is a full pupil that reaches the same spatial frequencies and receives photons in proportion to its area. All
-results, figures and TensorBoard events go to one new folder, runs/codesign-date-time by default.
+The full pupil reaches the same spatial frequencies and receives photons in proportion to its area. All results, figures
+and TensorBoard events go to one new folder, runs/codesign-date-time by default.
 """
 
 from __future__ import annotations
@@ -45,37 +45,38 @@ class ImagingOptions:
     """Telescope, turbulence and detector of the simulated observation."""
 
     diameter: float = 1.0
-    """Of the disc that the mask is cut from, D [m]."""
+    """Diameter D of the disc that the mask is cut from [m]."""
     wavelength: float = 550e-9
-    """[m]"""
+    """Wavelength of the light [m]."""
     n_pixels: int = 128
-    """Of the image, per side."""
+    """Number of pixels per side of the image."""
     d_over_r0: float = 7.0
     """Strength of the turbulence, D / r0."""
     outer_scale: float = 20.0
-    """Of the turbulence, in units of D."""
+    """Outer scale of the turbulence, in units of D."""
     n_frames: int = 20
-    """Short exposures, T."""
+    """Number T of short exposures."""
     n_photons: float = 1e7
-    """Electrons per frame through the mask, before light leaves the field."""
+    """Electrons per frame through the mask, including light that falls outside the field."""
     readout_noise: float = 1.5
-    """Electrons rms per pixel and frame."""
+    """Read-out noise [electrons rms per pixel and frame]."""
 
 
 @dataclass(frozen=True)
 class RestorationOptions:
-    """The myopic deconvolution, with equal budgets for the mask and the full pupil."""
+    """Settings of the myopic deconvolution, the same for the mask and the full pupil."""
 
     n_modes: int | None = None
-    """Noll modes, from piston, per sub-aperture (or over the full pupil); None: the library's choice for each."""
+    """Number of Zernike modes per hole or over the full pupil, from Noll mode 1 (piston); None: 6, or 231 for the full
+    pupil."""
     prior: bool = True
-    """Weigh aberrations by their von Karman statistics."""
+    """Weight the aberrations by their von Karman statistics."""
     max_iterations: int = 2800
-    """Upper limit of iterations, of all starts together; one start takes 1000 at most."""
+    """Maximum number of iterations over all starts, each of which takes at most 1000."""
     plain: bool = False
-    """One bounded L-BFGS on one cost: no further starts, repairs, frame weights or falling noise, and no sky."""
+    """Use one plain L-BFGS descent on a fixed cost, without further starts, escapes, recalibration or sky."""
     told_turbulence: bool = False
-    """Tell the restoration r0 and the outer scale of the simulation, which an observer does not know."""
+    """Give the restoration r0 and the outer scale of the simulation, which an observer does not know."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,16 +90,17 @@ class Options(ExperimentOptions):
     design: SearchOptions = field(default_factory=SearchOptions)
     imaging: ImagingOptions = field(default_factory=ImagingOptions)
     scene: SceneOptions = field(default_factory=SceneOptions)
-    """The target."""
+    """Scene that is observed."""
     restoration: RestorationOptions = field(default_factory=RestorationOptions)
     preset: Literal["default", "paper"] = "default"
-    """`paper`: CMA-ES alone, piston and tip-tilt only, no aberration prior, one plain L-BFGS, as first published."""
+    """With paper, the method as first published: CMA-ES alone, piston, tip and tilt only, no aberration prior, and one
+    plain L-BFGS."""
     seed: int = 0
-    """Of the search, the turbulence and the noise."""
+    """Seed of the search, the turbulence and the noise."""
 
 
 def with_presets(options: Options) -> Options:
-    """The options that run: `preset` and `smoke` replace what they stand for."""
+    """Return the options with the replacements of `preset` and `smoke`."""
     design, imaging, restoration = options.design, options.imaging, options.restoration
     if options.preset == "paper":
         design = dataclasses.replace(design, method="cma", refine=False)
@@ -111,12 +113,12 @@ def with_presets(options: Options) -> Options:
 
 
 def image_grid(options: Options) -> Grid:
-    """The grid of the exposures: Nyquist for the mask's disc."""
+    """Return the grid of the exposures, Nyquist-sampled for the mask's disc."""
     return Grid.nyquist(options.imaging.diameter, options.imaging.wavelength, options.imaging.n_pixels)
 
 
 def outside(options: Options) -> tuple[TurbulencePhase, Detector]:
-    """What comes between the scene and the frames."""
+    """Return turbulence and detector of the simulation. Raises ValueError if their options are out of range."""
     imaging = options.imaging
     if not imaging.d_over_r0 > 0:
         raise ValueError(f"imaging.d_over_r0 is {imaging.d_over_r0}: it must be positive")
@@ -127,7 +129,7 @@ def outside(options: Options) -> tuple[TurbulencePhase, Detector]:
 
 
 def inversion(options: Options, aperture: Aperture, n_modes: int | None) -> MyopicDeconvolution:
-    """The restoration, told what an observer knows: instrument and read-out noise; turbulence only if asked for."""
+    """Return the restoration method with what an observer knows: instrument and noise, on request the turbulence."""
     imaging, wanted = options.imaging, options.restoration
     told = wanted.told_turbulence
     return MyopicDeconvolution(
@@ -145,7 +147,7 @@ def inversion(options: Options, aperture: Aperture, n_modes: int | None) -> Myop
 
 
 def check(options: Options) -> None:
-    """Raise ValueError for what the stages after the search would refuse: the search takes long."""
+    """Raise ValueError for options that stages after the search would reject, before that long search begins."""
     require_wavelength(options.imaging.wavelength, "--imaging.wavelength")
     outside(options)
     design, diameter = options.design, options.imaging.diameter
@@ -165,15 +167,15 @@ def design_mask(options: Options, callback: Callback) -> SearchResult:
 
 
 def scene_knee(options: Options) -> float:
-    """What --design.knee says, or one over the larger side of the scene [cycles/pixel]."""
+    """Return --design.knee, or else one over the larger side of the scene [cycles/pixel]."""
     knee = options.design.knee
     return 1 / (options.scene.size * options.imaging.n_pixels) if knee is None else knee
 
 
 def observe(options: Options, scene: torch.Tensor, aperture: Aperture, callback: Callback) -> Observation:
-    """Draw short exposures end to end: the full turbulent phase, and no model that the inversion knows.
+    """Simulate short exposures end to end, with the full turbulent phase and independently of the restoration's model.
 
-    One seed: mask and full pupil look through the same screens.
+    The seed is the same for mask and full pupil, so that both look through the same screens.
     """
     turbulence, detector = outside(options)
     generator = torch.Generator().manual_seed(options.seed)
@@ -190,7 +192,7 @@ def restore(options: Options, observation: Observation, callback: Callback) -> R
 
 
 def metrics(observation: Observation, result: RestorationResult, cutoff: float) -> dict[str, float]:
-    """What the table at the end says of one instrument."""
+    """Return one instrument's column of the table at the end."""
     truth = observation.object
     assert truth is not None
     return {
@@ -208,7 +210,7 @@ def metrics(observation: Observation, result: RestorationResult, cutoff: float) 
 def codesign(
     options: Options, scene: torch.Tensor, output: Run
 ) -> tuple[dict[str, dict[str, float]], dict[str, Verdict | None]]:
-    """Design, observe, restore and compare; returns the metrics of each instrument, and the verdicts."""
+    """Design, observe, restore and compare; return the metrics of each instrument, and the verdicts."""
     logger, callback = output.logger, output.callback
     design = design_mask(options, callback)
     log_design(design, image_grid(options), logger)
@@ -243,7 +245,7 @@ def codesign(
 
 
 def print_table(table: dict[str, dict[str, float]]) -> None:
-    """Scores side by side: 0 is perfect, whichever wins."""
+    """Print the metrics of the instruments side by side; a score of 0 is perfect."""
     view = Table(title="Restoration from equal budgets (score: relative error up to the diffraction limit)")
     view.add_column("")
     for name in table:
@@ -254,12 +256,12 @@ def print_table(table: dict[str, dict[str, float]]) -> None:
 
 
 def run(options: Options) -> None:
-    """Run in a new folder; an interrupted run leaves there what it reached."""
+    """Run in a new folder, in which an interrupted run leaves its results so far."""
     options = with_presets(options)
     check(options)
     scene = make_scene(image_grid(options).shape, options.imaging.n_photons, options.scene)
     with new_run("codesign", options, options.seed) as output:
-        output.summary.append(f"look at it with: tensorboard --logdir {output.directory.parent}")
+        output.summary.append(f"view it with: tensorboard --logdir {output.directory.parent}")
         table, verdicts = codesign(options, scene, output)
     print_table(table)
     print(*(f"{name}: {verdict}" for name, verdict in verdicts.items()), sep="\n")

@@ -1,4 +1,4 @@
-"""`torchmask companion`: a companion beside a star, from squared visibilities and closure phases."""
+"""`torchmask companion`: search for a companion of a star in squared visibilities and closure phases."""
 
 from __future__ import annotations
 
@@ -26,29 +26,29 @@ from torchmask.viz.companion import companion_figure
 
 @dataclass(frozen=True, kw_only=True)
 class Options(RunOptions):
-    """Look for a companion beside a star in OIFITS files, and say how faint one would have been found.
+    """Search for a companion of a star in OIFITS files, and give the contrasts that would have been detected.
 
-    The files are those of `torchmask restore --oifits` or of any other program. Several are taken together. Writes
-    companion.json, the map of all places that were tried as companion.npz, and a figure to a new folder.
+    The files are those of `torchmask restore --oifits` or of any other program; several are analysed jointly. The
+    command writes companion.json, the map of all positions tried (companion.npz) and a figure to a new folder.
     """
 
     files: tyro.conf.Positional[tuple[Path, ...]] = ()
     """OIFITS files of the star that may have a companion."""
     star: tuple[Path, ...] = ()
-    """OIFITS files of a star that is a point, to divide by: one for each of the files, or one for all. Without it the
-    files must be calibrated already."""
+    """OIFITS files of an unresolved calibrator star: one for each of the files, or one for all. Without it the files
+    must be calibrated already."""
     target: str | None = None
-    """Name of the target, where a file holds several."""
+    """Name of the target, for files with several."""
     closures_only: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Leave the squared visibilities out: closure phases bear a contrast that is not calibrated."""
+    """Ignore the squared visibilities, unlike which closure phases do not need a calibrated contrast."""
     least_arcsec: float | None = None
-    """Smallest separation that is tried [arcsec]; None: half of the finest fringe."""
+    """Smallest separation to try [arcsec]; None: half the period of the finest fringe."""
     most_arcsec: float | None = None
-    """Largest separation that is tried [arcsec]; None: half of the widest fringe."""
+    """Largest separation to try [arcsec]; None: half the period of the widest fringe."""
 
 
 def run(options: Options) -> None:
-    """Read, look, write and print."""
+    """Read the files, search, and write and print the results."""
     measured = read_measurements(options)
     bounds = [None if value is None else value * ARCSEC for value in (options.least_arcsec, options.most_arcsec)]
     try:
@@ -78,9 +78,9 @@ def run(options: Options) -> None:
 
 
 def read_measurements(options: Options) -> Measurements:
-    """All files as one, divided by the star. Raises ValueError, which names the file, for what cannot be used."""
+    """Read and join all files, calibrated by the star. Raises ValueError, which names the file, for unusable ones."""
     if not options.files:
-        raise ValueError("there is nothing to look at: give OIFITS files")
+        raise ValueError("there are no files to search: give OIFITS files")
     if len(options.star) not in (0, 1, len(options.files)):
         raise ValueError(
             f"--star names {len(options.star)} files for {len(options.files)} of the object: give one for each, or one "
@@ -98,12 +98,12 @@ def read_measurements(options: Options) -> Measurements:
                 raise ValueError(f"--star {options.star[star]} and {path}: {error}") from error
         parts.append(seen.closures_only() if options.closures_only else seen)
     if options.closures_only and not any(len(part.closure_phases) for part in parts):
-        raise ValueError("--closures-only: the files hold no closure phases")
+        raise ValueError("--closures-only: the files have no closure phases")
     return join(parts)
 
 
 def describe(fit: PairFit) -> dict[str, Any]:
-    """The companion of a fit with its errors, as numbers for a table: mas, degrees and magnitudes."""
+    """Return the companion of a fit with its errors, in mas, degrees and magnitudes."""
     rotation = rotation_towards(fit.companion)
     contrast, along, across = (rotation @ fit.covariance @ rotation.T).diagonal().sqrt().tolist()
     radius = float(torch.linalg.vector_norm(fit.companion[1:]))
@@ -122,7 +122,7 @@ def describe(fit: PairFit) -> dict[str, Any]:
 
 
 def summary(companion: dict[str, Any], limits: DetectionLimits, side_known: bool) -> Sequence[str]:
-    """What is printed."""
+    """Return the lines to print."""
     errors, significant = companion["errors"], companion["significance"] >= SIGNIFICANCE
     head = "a companion" if significant else f"no companion above {SIGNIFICANCE:g} standard errors; the likeliest is"
     lines = [
@@ -133,7 +133,7 @@ def summary(companion: dict[str, Any], limits: DetectionLimits, side_known: bool
         f"{companion['degrees_of_freedom']}, {companion['chi_square_without']:.4g} without it)"
     ]
     if not side_known:
-        lines.append("without closure phases the opposite side of the star fits as well")
+        lines.append("without closure phases, a companion on the opposite side of the star fits equally well")
     for place, contrast, error in zip(limits.separation, limits.contrast, limits.errors, strict=True):
         lines.append(
             f"  at {1000 * place:.4g} mas a companion of {contrast:.2g} +- {error:.1g} of the star's light would be "

@@ -1,7 +1,7 @@
-"""Options to config.yaml and back.
+"""Write options to config.yaml and read them.
 
-A config file holds what a result depends on. It is plain YAML: read without constructing any object, and strictly, so
-that a misspelt key cannot be taken for a default.
+A config file has all options that a result depends on. It is plain YAML, read without constructing any object, and
+unknown keys are errors, so that a misspelt key does not go unnoticed.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from torchmask.io import atomic_write, from_json, to_json
 T = TypeVar("T")
 
 CONFIG = "config.yaml"  # its name in the folder of a run
-_COMMAND = "command"  # the key that says which command a config file is for
-# Where work is done, where results go and how errors are shown: no part of what is computed.
+_COMMAND = "command"  # key for the command that a config file belongs to
+# Options that do not affect what is computed.
 _NOT_STORED = ("out", "config", "resume", "debug", "sweep", "workers", "backend")
 
 
 def save_config(path: str | Path, command: str, options: Any) -> None:
-    """Write the options that a result depends on, for `load_config`; paths that exist become absolute. A new file."""
+    """Write the options that a result depends on to a new file for `load_config`; existing paths become absolute."""
     import yaml
 
     values = {_COMMAND: command} | to_json(stored(options))
@@ -31,13 +31,13 @@ def save_config(path: str | Path, command: str, options: Any) -> None:
 
 
 def load_config(path: str | Path, options: type[T], command: str) -> T:
-    """Read what `save_config` wrote, or part of it; `options.from_v01`, if there is one, translates old keys.
+    """Read a file of `save_config`, or part of one; `options.from_v01`, if it exists, translates old keys.
 
     Raises
     ------
     ValueError
-        If the file is missing, no YAML, for another command, or holds an unknown key or a value of the wrong kind; the
-        message names the keys that are known.
+        If the file is missing, is not YAML, is for another command, or has an unknown key or a value of the wrong type;
+        the message lists the known keys.
     """
     import yaml
 
@@ -51,7 +51,7 @@ def load_config(path: str | Path, options: type[T], command: str) -> T:
     try:
         values = {} if values is None else values
         if not isinstance(values, dict):
-            raise ValueError(f"the file holds {values!r}: names with values are needed")
+            raise ValueError(f"the file contains {values!r}: names with values are needed")
         values = dict(values)
         made_for = values.pop(_COMMAND, command)
         if made_for != command:
@@ -64,7 +64,7 @@ def load_config(path: str | Path, options: type[T], command: str) -> T:
 
 
 def stored(options: Any) -> dict[str, Any]:
-    """Fields that a result depends on, nested dataclasses as mappings, paths absolute."""
+    """Return the fields that a result depends on, with nested dataclasses as mappings and absolute paths."""
 
     def plain(value: Any) -> Any:
         if dataclasses.is_dataclass(value):

@@ -1,4 +1,4 @@
-"""`--oifits`: visibilities and closure phases of the frames that a command restores, as a file beside the image."""
+"""`--oifits`: write visibilities and closure phases of the restored frames to a file beside the image."""
 
 from __future__ import annotations
 

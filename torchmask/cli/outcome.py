@@ -1,4 +1,4 @@
-"""What a restoration leaves in its folder: the image, its numbers, figures and what is told of clouds."""
+"""Write the results of a restoration: the image, its metrics, figures and a warning of clouds."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def write_outcome(
 ) -> dict[str, Any]:
     """Write restored.npz, restored.fits and metrics.json; return the numbers of the last.
 
-    `history` says in restored.fits what was done.
+    `history` becomes the HISTORY of restored.fits.
     """
     result.save(folder / "restored.npz")
     save_restored(folder / "restored.fits", result, observation, history)
@@ -33,7 +33,7 @@ def write_outcome(
 
 
 def metrics(observation: Observation, result: RestorationResult) -> dict[str, Any]:
-    """Return what metrics.json says: the fit, the search, clouds, and the score where the truth is known."""
+    """Return the content of metrics.json: fit, search, clouds, and the score if the truth is known."""
     table: dict[str, Any] = {
         "chi_square": float(result.chi_square.mean()),
         "worst_frame_chi_square": float(result.chi_square.max()),
@@ -62,7 +62,7 @@ def metrics(observation: Observation, result: RestorationResult) -> dict[str, An
 def log_outcome(
     observation: Observation, result: RestorationResult, table: Mapping[str, Any], logger: RunLogger, prefix: str = ""
 ) -> None:
-    """Draw the figures, and hand the final metrics to TensorBoard; `prefix` tells stacks apart."""
+    """Draw the figures and log the final metrics to TensorBoard; `prefix` distinguishes stacks."""
     scale, sky = observation.grid.pixel_scale, observation.sky_matrix
     logger.figure(
         f"{prefix}restored",
@@ -83,7 +83,7 @@ def log_outcome(
 
 
 def summarise_outcome(result: RestorationResult, table: Mapping[str, Any]) -> str:
-    """Return what is printed of a restoration: clouds, and the summary of the result, which ends in its verdict."""
+    """Return the text to print: a warning of clouds, and the summary of the result, which ends in its verdict."""
     clouded = table["clouded_frames"]
     told = f"frames {clouded} have less than half the light of the others, as through a cloud; --skip leaves them out\n"
     return (told if clouded else "") + result.summary()

@@ -1,4 +1,4 @@
-"""What a run shows of its masks, exposures and restorations, in TensorBoard and as PNG."""
+"""Figures of a run's masks, exposures and restorations, in TensorBoard and as PNG."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def log_design(design: SearchResult, grid: Grid, logger: RunLogger, constraints: Sequence[Constraint] = ()) -> None:
-    """The mask with what it keeps clear of, the frequencies it passes, and how the search went."""
+    """Draw the mask with the zones it must avoid, its spatial frequencies, and the history of the search."""
     mask = viz.mask_figure(design.aperture)
     draw_zones(mask, constraints, drawing.length_unit(design.aperture.mask_diameter)[1])
     logger.figure("design/mask", mask)
@@ -39,7 +39,7 @@ def log_design(design: SearchResult, grid: Grid, logger: RunLogger, constraints:
 
 
 def draw_zones(figure: Figure, constraints: Sequence[Constraint], scale: float) -> None:
-    """Shade the zones of the pupil that no hole may reach; `scale` units of the axes are a metre."""
+    """Shade the zones of the pupil that holes must avoid; `scale` is the number of axis units per metre."""
     from matplotlib.patches import Circle, Polygon
 
     style: dict[str, Any] = {"facecolor": drawing.FAINT, "edgecolor": "none"}
@@ -56,7 +56,7 @@ def draw_zones(figure: Figure, constraints: Sequence[Constraint], scale: float) 
 
 
 def log_observation(name: str, observation: Observation, logger: RunLogger) -> None:
-    """PSFs with and without turbulence, their MTFs, and frames."""
+    """Draw PSFs with and without turbulence, their MTFs, and frames."""
     assert observation.psfs is not None
     grid = observation.grid
     psfs = torch.fft.ifftshift(observation.psfs, dim=(-2, -1))
@@ -79,13 +79,13 @@ def restored_figure(
     unit: str = "electrons",
     sky: Any | None = None,
 ) -> Figure:
-    """A restored image (H, W), beside it the first and the mean of `frames` (T, H, W), and the rms of `residuals`.
+    """Draw a restored image (H, W) beside the first and the mean of `frames` (T, H, W) and the rms of `residuals`.
 
-    The standard deviation of the image stands between, if there is one.
+    If `deviation` (H, W) is given, the standard deviation of the image is drawn too.
 
-    Light is shown with a square root, each image up to its own 99.5th percentile [`unit` per pixel]; residuals
-    (T, H, W) are in units of the noise, so that 1 is what noise alone leaves. `pixel_scale` [rad] labels the axes with
-    angles, `sky` (2, 2), as `Observation.sky_matrix`, adds north and east.
+    Light is shown with a square-root stretch, each image up to its own 99.5th percentile [`unit` per pixel]. Residuals
+    (T, H, W) are in units of the noise, so that noise alone gives 1. `pixel_scale` [rad] labels the axes with angles;
+    `sky` (2, 2), as `Observation.sky_matrix`, adds north and east.
     """
     restored = as_array(image)
     lights = {title: restored}

@@ -1,4 +1,4 @@
-"""`torchmask restore`: the image behind a stack of short exposures, or the images behind several."""
+"""`torchmask restore`: restore the images of one or several stacks of short exposures."""
 
 from __future__ import annotations
 
@@ -36,53 +36,56 @@ SKIES = {"if-seen": Background.IF_SEEN, "per-frame": Background.PER_FRAME, "none
 
 @dataclass(frozen=True, kw_only=True)
 class Options(BandOptions, StackOptions, OIFITSOptions, WorkerOptions, RunOptions):
-    """Restore the image behind a stack of short exposures with unknown aberrations (myopic deconvolution).
+    """Restore an image from a stack of short exposures with unknown aberrations (myopic deconvolution).
 
-    A stack is an .npz file (`torchmask simulate` writes such) or a FITS cube; several are restored side by side, each
-    by itself. With --join the FITS files, cubes or images of one filter and orientation, are one stack. FITS files need
-    --mask. Writes restored.fits (with the sky coordinates of the input, and in HISTORY what was done), restored.npz,
-    figures, metrics.json, config.yaml and the log to a new folder, of several stacks to a folder in it for each. The
-    last line says whether the frames are explained; the exit status is 3 if not.
+    A stack is an .npz file, such as `torchmask simulate` writes, or a FITS cube; several are restored in parallel and
+    independently. With --join all FITS files, cubes or images of one filter and orientation, form one stack. FITS files
+    need --mask. The command writes restored.fits (with the sky coordinates of the input, and the settings in HISTORY),
+    restored.npz, figures, metrics.json, config.yaml and the log to a new folder, or for several stacks to a subfolder
+    for each. The last line says whether the restoration explains the frames; the exit status is 3 if it does not.
     """
 
     stacks: tyro.conf.Positional[tuple[Path, ...]] = ()
     """Stacks of exposures, .npz or .fits."""
     join: tyro.conf.FlagCreatePairsOff[bool] = False
-    """All FITS files together are one stack."""
+    """Treat all FITS files together as one stack."""
     r0: float | None = None
-    """Fried parameter of the turbulence at the wavelength [m]; None: as a simulated stack says, or else estimated."""
+    """Fried parameter of the turbulence at the wavelength [m]; None: that of a simulated stack, or else estimated."""
     outer_scale: float | None = None
-    """Of the turbulence [m]; None: as a simulated stack says, or else 20 mask diameters."""
+    """Outer scale of the turbulence [m]; None: that of a simulated stack, or else 20 mask diameters."""
     n_modes: int | None = None
-    """Zernike modes per hole, Noll 1 (piston) to this; None: 6, or 231 for a full pupil."""
+    """Number of Zernike modes per hole, from Noll mode 1 (piston); None: 6, or 231 for a full pupil."""
     static_modes: int = 0
-    """Zernike modes per hole of aberrations that all frames share, such as those of the telescope."""
+    """Number of Zernike modes per hole for aberrations that all frames share, such as those of the telescope."""
     sky: float | Literal["if-seen", "per-frame", "none"] = "if-seen"
-    """Its light [electrons per pixel]; or one constant for each frame, to be found always or if the frames show one."""
+    """Known sky [electrons per pixel]; or per-frame to fit a constant in each frame, if-seen: if the frames show a
+    sky."""
     pixel_fill: float | None = None
-    """Part of the area of its pitch in which a pixel is sensitive, 1 for gapless pixels; None: pixels are points."""
+    """Sensitive fraction of the area of a pixel, 1 for pixels without gaps; None: pixels are points."""
     exposure_tau0: float = 0.0
-    """How long a frame lasts [tau0 = 0.314 r0 / wind]: holes then move meanwhile in the model; 0: snapshots."""
+    """Exposure time of a frame [tau0 = 0.314 r0 / wind], during which the model lets holes move; 0: snapshots."""
     star: Path | None = None
-    """Exposures of a star through the same mask, .npz or .fits: first they tell how it lies (`torchmask calibrate`)."""
+    """Exposures of a star through the same mask, .npz or .fits, which give its geometry (`torchmask calibrate`)."""
     refine_geometry: Literal["if-seen", "yes", "no"] = "if-seen"
-    """Find a turn and a magnification of the mask with the image; if-seen: where the frames ask for it."""
+    """Estimate a rotation and magnification of the mask with the image; if-seen: if the frames show an error in it."""
     prior: bool = True
-    """Weigh aberrations by their von Karman statistics."""
+    """Weight the aberrations by their von Karman statistics."""
     tv_weight: float = 1.0
-    """Of the total variation of the object, without unit: more is smoother."""
+    """Weight of the total variation of the object, dimensionless; a larger weight gives a smoother image."""
     max_iterations: int = 4000
-    """Upper limit of iterations, of all starts together; one start takes 1000 at most."""
+    """Maximum number of iterations over all starts, each of which takes at most 1000."""
     tolerance: float = 1e-4
     """Converged when 100 iterations lower the cost by less than this fraction."""
     n_samples: int = 0
-    """Drawn for the standard deviations of the image, extension ERR of restored.fits: 8 are enough; 0: none."""
+    """Number of posterior samples for the standard deviations of the image (ERR in restored.fits): 8 suffice; 0:
+    none."""
     resume: Path | None = None
-    """Folder of an interrupted run: go on with its options from its checkpoint, of every 100th iteration."""
+    """Folder of an interrupted run, which is continued with its options from its last checkpoint (every 100 iterations
+    have one)."""
 
     @staticmethod
     def from_v01(values: Mapping[str, Any]) -> dict[str, Any]:
-        """What a config of version 0.1 says, where all files were one stack."""
+        """Translate a config of version 0.1, in which all files were one stack."""
         values = dict(values)
         if "stack" in values:
             values["stacks"] = values.pop("stack")
@@ -91,12 +94,12 @@ class Options(BandOptions, StackOptions, OIFITSOptions, WorkerOptions, RunOption
 
 
 def run(options: Options) -> int:
-    """Restore, and write the images; returns the exit status, which says whether the frames are explained."""
+    """Restore and write the images; return the exit status, which says whether the frames are explained."""
     stacks = group_files(options.stacks, options.join)
     if not stacks:
         raise ValueError("there is no stack to restore: give .npz or FITS files")
     if options.resume is not None and len(stacks) > 1:
-        raise ValueError(f"--resume goes on with one stack, and {len(stacks)} are given")
+        raise ValueError(f"--resume continues one stack, but {len(stacks)} are given")
     star = None if options.star is None else read_star(options.star, options, options.pixel_fill)
     if len(stacks) > 1:
         return restore_several(stacks, options, star)
@@ -105,17 +108,17 @@ def run(options: Options) -> int:
 
 
 def read_calibrated(files: Sequence[Path], options: Options, star: MaskCalibration | None) -> Observation:
-    """One stack, through the mask where the star has shown it."""
+    """Read one stack, with the mask's geometry as measured on the star if there is one."""
     observation = read_stack(files, options)
     return observation if star is None else dataclasses.replace(observation, aperture=star.aperture)
 
 
 def restore_one(files: Sequence[Path], options: Options, star: MaskCalibration | None) -> int:
-    """One stack, on all cores, with a checkpoint to go on from; returns the exit status."""
+    """Restore one stack on all cores, with a checkpoint for --resume; return the exit status."""
     observation = read_calibrated(files, options, star)
     checkpoint = None if options.resume is None else options.resume / CHECKPOINT
     if checkpoint is not None and not checkpoint.is_file():
-        raise ValueError(f"there is no {checkpoint} to go on from: it is written at the 100th iteration")
+        raise ValueError(f"there is no {checkpoint} to resume from: it is first written at the 100th iteration")
     method = deconvolution(observation, options)
     observables = measure_frames(observation, options, known_sky(options))
     with new_run("restore", options) as output:
@@ -141,7 +144,7 @@ def restore_one(files: Sequence[Path], options: Options, star: MaskCalibration |
 
 
 def restore_several(stacks: Mapping[str, Sequence[Path]], options: Options, star: MaskCalibration | None) -> int:
-    """Each stack on a core, and what was found in a folder of its name; failures are told when all have ended.
+    """Restore each stack on one core, into a folder of its name; report failures when all have ended.
 
     Returns the exit status, which is that of the worst verdict.
     """
@@ -195,7 +198,7 @@ def _failed(failures: Mapping[str, Exception], n_stacks: int) -> ValueError:
 
 
 def deconvolution(observation: Observation, options: Options) -> MyopicDeconvolution:
-    """The method for a stack. Raises ValueError for settings that it does not allow."""
+    """Return the restoration method for a stack. Raises ValueError for settings that it does not allow."""
     return MyopicDeconvolution(
         observation.aperture,
         observation.grid,
@@ -217,12 +220,12 @@ def deconvolution(observation: Observation, options: Options) -> MyopicDeconvolu
 
 
 def known_sky(options: Options) -> float:
-    """What --sky says of its light [electrons per pixel]; 0 where it is to be found."""
+    """Return the sky of --sky [electrons per pixel]; 0 if it is to be estimated."""
     return 0.0 if isinstance(options.sky, str) else options.sky
 
 
 def history(files: Sequence[Path], result: RestorationResult, options: Options) -> list[str]:
-    """What was done, for a FITS header: version, files, options that are not at their default, and what came out."""
+    """Return the HISTORY of a FITS header: version, files, options that differ from their defaults, and outcome."""
     default = stored(Options())
     changed = {name: value for name, value in stored(options).items() if value != default[name]}
     return [

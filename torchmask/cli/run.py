@@ -22,7 +22,7 @@ from torchmask.tracking import RunLogger
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-CHECKPOINT = "resume.npz"  # of a run that can go on from there
+CHECKPOINT = "resume.npz"  # of a run that can be resumed
 
 
 @dataclass(frozen=True)
@@ -54,18 +54,18 @@ class Run:
 def new_run(command: str, options: RunOptions, seed: int | None = None) -> Iterator[Run]:
     """Log to a new folder (by default runs/COMMAND-date-time), and to the terminal.
 
-    Where the request turns out to be impossible before any work is done (ValueError), the folder goes again. Whatever
-    else ends the run leaves what was reached, and the user is told where.
+    If the request turns out to be impossible before there are any results (ValueError), the folder is removed again. If
+    the run ends early for any other reason, the results so far are kept, and the user is told where.
 
     Raises ValueError if the folder exists or cannot be made.
     """
     run: Run | None = None
     directory = options.out or free_name(Path("runs") / datetime.now().strftime(f"{command}-%Y%m%d-%H%M%S"))
     parents = [parent for parent in directory.parents if not parent.exists()]
-    useless = False  # until the folder is ours, and again once it holds results
+    useless = False  # only True from when the folder is made until it has results
 
     def kept(write: Callback) -> Callback:
-        """Records of results go to the log, and with them the folder is worth keeping."""
+        """Write records of results to the log, after which the folder is kept."""
 
         def note(record: Record) -> None:
             nonlocal useless
@@ -97,7 +97,7 @@ def new_run(command: str, options: RunOptions, seed: int | None = None) -> Itera
 
 
 def _ways_on(command: str, directory: Path, options: RunOptions) -> list[str]:
-    """What an interrupted run tells its user: only what is there is named."""
+    """Return what to print after an interruption: where the results so far are, and how to continue if possible."""
     lines = [f"what was reached is in {directory}"] if directory.is_dir() else []
     if all((directory / name).is_file() for name in (CONFIG, CHECKPOINT)):
         lines.append(f"go on with: torchmask {command} --resume {shlex.quote(str(directory))}")

@@ -1,4 +1,4 @@
-"""`torchmask view`: what a file or a run folder holds, as text and pictures."""
+"""`torchmask view`: show the content of a file or a run folder as text and figures."""
 
 from __future__ import annotations
 
@@ -29,29 +29,33 @@ from torchmask.viz.comparison import comparison_figure
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_RESULTS = ("restored.npz", "result.npz", "stack.npz", "mask.json")  # of a run: the first of these that is there
+_RESULTS = ("restored.npz", "result.npz", "stack.npz", "mask.json")  # of a run, of which the first that exists is shown
 _NYQUIST = 0.5  # cycles/pixel, the cut-off of a codesign run
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options(DebugOptions):
-    """Say what a file holds, and draw it: a mask, a stack, a restored image, a run folder or one of its checkpoints."""
+    """Describe and draw the content of a file: a mask, a stack, a restored image, a run folder or its checkpoint."""
 
     path: tyro.conf.Positional[Path]
     """Mask (.json, .dxf, .fits), stack or result (.npz), image or cube (.fits), or run folder."""
     out: Path | None = None
-    """New .png file; None: the name of the input, in the current folder. Of a mask, NAME-uv.png has its baselines."""
+    """New .png file; None: named after the input, in the current folder. NAME-uv.png shows the baselines of a mask."""
 
 
 class View(NamedTuple):
-    """text : what is there; figures : by what is added to the name of their file."""
+    """A view of a file.
+
+    text : description
+    figures : figures, by the suffix of their file names
+    """
 
     text: str
     figures: dict[str, Figure]
 
 
 def run(options: Options) -> None:
-    """Print the text, write the figures."""
+    """Print the text and write the figures."""
     if options.out is not None and options.out.suffix.lower() != ".png":
         raise ValueError(f"{options.out} does not end in .png")
     view = view_path(options.path)
@@ -67,7 +71,7 @@ def run(options: Options) -> None:
 
 
 def view_path(path: Path) -> View:
-    """Look into a file or folder. Raises ValueError for what is missing, damaged or unknown."""
+    """Return the view of a file or folder. Raises ValueError if it is missing, damaged or of an unknown kind."""
     if path.is_dir():
         return _view_run(path)
     viewers: dict[str, Callable[[Path], View]] = {
@@ -98,7 +102,7 @@ def _view_fits(path: Path) -> View:
         with fits.open(path) as content:
             is_mask = "HOLES" in content
     except (OSError, ValueError) as error:
-        raise ValueError(f"{path} is no FITS file, or is damaged: {error}") from error
+        raise ValueError(f"{path} is not a FITS file, or is damaged: {error}") from error
     if is_mask:
         return _view_mask(path)
     images = read_fits(path)
@@ -135,11 +139,11 @@ def _view_npz(path: Path) -> View:
             f"image of {image.shape[0]} x {image.shape[1]} pixels{step}", {"": restored_figure(image, title="image")}
         )
     text = "\n".join(f"{name}: {array.dtype} {array.shape}" for name, array in stored.items())
-    return View(f"arrays that no figure is known for\n{text}", {})
+    return View(f"arrays without a figure\n{text}", {})
 
 
 def _orientation_beside(path: Path) -> Any | None:
-    """Return the matrix from pixels to the sky of the FITS file beside an .npz file; None if none tells it."""
+    """Return the matrix from pixels to the sky of the FITS file beside an .npz file, or None."""
     image = path.with_suffix(".fits")
     return pixel_matrix(read_fits(image).header) if image.is_file() else None
 
@@ -174,13 +178,13 @@ def _codesign_view(stored: dict[str, Any]) -> View:
 
 
 def _view_run(folder: Path) -> View:
-    """How a run ended, the last values of each stage, and its result, or else the last state it reached."""
-    rows = read_metrics(folder)  # raises where this is no run folder
+    """Describe how a run ended and the last values of each stage, and show its result or else its last checkpoint."""
+    rows = read_metrics(folder)  # raises ValueError if this is not a run folder
     status = read_json(folder / "status.json")
     last: dict[str, dict[str, Any]] = {}
     for row in rows:
         before = last.get(row["stage"], row)
-        same = before["scalars"] if before["step"] == row["step"] else {}  # final values come one by one
+        same = before["scalars"] if before["step"] == row["step"] else {}  # final values are logged one by one
         last[row["stage"]] = row | {"scalars": same | row["scalars"]}
     lines = [f"{folder}: {status['status']} after {status['seconds']:.0f} s"]
     if status.get("error"):
@@ -190,7 +194,7 @@ def _view_run(folder: Path) -> View:
         values = ", ".join(f"{name} {value:.5g}" for name, value in row["scalars"].items() if value is not None)
         lines.append(f"  {stage} {row['step']}{budget}: {values}")
     there = [folder / name for name in _RESULTS if (folder / name).is_file()]
-    stacks = sorted(folder.glob("*/restored.npz"))  # several were restored
+    stacks = sorted(folder.glob("*/restored.npz"))  # of a run that restored several
     if len(stacks) > 1:
         lines.append(f"{len(stacks)} stacks: {', '.join(str(path) for path in stacks)}")
     there += stacks
@@ -206,7 +210,7 @@ def _names(path: Path, view: View) -> dict[str, Path]:
 
 
 def _free_names(stem: str, view: View) -> dict[str, Path]:
-    """Names in the current folder after `stem`, or after the first of stem-2, stem-3, ... that are all free."""
+    """Return names in the current folder from `stem`, or the first of stem-2, stem-3, ... for which all are free."""
     for number in itertools.count(1):
         names = _names(Path(f"{stem}.png" if number == 1 else f"{stem}-{number}.png"), view)
         if not any(path.exists() for path in names.values()):
