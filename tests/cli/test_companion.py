@@ -76,13 +76,13 @@ def test_a_mistake_is_one_line_and_nothing_is_written(write, tmp_path, capsys):
     for arguments, message in (
         ((), "there are no files to search: give OIFITS files"),
         ((tmp_path / "none.fits",), "there is no file"),
-        ((text,), "is no OIFITS file"),
+        ((text,), "is not an OIFITS file"),
         ((star, star, star, "--star", star, star), "--star names 2 files for 3 of the object"),
         (
             (star, "--least-arcsec", "0.3", "--most-arcsec", "0.1"),
             "--least-arcsec, --most-arcsec: separations from 0.3",
         ),
-        ((star, "--target", "moon"), "no target 'moon': it holds UNKNOWN"),
+        ((star, "--target", "moon"), "no target 'moon': it has UNKNOWN"),
     ):
         assert run(*arguments, "--out", tmp_path / "run") == 1
         err = capsys.readouterr().err

@@ -82,13 +82,13 @@ def test_folders_that_were_there_stay(tmp_path):
 def test_an_error_on_the_way_leaves_what_was_reached_and_says_where(tmp_path, capsys):
     fail(RunOptions(out=tmp_path / "run"), ValueError("the light is gone"), RECORD)
     assert status(tmp_path / "run") == "failed"
-    assert capsys.readouterr().err == f"half of it is done\nwhat was reached is in {tmp_path / 'run'}\n"
+    assert capsys.readouterr().err == f"half of it is done\nthe results so far are in {tmp_path / 'run'}\n"
 
 
 def test_an_interruption_leaves_what_was_reached_and_a_sweep_says_how_to_go_on(tmp_path, capsys):
     fail(RunOptions(out=tmp_path / "run"), KeyboardInterrupt(), RECORD)
     assert status(tmp_path / "run") == "interrupted"
-    assert capsys.readouterr().err == f"\nwhat was reached is in {tmp_path / 'run'}\n"
+    assert capsys.readouterr().err == f"\nthe results so far are in {tmp_path / 'run'}\n"
     fail(SweepOptions(out=tmp_path / "other", sweep=tmp_path / "sweep"), KeyboardInterrupt(), RECORD)
     assert f"with --sweep {tmp_path / 'sweep'} the next run goes on from there" in capsys.readouterr().err
 

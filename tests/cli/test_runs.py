@@ -400,7 +400,7 @@ def test_a_restoration_ends_in_a_verdict(runs, tmp_path, capsys):
 def test_an_interrupted_search_leaves_its_best_mask(tmp_path, monkeypatch, capsys):
     interrupt_at(monkeypatch, "design/hybrid", 30)
     assert main([*DESIGN, *RULES, "--out", str(tmp_path / "run")]) == 130
-    assert f"what was reached is in {tmp_path / 'run'}" in capsys.readouterr().err
+    assert f"the results so far are in {tmp_path / 'run'}" in capsys.readouterr().err
     check_mask(load_mask(tmp_path / "run/mask.json"), 1e-9, [MinimumGap(0.05), KeepOutDisc(0.3)])
     assert json.loads((tmp_path / "run/status.json").read_text())["status"] == "interrupted"
 
@@ -425,7 +425,7 @@ def test_an_interrupted_restoration_goes_on_to_the_same_result(runs, tmp_path, m
     interrupt_at(monkeypatch, "restoration", 150)
     capsys.readouterr()
     assert main(["restore", *map(str, stack), "--out", str(tmp_path / "cut")]) == 130
-    assert f"go on with: torchmask restore --resume {tmp_path / 'cut'}\n" in capsys.readouterr().err
+    assert f"continue with: torchmask restore --resume {tmp_path / 'cut'}\n" in capsys.readouterr().err
     assert (tmp_path / "cut/resume.npz").is_file()
     assert not (tmp_path / "cut/restored.npz").exists()
     monkeypatch.undo()
@@ -437,7 +437,7 @@ def test_an_interrupted_restoration_goes_on_to_the_same_result(runs, tmp_path, m
         np.testing.assert_array_equal(whole[key], rest[key])
     interrupt_at(monkeypatch, "restoration", 110)  # before the resumed run has written a state of its own
     assert main(["restore", "--resume", str(tmp_path / "cut"), "--out", str(tmp_path / "again")]) == 130
-    assert f"go on with: torchmask restore --resume {tmp_path / 'again'}\n" in capsys.readouterr().err
+    assert f"continue with: torchmask restore --resume {tmp_path / 'again'}\n" in capsys.readouterr().err
     assert load_npz(tmp_path / "again/resume.npz")["costs"].tolist() == whole["cost"][:100].tolist()
     monkeypatch.undo()
     steps = [row["step"] for row in read_metrics(tmp_path / "rest") if row["stage"] == "restoration"]
@@ -507,7 +507,7 @@ def test_what_failed_of_several_is_one_line_and_the_log_knows(several, capsys):
     assert main(["restore", "--config", config, "--max-iterations", "2", "--out", f"{several}-again"]) == 1
     *summary, where, error = capsys.readouterr().err.splitlines()
     assert error.startswith("torchmask restore: error: 1 of 3 stacks failed: damaged: ")
-    assert where == f"what was reached is in {several}-again"
+    assert where == f"the results so far are in {several}-again"
     assert any(line.startswith("stack-2: restored 32 x 32 pixels") for line in summary)
 
 
@@ -533,7 +533,7 @@ def test_an_interruption_keeps_the_stacks_that_are_done(runs, tmp_path, monkeypa
     stack = str(runs / "simulate/stack.npz")
     argv = ["restore", stack, stack, stack, "--max-iterations", "2", "--workers", "1", "--out", str(tmp_path / "run")]
     assert main(argv) == 130
-    assert f"what was reached is in {tmp_path / 'run'}" in capsys.readouterr().err
+    assert f"the results so far are in {tmp_path / 'run'}" in capsys.readouterr().err
     assert sorted(path.parent.name for path in (tmp_path / "run").glob("*/restored.npz")) == ["stack"]
 
 

@@ -220,5 +220,5 @@ def test_weights_of_pixels(mask):
 
 
 def test_too_few_modes_are_refused(mask):
-    with pytest.raises(ValueError, match="n_modes is 2: piston, tip and tilt of every hole, 3, are the least"):
+    with pytest.raises(ValueError, match="n_modes is 2: at least 3, piston, tip and tilt, are needed"):
         CompanionModel(mask, GRID, 2, Band.of([550e-9]), radius=9.0)

@@ -201,10 +201,10 @@ def test_readout_noise_that_nothing_tells_is_asked_for(mask):
 
 def test_baselines_that_cannot_be_told_apart_are_refused(mask, grid):
     frames = torch.rand(1, *grid.shape, generator=torch.Generator().manual_seed(0))
-    with pytest.raises(ValueError, match=r"two holes are the least"):
+    with pytest.raises(ValueError, match=r"give at least two holes"):
         frame_observables(Observation(frames, FullAperture(0.9), grid, 0.0))
     square = SparseAperture([[0.3, 0.3], [0.3, -0.3], [-0.3, -0.3], [-0.3, 0.3]], 0.1, 1.0)
-    with pytest.raises(ValueError, match=r"cannot be told apart: those of holes .* lie 0 m apart"):
+    with pytest.raises(ValueError, match=r"cannot be separated: those of holes .* lie 0 m apart"):
         frame_observables(Observation(frames, square, grid, 0.0))
     with pytest.raises(ValueError, match=r"frames \[0\] hold no light"):
         frame_observables(Observation(0 * frames, mask, grid, 0.0))

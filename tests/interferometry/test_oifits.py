@@ -121,7 +121,7 @@ def test_the_file_says_what_was_observed(tmp_path, mask, grid, expose_points, sk
 def test_unknown_things_are_said_to_be_unknown(tmp_path, mask, grid, expose_points):
     observation = Observation(expose_points(mask, grid), mask, grid, 0.0)
     observables = frame_observables(observation)
-    with pytest.raises(ValueError, match=r"width of the band is not known.*give bandwidth \[m\]"):
+    with pytest.raises(ValueError, match=r"no known FILTER.*give bandwidth \[m\]"):
         save_oifits(tmp_path / "a.fits", observables, observation)
     save_oifits(tmp_path / "a.fits", observables, observation, bandwidth=1e-8)
     primary = fits.getheader(tmp_path / "a.fits")

@@ -128,7 +128,7 @@ def test_a_file_of_a_spectrograph_on_telescopes(revision, tmp_path, recwarn):
     interferometer(revision).save(str(path))
     with pytest.raises(ValueError, match=r"several targets: say which of star, binary is meant"):
         load_oifits(path)
-    with pytest.raises(ValueError, match=r"no target 'moon': it holds star, binary"):
+    with pytest.raises(ValueError, match=r"no target 'moon': it has star, binary"):
         load_oifits(path, "moon")
     seen = load_oifits(path, "binary")
     # two times of six baselines and four triangles at three wavelengths, one flagged, one without error
@@ -154,10 +154,10 @@ def test_what_is_no_oifits_is_refused(tmp_path, observables):
     with pytest.raises(ValueError, match=r"there is no file .*none\.fits"):
         load_oifits(tmp_path / "none.fits")
     (tmp_path / "text.fits").write_text("no FITS at all")
-    with pytest.raises(ValueError, match=r"text\.fits is no OIFITS file, or is damaged"):
+    with pytest.raises(ValueError, match=r"text\.fits is not an OIFITS file, or is damaged"):
         load_oifits(tmp_path / "text.fits")
     fits.PrimaryHDU(np.zeros((4, 4))).writeto(tmp_path / "image.fits")
-    with pytest.raises(ValueError, match=r"image\.fits holds no squared visibility and no closure phase"):
+    with pytest.raises(ValueError, match=r"image\.fits has no squared visibility and no closure phase"):
         load_oifits(tmp_path / "image.fits")
     seen, observation = observables
     save_oifits(tmp_path / "a.fits", seen, observation, bandwidth=1e-8)
@@ -167,7 +167,7 @@ def test_what_is_no_oifits_is_refused(tmp_path, observables):
         hdus["OI_VIS2"].data["FLAG"] = True
         hdus["OI_T3"].data["FLAG"] = True
         hdus.writeto(tmp_path / "c.fits")
-    with pytest.raises(ValueError, match=r"OI_VIS2 is of UNKNOWN, for which there is no OI_WAVELENGTH"):
+    with pytest.raises(ValueError, match=r"OI_VIS2 is of instrument UNKNOWN, which has no OI_WAVELENGTH"):
         load_oifits(tmp_path / "b.fits")
-    with pytest.raises(ValueError, match=r"holds no squared visibility and no closure phase"):
+    with pytest.raises(ValueError, match=r"has no squared visibility and no closure phase"):
         load_oifits(tmp_path / "c.fits")

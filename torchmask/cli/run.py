@@ -91,16 +91,16 @@ def new_run(command: str, options: RunOptions, seed: int | None = None) -> Itera
             for parent in parents:
                 parent.rmdir()
         elif run is not None:
-            print(*run.summary, f"what was reached is in {directory}", sep="\n", file=sys.stderr)
+            print(*run.summary, f"the results so far are in {directory}", sep="\n", file=sys.stderr)
         raise
     print(f"written to {directory}", *run.summary, sep="\n")
 
 
 def _ways_on(command: str, directory: Path, options: RunOptions) -> list[str]:
     """Return what to print after an interruption: where the results so far are, and how to continue if possible."""
-    lines = [f"what was reached is in {directory}"] if directory.is_dir() else []
+    lines = [f"the results so far are in {directory}"] if directory.is_dir() else []
     if all((directory / name).is_file() for name in (CONFIG, CHECKPOINT)):
-        lines.append(f"go on with: torchmask {command} --resume {shlex.quote(str(directory))}")
+        lines.append(f"continue with: torchmask {command} --resume {shlex.quote(str(directory))}")
     if isinstance(options, SweepOptions):
         lines.append(f"with --sweep {options.sweep} the next run goes on from there")
     return lines

@@ -1,4 +1,4 @@
-"""How a mask lies, and how much light its holes pass, measured on frames of a star or of a pinhole."""
+"""Calibration of a mask: its geometry and the transmissions of its holes, measured on frames of a star or pinhole."""
 
 from __future__ import annotations
 
@@ -29,23 +29,25 @@ from torchmask.optics.geometry import MaskGeometry, turn_and_stretch
 from torchmask.optics.pixel import PixelResponse
 from torchmask.record import Callback, Record
 
-_REACH = 1.6  # of the pixels compared, in wavelengths over the diameter of a hole: beyond its first dark ring
-_LEAST_EXPLAINED = 0.5  # of the variance of a frame: the fit is of something else otherwise
-_FIRST_MODES = 3  # piston, tip and tilt are found first
+_REACH = 1.6  # radius of the pixels compared [wavelength / hole diameter]: beyond the first dark ring of a hole
+_LEAST_EXPLAINED = 0.5  # of the variance of a frame: a fit that explains less is not of a star behind this mask
+_FIRST_MODES = 3  # piston, tip and tilt are fitted first
 
 
 @dataclass(frozen=True, eq=False)
 class MaskCalibration:
-    """How a mask lies, with standard errors; `print` shows it.
+    """Measured geometry of a mask with standard errors; `print` shows it.
 
-    aperture : the mask where it lies
-    geometry : the map that leads there from the mask as told; a turn by 180 degrees, which no image shows, is left out
-    geometry_errors : (4,) of rotation [rad], magnification_x, magnification_y and shear
-    mirror_seen : False where a mirrored mask would look the same, as one of symmetric baselines; `geometry` says then
-        that it is not mirrored
-    transmissions, transmission_errors : (N,) light through the holes against their mean
-    offset, offset_errors : (2,) where the star stands, mean over the frames, (x, y) from pixel [H // 2, W // 2] [pixel]
-    explained : (T,) of the variance of each frame's pixels around the star, at most 1
+    aperture : the mask with the measured geometry
+    geometry : map to it from the given mask, without rotations by 180 degrees, which images do not show
+    geometry_errors : (4,) errors of rotation [rad], magnification_x, magnification_y and shear
+    mirror_seen : False if a mirrored mask would look the same, as for symmetric baselines; `geometry` is then not
+        mirrored
+    transmissions : (N,) light through each hole relative to their mean
+    transmission_errors : (N,) errors of the transmissions
+    offset : (2,) mean position (x, y) of the star, relative to pixel [H // 2, W // 2] [pixel]
+    offset_errors : (2,) errors of the offset [pixel]
+    explained : (T,) fraction of the variance of each frame's pixels around the star that the fit explains
 
     Examples
     --------
@@ -104,47 +106,47 @@ def calibrate_mask(
     n_modes: int = 6,
     callback: Callback | None = None,
 ) -> MaskCalibration:
-    """Measure how a mask lies on short exposures `frames` (T, H, W) [electrons] of a star or pinhole.
+    """Measure the geometry of a mask on short exposures `frames` (T, H, W) [electrons] of a star or pinhole.
 
-    First the power of the fringes, out of which the pistons of turbulence drop, tells mirror, turn and magnification
-    roughly. Then the aberrations of every frame are fitted together with what all frames share: the affine map of the
-    pupil and the light through each hole.
+    First, mirror, rotation and magnification are estimated roughly from the power of the fringes, which does not depend
+    on the pistons of turbulence. Then the aberrations of every frame are fitted jointly with what all frames share: the
+    affine map of the pupil and the transmission of each hole.
 
     Parameters
     ----------
     frames : (T, H, W) tensor or array
-        In any turbulence, or none; a few tens are enough. The star may move from frame to frame.
+        Exposures with any turbulence, or none; a few tens are enough. The star may move from frame to frame.
     aperture : SparseAperture
-        As told. It may be wrong by any turn, by a mirror, and by a few percent in size.
+        Nominal mask. It may be wrong by any rotation, a mirror, and a few percent in size.
     grid : Grid
-        Of the frames. A pixel scale that is wrong shows as magnification, and does no harm.
+        Grid of the frames. An error of the pixel scale appears as magnification, and is harmless.
     valid : (H, W) or (T, H, W) boolean tensor or array, optional
         False where a pixel is dead or saturated.
     readout_noise : float
-        [electrons rms per pixel].
+        Read-out noise [electrons rms per pixel].
     pixel : PixelResponse, optional
-        How the detector's pixels blur the image. None: they are points.
+        Blur by the detector's pixels. None: they are points.
     n_modes : int
-        Zernike modes of every hole and frame, at least 3.
+        Number of Zernike modes of every hole and frame, at least 3.
     callback : callable, optional
-        Receives a `Record` of stage "calibration" after each frame of the first fit.
+        Called with a `Record` of stage "calibration" after each frame of the first fit.
 
     Returns
     -------
     MaskCalibration
-        Standard errors are the larger of what noise leaves and what the frames' disagreement tells, if there are two or
-        more. Turbulence in holes wider than r0 has modes beyond `n_modes`, which count in them.
+        Standard errors are the larger of those from the noise and, for two or more frames, those from the scatter
+        between frames. The latter include modes beyond `n_modes` of turbulence in holes wider than r0.
 
     Raises
     ------
     ValueError
-        If the aperture is no single mask of three holes or more, `n_modes` or `readout_noise` are out of range,
-        `check_frames` refuses the frames, or they do not show a point source behind this mask.
+        If the aperture is not a single mask of three holes or more, `n_modes` or `readout_noise` are out of range,
+        `check_frames` rejects the frames, or they do not show a point source behind this mask.
 
     Notes
     -----
-    A hole's field is integrated by a quadrature, with all derivatives in closed form; elliptic holes, as a stretched
-    image has them, are modelled as such, while `aperture` has holes that are magnified evenly.
+    A hole's field is integrated by a quadrature, with all derivatives in closed form. The model has elliptical holes if
+    the map stretches the mask, while the holes of the returned `aperture` are magnified uniformly.
 
     Examples
     --------
@@ -162,7 +164,7 @@ def calibrate_mask(
     if aperture.centers.ndim != 2 or aperture.n_subapertures < 3:
         raise ValueError(f"centers has shape {tuple(aperture.centers.shape)}: one mask of at least 3 holes is needed")
     if n_modes < _FIRST_MODES:
-        raise ValueError(f"n_modes is {n_modes}: piston, tip and tilt, {_FIRST_MODES}, are the least")
+        raise ValueError(f"n_modes is {n_modes}: at least {_FIRST_MODES}, piston, tip and tilt, are needed")
     if not (math.isfinite(readout_noise) and readout_noise >= 0):
         raise ValueError(f"readout_noise is {readout_noise}: it must be finite and at least 0, in electrons rms")
     frames, valid = (values.cpu() for values in check_frames(frames, valid, grid))
@@ -191,7 +193,7 @@ def calibrate_mask(
 def _first_fit(
     coarse: StarModel, model: StarModel, data: Tensor, weights: Tensor, shared: Shared, callback: Callback | None
 ) -> StarFit:
-    """Every frame fitted by itself, to pistons, tips and tilts first and to all modes then."""
+    """Fit every frame separately, first with pistons, tips and tilts only and then with all modes."""
     coarse_kernels, kernels = coarse.kernels(shared.matrix), model.kernels(shared.matrix)
     rows = []
     for frame, weight in zip(data, weights, strict=True):
@@ -207,16 +209,16 @@ def _first_fit(
 
 
 def _even_weights(data: Tensor, counted: Tensor) -> Tensor:
-    """The same (T, pixels) for all pixels of a frame that count: one over their mean light, or a small part of all."""
+    """Return equal weights (T, pixels) for all valid pixels of a frame: one over their mean light, which is clamped."""
     level = (data * counted).sum(1, keepdim=True) / counted.sum(1, keepdim=True).clamp(min=1)
     return counted / level.clamp(min=1e-6 * float(data.abs().max()))
 
 
 def _variance(data: Tensor, counted: Tensor, fit: StarFit, readout_noise: float) -> Tensor:
-    """Of the pixels (T, pixels): their noise, and what the frame's fit leaves beyond it, the same in all pixels.
+    """Return the variance (T, pixels): that of the noise plus the excess residual of the frame, equal in all pixels.
 
-    Modes that the model lacks leave more where there is more light, but pixels weighed by that would count mostly
-    where nearly none is.
+    Residuals of modes that the model lacks are larger in bright pixels, but weights that follow them would give most
+    weight to pixels with hardly any light.
     """
     noise = fit.images.clamp(min=1e-6 * float(fit.images.max())) + readout_noise**2
     freedom = (counted.sum(1) - fit.own.shape[1]).clamp(min=1)
@@ -225,7 +227,7 @@ def _variance(data: Tensor, counted: Tensor, fit: StarFit, readout_noise: float)
 
 
 def _explained(data: Tensor, counted: Tensor, fit: StarFit) -> Tensor:
-    """Share (T,) of the variance of each frame's pixels."""
+    """Return the fraction (T,) of the variance of each frame's pixels that the fit explains."""
     mean = (data * counted).sum(1, keepdim=True) / counted.sum(1, keepdim=True)
     left, all_of_it = ((counted * (data - level) ** 2).sum(1) for level in (fit.images, mean))
     return 1 - left / all_of_it
@@ -242,7 +244,7 @@ def _require_star(data: Tensor, counted: Tensor, fit: StarFit) -> None:
 
 
 def _estimates(model: StarModel, fit: StarFit, information: Information, middles: Tensor) -> dict[str, Tensor]:
-    """The fields of a `MaskCalibration` that are numbers with errors."""
+    """Return the fields of a `MaskCalibration` that have errors, and these errors."""
     covariances = [information.noise_covariance, information.covariance]
 
     def errors(function: Callable[[Tensor], Tensor], at: Tensor, part: slice) -> Tensor:

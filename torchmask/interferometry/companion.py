@@ -1,8 +1,8 @@
-"""A star and a faint companion beside it, as exposures through a mask show them.
+"""Forward model of exposures of a star and a faint companion through a mask.
 
-A companion is (contrast, east, north): its flux over that of the star, and its offset on the sky [rad]. Both have one
-colour. They are imaged through aberrations common to all exposures plus small ones of each, blurred by the pixel and
-the spread of its charge, on a flat background. `fit_companion` finds all of that.
+A companion is (contrast, east, north): its flux over that of the star, and its offset on the sky [rad]. Both have the
+same colour. They are imaged through aberrations common to all exposures plus small ones of each, blurred by the pixel
+and by charge diffusion, on a flat background. `fit_companion` estimates all of these.
 """
 
 from __future__ import annotations
@@ -22,17 +22,18 @@ from torchmask.optics.band import Band
 from torchmask.optics.psf import focal_intensity
 from torchmask.optics.zernike import ZernikePhase
 
-OWN_MODES = 3  # piston, tip and tilt of every hole, which each exposure has for itself
-_FIELD = 3  # of the PSFs, in widths of an exposure: sets how finely the holes are sampled, to half a percent
+OWN_MODES = 3  # piston, tip and tilt of every hole, which differ between exposures
+_FIELD = 3  # of the PSFs, in widths of an exposure, which sets the sampling of the holes: accurate to half a percent
 
 
 @dataclass(frozen=True, eq=False)
 class Exposures:
-    """Exposures of one star, which stands in the middle of each but for a fraction of a pixel.
+    """Exposures of one star, which is centred in each to a fraction of a pixel.
 
-    frames, errors : (T, H, W) electrons, and their rms; finite in every pixel
-    valid : (T, H, W) bool, False where a pixel does not count
-    to_pixels : (T, 2, 2) from (east, north) [rad] to (y, x) [pixel]
+    frames : (T, H, W) electrons, finite in every pixel
+    errors : (T, H, W) standard deviation of the noise [electrons], finite in every pixel
+    valid : (T, H, W) bool, False for pixels to ignore
+    to_pixels : (T, 2, 2) matrix from (east, north) [rad] to (y, x) [pixel]
 
     Raises ValueError if they disagree in shape or are not finite.
 
@@ -66,9 +67,9 @@ class Exposures:
 
     @classmethod
     def from_observations(cls, observations: Sequence[Observation]) -> Exposures:
-        """The frames of several observations of one star, each with its own direction of north.
+        """Return the frames of several observations of one star, each with its own direction of north.
 
-        Raises ValueError if there is none, or one lacks errors or sky coordinates.
+        Raises ValueError if no observation is given, or one lacks errors or sky coordinates.
         """
         if not observations:
             raise ValueError("observations is empty: give at least one")
@@ -87,12 +88,12 @@ class Exposures:
 
 @dataclass(frozen=True, eq=False)
 class Parameters:
-    """All that the exposures of a star and its companion depend on.
+    """Parameters of the model of exposures of a star and its companion.
 
     static : (N J,) coefficients of the aberrations common to all exposures [rad rms], hole by hole
-    blur : (2,) variances of the spread of charge along y and x [pixel^2]
-    own : (T, 4 + 3 N) of each exposure: flux [electrons], background [electrons per pixel], y and x of the star
-        [pixel], and piston, tip and tilt of every hole on top of `static` [rad rms]
+    blur : (2,) variances of the charge diffusion along y and x [pixel^2]
+    own : (T, 4 + 3 N) parameters of each exposure: flux [electrons], background [electrons per pixel], y and x of the
+        star [pixel], and piston, tip and tilt of every hole in addition to `static` [rad rms]
     companion : (3,) contrast, east, north; a contrast of 0 if there is none
 
     Examples
@@ -108,28 +109,28 @@ class Parameters:
     companion: Tensor
 
     def of_exposures(self, chosen: slice) -> Parameters:
-        """Those of some of the exposures."""
+        """Return the parameters of some of the exposures."""
         return replace(self, own=self.own[chosen])
 
 
 class CompanionModel:
-    """Images of a star and a companion through a mask, and how near the star and how well they are to be believed.
+    """Model of images of a star and a companion through a mask.
 
     Parameters
     ----------
     aperture : Aperture
-        One mask, on the axes of the detector.
+        One mask, with centres along the axes of the detector.
     grid : Grid
-        Of the exposures; coefficients are rad at its wavelength.
+        Grid of the exposures; coefficients are in rad at its wavelength.
     n_modes : int
-        J, Zernike modes of every hole in the aberrations common to all exposures, at least 3.
+        Number J of Zernike modes of every hole in the aberrations common to all exposures, at least 3.
     band : Band
-        Aberrations are path differences, the same for all its wavelengths.
+        Wavelengths of the light. Aberrations are path differences, the same at all of them.
     radius : float
-        Pixels this far from the middle of an exposure are compared with the model.
+        Radius around the middle of an exposure within which pixels are compared with the model [pixel].
     flux_error : float
-        The variance of a pixel is that of its noise plus (flux_error x its flux)^2, for what no model of optics and
-        detector gets right. `fit_companion` on a single star and `unexplained_flux` measure it.
+        Relative error of the model: the variance of a pixel is that of its noise plus (flux_error x its flux)^2. It is
+        measured with `fit_companion` on a single star and `unexplained_flux`.
 
     Raises
     ------
@@ -165,7 +166,7 @@ class CompanionModel:
         flux_error: float = 0.01,
     ) -> None:
         if n_modes < OWN_MODES:
-            raise ValueError(f"n_modes is {n_modes}: piston, tip and tilt of every hole, {OWN_MODES}, are the least")
+            raise ValueError(f"n_modes is {n_modes}: at least {OWN_MODES}, piston, tip and tilt, are needed")
         self.grid, self.radius, self.flux_error = grid, radius, flux_error
         self.n_subapertures, self.n_modes = aperture.n_subapertures, n_modes
         self._colours = []
@@ -181,10 +182,10 @@ class CompanionModel:
         self.near: Tensor = torch.hypot(y, x) <= radius  # (H, W), the pixels that are compared
 
     def psf(self, aberrations: Tensor) -> Tensor:
-        """(3 H, 3 W), origin at [0, 0], through aberrations (N J) [rad rms], in units of the light through the mask.
+        """Return the PSF (3 H, 3 W) for aberrations (N J) [rad rms], with the origin at [0, 0].
 
-        Aberrations that scatter light out of this field leave the rest as bright as it was. A sum held at 1 would tie
-        the star's flux to all of them, and Gauss-Newton steps zigzag then.
+        Its unit is the light through the mask. It is not normalised to unit sum when aberrations scatter light out of
+        the field: that would couple the star's flux to all of them, and Gauss-Newton steps would zigzag.
         """
         coefficients = aberrations.view(self.n_subapertures, self.n_modes)
         colours = [
@@ -194,17 +195,20 @@ class CompanionModel:
         return torch.stack(colours).sum(0)
 
     def image(self, aberrations: Tensor, blur: Tensor, place: Tensor, companion: Tensor, to_pixels: Tensor) -> Tensor:
-        """One exposure (H, W) [electrons], differentiable in all but the directions on the sky.
+        """Return one exposure (H, W) [electrons], differentiable in all parameters but `to_pixels`.
 
         Parameters
         ----------
         aberrations : (N J,) tensor
-            Static and own ones together [rad rms].
+            Sum of static aberrations and those of the exposure [rad rms].
         blur : (2,) tensor
+            Variances of the charge diffusion along y and x [pixel^2].
         place : (4,) tensor
-            Flux, background, y and x of the star.
+            Flux [electrons], background [electrons per pixel], y and x of the star [pixel].
         companion : (3,) tensor
+            Contrast, east and north [rad].
         to_pixels : (2, 2) tensor
+            Matrix from (east, north) [rad] to (y, x) [pixel].
         """
         flux, background, y, x = place
         contrast, offset = companion[0], to_pixels @ companion[1:]
@@ -215,22 +219,22 @@ class CompanionModel:
         return self._window(transfer * sky) + background
 
     def images(self, parameters: Parameters, to_pixels: Tensor) -> Tensor:
-        """All exposures (T, H, W) [electrons], whose directions on the sky are `to_pixels` (T, 2, 2)."""
+        """Return all exposures (T, H, W) [electrons] for their matrices `to_pixels` (T, 2, 2)."""
         static, blur, companion = parameters.static, parameters.blur, parameters.companion
         shots = zip(parameters.own, to_pixels, strict=True)
         return torch.stack([self.image(self.total(static, own), blur, own[:4], companion, sky) for own, sky in shots])
 
     def total(self, static: Tensor, own: Tensor) -> Tensor:
-        """Aberrations (N J) of one exposure whose own parameters are `own` (4 + 3 N)."""
+        """Return the total aberrations (N J) of one exposure with its own parameters `own` (4 + 3 N)."""
         extra = own[4:].view(self.n_subapertures, OWN_MODES)
         return static + torch.nn.functional.pad(extra, (0, self.n_modes - OWN_MODES)).flatten()
 
     def moved(self, image: Tensor, offsets: Tensor) -> Tensor:
-        """An image (H, W), dark outside, moved by each of `offsets` (M, 2) [pixel, (y, x)]: (M, H, W)."""
+        """Return an image (H, W), dark outside, shifted by each of `offsets` (M, 2) [pixel, (y, x)], as (M, H, W)."""
         return self._window(torch.fft.rfft2(image, s=self._field) * shift_transfer(self._field, offsets))
 
     def root_weights(self, exposures: Exposures) -> Tensor:
-        """One over the rms error of each pixel (T, H, W), 0 where it is not compared."""
+        """Return one over the rms error of each pixel (T, H, W), 0 for pixels that are not compared."""
         variance = exposures.errors**2 + (self.flux_error * exposures.frames.clamp(min=0)) ** 2
         return torch.where(exposures.valid & self.near, variance, torch.inf).rsqrt()
 

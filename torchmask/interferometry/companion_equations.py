@@ -1,4 +1,4 @@
-"""The equations of a fit to exposures of a star and its companion: what is compared, expected beforehand and solved."""
+"""The least-squares problem of a fit to exposures of a star and its companion, and its normal equations."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from torch.func import jacfwd
 
 from torchmask.interferometry.companion import OWN_MODES, CompanionModel, Exposures, Parameters
 
-STATIC_RMS, OWN_RMS = 0.3, 0.02  # [rad] expected sizes of the common aberrations, and of those of one exposure
-BLUR, BLUR_RMS = 0.1, 0.1  # [pixel^2] variance of the spread of charge along an axis, and how well it is known
-_RIDGE = 1e-12  # of the scaled normal matrix: what nothing holds, as the background of an exposure left out, stays
+STATIC_RMS, OWN_RMS = 0.3, 0.02  # [rad] prior rms of the common aberrations, and of those of one exposure
+BLUR, BLUR_RMS = 0.1, 0.1  # [pixel^2] prior mean and rms of the variance of the charge diffusion along an axis
+_RIDGE = 1e-12  # of the scaled normal matrix, for parameters without data, such as those of an exposure left out
 
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """Of Gauss-Newton: the terms of each exposure, (T, P, P) and (T, P), and those of what is expected beforehand."""
+    """Gauss-Newton normal equations: terms of each exposure, (T, P, P) and (T, P), and terms of the prior."""
 
     matrices: Tensor
     vectors: Tensor
@@ -25,14 +25,14 @@ class NormalEquations:
     prior_vector: Tensor
 
     def solve(self, leave_out: int | None = None) -> Tensor:
-        """The step (P,), of all exposures or of all but one."""
+        """Return the step (P,) from all exposures, or from all but one."""
         vector = self.vectors.sum(0) + self.prior_vector
         if leave_out is not None:
             vector = vector - self.vectors[leave_out]
         return self.solve_for(vector[:, None], leave_out)[:, 0]
 
     def solve_for(self, columns: Tensor, leave_out: int | None = None) -> Tensor:
-        """The inverse of the matrix times `columns` (P, M)."""
+        """Return the inverse of the matrix times `columns` (P, M)."""
         matrix = self.matrices.sum(0) + self.prior_matrix
         if leave_out is not None:
             matrix = matrix - self.matrices[leave_out]
@@ -44,9 +44,9 @@ class NormalEquations:
 
 @dataclass(frozen=True, eq=False)
 class LeastSquares:
-    """Squared residuals, and squared distances from what is expected beforehand, in units of their variances.
+    """Sum of squared residuals and squared deviations from the prior mean, in units of their variances.
 
-    All parameters stand in one row: static and blur, those of each exposure, and the companion's if it is `free`.
+    The parameters are concatenated: static, blur, those of each exposure, and the companion if it is `free`.
     """
 
     model: CompanionModel
@@ -54,21 +54,21 @@ class LeastSquares:
     free: bool
 
     def cost(self, at: Parameters) -> float:
-        """The sum of both."""
+        """Return the sum of both at these parameters."""
         images = self.model.images(at, self.exposures.to_pixels)
         residual = (self.exposures.frames - images) * self.model.root_weights(self.exposures)
         precision, distance = self._expected(at)
         return float((residual**2).sum() + (precision * distance**2).sum())
 
     def move(self, at: Parameters, change: Tensor) -> Parameters:
-        """The parameters after a step (P,)."""
+        """Return the parameters after a step (P,)."""
         sizes = [len(at.static), 2, at.own.numel(), 3 * self.free]
         static, blur, own, companion = change.split(sizes)
         found = at.companion + companion if self.free else at.companion
         return Parameters(at.static + static, at.blur + blur, at.own + own.view_as(at.own), found)
 
     def linearise(self, at: Parameters, t: int) -> tuple[Tensor, Tensor]:
-        """Weighted residuals (pixels,) of exposure t, and the model's derivatives by the parameters at `places`."""
+        """Return weighted residuals (pixels,) of exposure t, and the derivatives in the parameters at `places`."""
         model, n = self.model, len(at.static)
         weight = model.root_weights(self.exposures[t : t + 1])[0]
         row = torch.cat([model.total(at.static, at.own[t]), at.blur, at.own[t, :4], at.companion])
@@ -85,14 +85,14 @@ class LeastSquares:
         return residual, torch.cat(parts + [jacobian[:, n + 6 :]] * self.free, dim=1)
 
     def places(self, at: Parameters, t: int) -> Tensor:
-        """Where the parameters of exposure t stand among all."""
+        """Return the indices of the parameters that exposure t depends on."""
         shared, (n_exposures, n_own) = len(at.static) + 2, at.own.shape
         first, last = shared + t * n_own, shared + n_exposures * n_own
         parts = [torch.arange(shared), torch.arange(first, first + n_own)]
         return torch.cat(parts + [torch.arange(last, last + 3)] * self.free)
 
     def normal_equations(self, at: Parameters) -> NormalEquations:
-        """Of the next step from here."""
+        """Return the normal equations of the next step."""
         precision, distance = self._expected(at)
         n, n_all = len(at.own), len(precision)
         matrices = torch.zeros(n, n_all, n_all, dtype=torch.float64)
@@ -105,7 +105,7 @@ class LeastSquares:
         return NormalEquations(matrices, vectors, torch.diag(precision), precision * distance)
 
     def _expected(self, at: Parameters) -> tuple[Tensor, Tensor]:
-        """Inverse variances of what is expected of the parameters, (P,), and how far it is away."""
+        """Return the prior's inverse variances (P,), and the deviations (P,) of the parameters from its mean."""
         static, blur, own = torch.full_like(at.static, STATIC_RMS**-2), torch.full_like(at.blur, BLUR_RMS**-2), at.own
         own_precision = torch.zeros_like(own)
         own_precision[:, 4:] = OWN_RMS**-2

@@ -1,7 +1,6 @@
-"""How well a companion is known that was found: from the exposures themselves, and from companions put beside a star.
+"""Errors of a detected companion, from the exposures themselves and from companions injected beside a single star.
 
-Companions (contrast, east, north) are in radians on the sky; what is said of them is in milliarcseconds, degrees and
-magnitudes.
+Companions (contrast, east, north) are in radians on the sky; tables give milliarcseconds, degrees and magnitudes.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ MEASURED = ("separation", "position_angle", "magnitude_difference")
 
 
 def polar(companion: Tensor) -> dict[str, float]:
-    """Separation [mas], position angle [deg, north through east] and magnitude difference.
+    """Return separation [mas], position angle [deg, north through east] and magnitude difference.
 
     Examples
     --------
@@ -40,15 +39,15 @@ def polar(companion: Tensor) -> dict[str, float]:
 
 
 def rotation_towards(companion: Tensor) -> Tensor:
-    """The rotation (3, 3) from (contrast, east, north) to contrast, along and across the direction of a companion."""
+    """Return the rotation (3, 3) from (contrast, east, north) to contrast, and along and across the separation."""
     east, north = (companion[1:] / torch.linalg.vector_norm(companion[1:])).tolist()
     return torch.tensor([[1, 0, 0], [0, east, north], [0, north, -east]], dtype=torch.float64)
 
 
 def inject_companion(exposures: Exposures, star: CompanionFit, companion: Tensor) -> Exposures:
-    """The exposures with a companion made of the star's own light, dimmed and moved.
+    """Return the exposures with a companion added, a dimmed and shifted copy of the star's own image.
 
-    Bad pixels give the light of `star`, a fit without companion.
+    In bad pixels the image is taken from `star`, a fit without companion.
     """
     light = torch.where(exposures.valid, exposures.frames, star.images) - star.parameters.own[:, 1, None, None]
     moved = shift(light, exposures.to_pixels @ companion[1:])
@@ -64,29 +63,31 @@ def injection_errors(
     step: float,
     callback: Callback | None = None,
 ) -> tuple[Tensor, list[dict[str, float]]]:
-    """Errors with which companions are found that were put beside a single star.
+    """Inject companions beside a single star and measure the errors with which they are recovered.
 
     Parameters
     ----------
     model : CompanionModel
+        Model of the exposures.
     exposures : Exposures
-        Of a single star.
+        Exposures of a single star.
     star : CompanionFit
-        To them, without companion.
+        Fit to them without companion.
     like : (3,) tensor
-        The companion whose contrast and separation these have, at n position angles.
+        Companion whose contrast and separation are injected.
     n : int
+        Number of injected companions, at equidistant position angles.
     step : float
-        Of the search's raster [arcsec], from whose nearest point each is fitted.
+        Step of the search raster [arcsec]; each fit starts at its nearest point.
     callback : callable, optional
-        Receives a `Record` of stage "injection" after each.
+        Called with a `Record` of stage "injection" after each companion.
 
     Returns
     -------
     errors : (n, 3) tensor
-        In contrast, along and across the separation [rad].
+        Errors in contrast, and along and across the separation [rad].
     rows : list of dict
-        The position angle of each, and what was found.
+        Position angle of each companion, and its recovered values.
     """
     radius, raster = float(torch.linalg.vector_norm(like[1:])), step * ARCSEC
     errors: list[Tensor] = []
@@ -106,19 +107,20 @@ def injection_errors(
 
 
 def measured_companion(fit: CompanionFit, systematic: Tensor) -> dict[str, Any]:
-    """The companion of a fit with its errors, as numbers for a table.
+    """Return the companion of a fit with its errors, as numbers for a table.
 
     Parameters
     ----------
     fit : CompanionFit
+        Fit with a companion.
     systematic : (3,) tensor
-        Errors that the exposures do not show: in contrast, along and across the separation [rad].
+        Systematic errors in contrast, and along and across the separation [rad].
 
     Returns
     -------
     dict
-        `MEASURED` by name; "statistical_error", that of the exposures (jackknife, or the noise if that is more),
-        "systematic_error" and "total_error" with the same names; contrast, chi_square, exposures.
+        `MEASURED` by name; "statistical_error" (the larger of jackknife and noise), "systematic_error" and
+        "total_error" with the same names; contrast, chi_square, exposures.
     """
     n, rotation = len(fit.jackknife), rotation_towards(fit.companion)
     scatter = (fit.jackknife - fit.jackknife.mean(0)) @ rotation.T
@@ -145,7 +147,7 @@ def measured_companion(fit: CompanionFit, systematic: Tensor) -> dict[str, Any]:
 
 
 def differences_over_errors(one: dict[str, Any], other: dict[str, Any]) -> dict[str, float]:
-    """Differences of two of `measured_companion` over their errors, those of the exposures alone."""
+    """Return the differences of two results of `measured_companion` over their statistical errors."""
     found = {}
     for name in MEASURED:
         error = math.hypot(one["statistical_error"][name], other["statistical_error"][name])

@@ -1,7 +1,6 @@
-"""Star, companion, aberrations, blur and background fitted together to all exposures, by Gauss-Newton steps.
+"""Joint fit of star, companion, aberrations, blur and background to all exposures, by Gauss-Newton steps.
 
-What could be mistaken for a companion is fitted with it, so the companion's error includes what the aberrations could
-take up.
+Aberrations that could be mistaken for a companion are fitted with it, so its error includes that ambiguity.
 """
 
 from __future__ import annotations
@@ -15,21 +14,21 @@ from torchmask.interferometry.companion import OWN_MODES, CompanionModel, Exposu
 from torchmask.interferometry.companion_equations import BLUR, LeastSquares
 from torchmask.record import Brief, Callback, Record
 
-STEPS = 40  # of Gauss-Newton, at most
-TOLERANCE = 0.1  # the last one lowers the squared residuals by less, which no error bar sees
-_HALVINGS = 6  # of a step that makes the fit worse
-_CORE = 3  # pixels to each side of the middle, in which the first guess looks for the star
+STEPS = 40  # maximum number of Gauss-Newton steps
+TOLERANCE = 0.1  # decrease of the squared residuals at which the fit ends: far below the error bars
+_HALVINGS = 6  # maximum number of halvings of a step that makes the fit worse
+_CORE = 3  # pixels to each side of the middle within which the star is first sought
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CompanionFit(Brief):
-    """Where a fit ended.
+    """Result of a fit.
 
-    parameters : companion, aberrations and the rest
-    covariance : (3, 3) of the companion; residuals count with the size they have; 0 if none was fitted
-    images : (T, H, W) the model [electrons]
-    chi_square : (T,) mean squared residual of the pixels that were compared
-    jackknife : (T, 3) companion without each of the exposures, to first order
+    parameters : best-fitting parameters
+    covariance : (3, 3) covariance of the companion, scaled by the residuals; 0 if none was fitted
+    images : (T, H, W) model of the exposures [electrons]
+    chi_square : (T,) mean squared residual of the pixels compared
+    jackknife : (T, 3) companion with each of the exposures left out, to first order
     """
 
     parameters: Parameters
@@ -40,7 +39,7 @@ class CompanionFit(Brief):
 
     @property
     def companion(self) -> Tensor:
-        """(3,) contrast, east, north."""
+        """Contrast, east and north [rad] of the companion (3,)."""
         return self.parameters.companion
 
 
@@ -52,20 +51,23 @@ def fit_companion(
     steps: int = STEPS,
     callback: Callback | None = None,
 ) -> CompanionFit:
-    """The best fit of a star to its exposures; of a star and its companion if one is given to start from.
+    """Fit a star to its exposures, or a star and its companion if an estimate of the companion is given.
 
     Parameters
     ----------
     model : CompanionModel
+        Model of the exposures.
     exposures : Exposures
+        Exposures to fit.
     companion : (3,) tensor, optional
-        Contrast, east and north, within about half a resolution element of the truth, as `search_companions` finds it.
+        Initial contrast, east and north [rad], within about half a resolution element of the truth, such as from
+        `search_companions`. None: fit the star alone.
     start : Parameters, optional
-        Of an earlier fit to the same exposures; its companion does not count. None: no aberrations.
+        Initial parameters from an earlier fit to the same exposures; its companion is ignored. None: no aberrations.
     steps : int
-        Of Gauss-Newton, at most; a step that makes the fit worse is halved.
+        Maximum number of Gauss-Newton steps; a step that makes the fit worse is halved.
     callback : callable, optional
-        Receives a `Record` of stage "fit" after each step.
+        Called with a `Record` of stage "fit" after each step.
 
     Raises
     ------
@@ -126,10 +128,10 @@ def fit_companion(
 def search_companions(
     model: CompanionModel, exposures: Exposures, fit: CompanionFit, offsets: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Contrast of a companion at each of `offsets` (M, 2) [rad] and its standard error, (M,) each.
+    """Return the contrast of a companion at each of `offsets` (M, 2) [rad], and its standard error, (M,) each.
 
-    Linearised about `fit`, one without companion, or with one, beside which a second is looked for; everything but the
-    companion that is there is refitted.
+    The model is linearised about `fit`, and all parameters but a companion that `fit` already has are refitted. If it
+    has one, a second companion is searched for.
 
     The example of `fit_companion` searches before it fits.
     """
@@ -152,7 +154,7 @@ def search_companions(
 
 
 def unexplained_flux(model: CompanionModel, exposures: Exposures, fit: CompanionFit) -> float:
-    """The fraction of a pixel's flux that, added to its noise, explains the residuals of `fit`; at most 1."""
+    """Return the fraction of a pixel's flux that, added to its noise, explains the residuals of `fit`; at most 1."""
     near = exposures.valid & model.near
     squares = ((exposures.frames - fit.images) ** 2)[near]
     noise, flux = (exposures.errors**2)[near], exposures.frames.clamp(min=0)[near]
@@ -165,7 +167,7 @@ def unexplained_flux(model: CompanionModel, exposures: Exposures, fit: Companion
 
 
 def _first_guess(model: CompanionModel, exposures: Exposures) -> Parameters:
-    """No aberrations; flux, and centroid from the pixels around the middle."""
+    """Return initial parameters without aberrations, with flux and centroid from the pixels around the middle."""
     middle = [n // 2 for n in model.grid.shape]
     rows, columns = (slice(m - _CORE, m + _CORE + 1) for m in middle)
     own = torch.zeros(len(exposures.frames), 4 + model.n_subapertures * OWN_MODES, dtype=torch.float64)
@@ -180,7 +182,7 @@ def _first_guess(model: CompanionModel, exposures: Exposures) -> Parameters:
 
 
 def _summarise(problem: LeastSquares, at: Parameters) -> CompanionFit:
-    """The fit that ends here, with its errors."""
+    """Return the fit that ends at these parameters, with its errors."""
     n, exposures, model = len(at.own), problem.exposures, problem.model
     images = model.images(at, exposures.to_pixels)
     residual = (exposures.frames - images) * model.root_weights(exposures)

@@ -1,4 +1,4 @@
-"""Where to look for a companion, and how faint one would be found beside a star."""
+"""Raster of a search for companions of a star, and its detection limits."""
 
 from __future__ import annotations
 
@@ -12,17 +12,19 @@ from torch import Tensor
 from torchmask.grid import ARCSEC
 from torchmask.record import Brief
 
-SIGNIFICANCE = 5.0  # times the scatter where there is no companion: what counts as found
-_ANNULUS, _REACH = 0.1, 0.025  # [arcsec] width of an annulus, and how far its scatter is measured beyond its borders
+SIGNIFICANCE = 5.0  # in units of the scatter without a companion, above which a companion counts as detected
+_ANNULUS, _REACH = 0.1, 0.025  # [arcsec] width of an annulus, and margin around it in which scatter is measured
 
 
 def search_offsets(step: float, least: float = 0.1, most: float = 0.7) -> Tensor:
-    """Offsets (M, 2), (east, north) [rad], of a square raster between two separations.
+    """Return offsets (M, 2), (east, north) [rad], on a square raster between two separations.
 
     Parameters
     ----------
-    step, least, most : float
-        Of the raster, and the separations that bound it [arcsec].
+    step : float
+        Step of the raster [arcsec].
+    least, most : float
+        Smallest and largest separation [arcsec].
 
     Examples
     --------
@@ -39,11 +41,11 @@ def search_offsets(step: float, least: float = 0.1, most: float = 0.7) -> Tensor
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DetectionLimits(Brief):
-    """Faintest companion that would be found, by the separation of annuli around the star.
+    """Contrast of the faintest detectable companion in annuli around the star.
 
     separation : (A,) middle of each annulus [arcsec]
-    contrast : (A,) flux over that of the star
-    errors : (A,) how well each contrast is known
+    contrast : (A,) limiting flux over that of the star
+    errors : (A,) standard error of each contrast
 
     Examples
     --------
@@ -57,26 +59,26 @@ class DetectionLimits(Brief):
     errors: np.ndarray
 
     def __call__(self, offsets: Tensor) -> Tensor:
-        """Limiting contrast at offsets (..., 2) [rad], linear between annuli."""
+        """Return the limiting contrast at offsets (..., 2) [rad], interpolated linearly between annuli."""
         away = torch.linalg.vector_norm(offsets, dim=-1) / ARCSEC
         return torch.as_tensor(np.interp(away.numpy(), self.separation, self.contrast))
 
 
 def detection_limits(offsets: Tensor, contrast: Tensor) -> DetectionLimits:
-    """`SIGNIFICANCE` times the rms contrast that is found, annulus by annulus, where there is no companion.
+    """Return `SIGNIFICANCE` times the rms contrast in each annulus around a star without companion.
 
     Parameters
     ----------
     offsets : (M, 2) tensor
-        [rad], from 0.1 arcsec on and at least as dense as the annuli are wide, 0.1 arcsec.
+        Offsets [rad], from 0.1 arcsec on, with steps no larger than the width of the annuli, 0.1 arcsec.
     contrast : (M,) tensor
-        What `search_companions` finds there beside a single star.
+        Contrast that `search_companions` gives there for a single star.
 
     Returns
     -------
     DetectionLimits
-        The error of a limit is that of an rms of as many independent values as squares as wide as the annulus fit into
-        it.
+        The error of a limit is that of an rms of n independent values, with n the number of squares as wide as the
+        annulus that fit into it.
 
     Examples
     --------

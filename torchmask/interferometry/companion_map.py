@@ -1,4 +1,4 @@
-"""A companion looked for in squared visibilities and closure phases: a map, a fit, and how faint one would be found."""
+"""Search for a companion in squared visibilities and closure phases: map, fit and detection limits."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from torchmask.interferometry.pair_model import PARAMETERS, PairResiduals, squar
 from torchmask.record import Brief
 
 _PER_ELEMENT = 8  # points of the raster along the finest fringe
-_WIDEST = 25  # finest fringes from the star to the border of the raster, at most
-_STEPS = 40  # of Gauss-Newton for contrast and place
-_LEAST_CURVATURE = 1e-12  # over the largest: below, a companion's place along some direction is not told
-_CHUNK = 1024  # places at a time
+_WIDEST = 25  # maximum radius of the raster, in periods of the finest fringe
+_STEPS = 40  # maximum number of Gauss-Newton steps for contrast and position
+_LEAST_CURVATURE = 1e-12  # of the largest: below, the companion's position along some direction is unconstrained
+_CHUNK = 1024  # positions at a time
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CompanionMap(Brief):
-    """The best contrast of a companion at each of M places around a star, with its error.
+    """Best-fitting contrast of a companion at each of M positions around a star, with its error.
 
     offsets : (M, 2) east and north [rad]
-    contrast, errors : (M,) flux over that of the star, and its rms, which grows with what the best companion leaves
-        beyond the errors of the measurements
-    chi_square : (M,) with the companion
-    least_chi_square : with the best one, whose place need not be one of these
-    star_chi_square : without one
-    degrees_of_freedom : how many independent numbers were measured, less three
+    contrast : (M,) flux over that of the star
+    errors : (M,) rms error of the contrast, scaled up if the best companion leaves more than the measurement errors
+    chi_square : (M,) chi-square with the companion
+    least_chi_square : chi-square with the best companion, whose position need not be one of these
+    star_chi_square : chi-square of the star alone
+    degrees_of_freedom : number of independent measurements less three
     """
 
     offsets: Tensor
@@ -45,24 +45,24 @@ class CompanionMap(Brief):
 
     @property
     def significance(self) -> Tensor:
-        """(M,) root of what a companion takes off chi-square, over what the best one leaves of a degree of freedom.
+        """Significance (M,): root of the decrease of chi-square over the best reduced chi-square, if that is above 1.
 
-        Of faint companions that is contrast over error. Negative where the contrast is.
+        For faint companions it is contrast over error. It is negative where the contrast is.
         """
         left = _unexplained(self.least_chi_square, self.degrees_of_freedom)
         return self.contrast.sign() * ((self.star_chi_square - self.chi_square).clamp(min=0) / left).sqrt()
 
     @property
     def best(self) -> Tensor:
-        """(3,) contrast, east and north of the most significant companion of the map."""
+        """Contrast, east and north [rad] (3,) of the most significant companion of the map."""
         index = int(self.significance.argmax())
         return torch.cat([self.contrast[index, None], self.offsets[index]])
 
     def limits(self, annulus: float, significance: float = SIGNIFICANCE) -> DetectionLimits:
-        """The contrast that is `significance` errors, in rings around the star `annulus` wide [rad].
+        """Return the contrast that equals `significance` errors, in annuli of width `annulus` [rad] around the star.
 
-        The error of a limit is how much the limit differs along the ring, together with what the number of
-        measurements leaves of the error's own certainty, if residuals had to tell it.
+        The error of a limit combines its scatter within the annulus with the uncertainty of the errors themselves, if
+        they were scaled by the residuals.
         """
         away = torch.linalg.vector_norm(self.offsets, dim=1)
         ring = (away / annulus).floor().long()
@@ -79,12 +79,13 @@ class CompanionMap(Brief):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PairFit(Brief):
-    """A companion and how well the measurements tell it.
+    """Best-fitting companion with its covariance.
 
     companion : (3,) contrast, east and north [rad]
-    covariance : (3, 3), which grows with what the fit leaves beyond the errors of the measurements
-    chi_square, star_chi_square : with the companion and without
-    degrees_of_freedom : independent numbers that were measured, less three
+    covariance : (3, 3) covariance, scaled up if the fit leaves more than the measurement errors
+    chi_square : chi-square with the companion
+    star_chi_square : chi-square of the star alone
+    degrees_of_freedom : number of independent measurements less three
     """
 
     companion: Tensor
@@ -95,53 +96,56 @@ class PairFit(Brief):
 
     @property
     def significance(self) -> float:
-        """Root of what the companion takes off chi-square, over what it leaves of a degree of freedom."""
+        """Root of the decrease of chi-square over the reduced chi-square, if that is above 1."""
         left = _unexplained(self.chi_square, self.degrees_of_freedom)
         return math.sqrt(max(0.0, self.star_chi_square - self.chi_square) / left)
 
 
 def raster(measured: Measurements, least: float | None = None, most: float | None = None) -> Tensor:
-    """Offsets (M, 2), (east, north) [rad], for `map_companions`: eight along the finest fringe.
+    """Return offsets (M, 2), (east, north) [rad], for `map_companions`: eight per period of the finest fringe.
 
     Parameters
     ----------
     measured : Measurements
-    least, most : float, optional
-        Separations that bound it [rad]. None: half the finest fringe, within which contrast and separation can hardly
-        be told apart, and half the widest, since what lies beyond looks like something nearer where baselines form a
-        lattice; but no more than 25 of the finest.
+        Measurements whose baselines set the step.
+    least : float, optional
+        Smallest separation [rad]. None: half the period of the finest fringe, below which contrast and separation are
+        degenerate.
+    most : float, optional
+        Largest separation [rad]. None: half the period of the widest fringe, beyond which companions are aliased if the
+        baselines form a lattice, but at most 25 periods of the finest.
 
     Raises
     ------
     ValueError
-        Unless 0 <= least < most, and the raster has a place between them.
+        Unless 0 <= least < most, and the raster has a point between them.
     """
     least = measured.finest / 2 if least is None else least
     most = min(measured.widest / 2, _WIDEST * measured.finest) if most is None else most
     if not 0 <= least < most:
         raise ValueError(
-            f"separations from {least / ARCSEC:.4g} to {most / ARCSEC:.4g} arcsec: the first must not be negative, and "
+            f"separations from {least / ARCSEC:.4g} to {most / ARCSEC:.4g} arcsec: the first must be at least 0 and "
             "less than the second"
         )
     offsets = search_offsets(measured.finest / _PER_ELEMENT / ARCSEC, least / ARCSEC, most / ARCSEC)
     if not len(offsets):
         raise ValueError(
-            f"no place lies between {least / ARCSEC:.4g} and {most / ARCSEC:.4g} arcsec on a raster of "
-            f"{measured.finest / _PER_ELEMENT / ARCSEC:.4g} arcsec: look farther apart"
+            f"no point lies between {least / ARCSEC:.4g} and {most / ARCSEC:.4g} arcsec on a raster of "
+            f"{measured.finest / _PER_ELEMENT / ARCSEC:.4g} arcsec: give separations farther apart"
         )
     return offsets
 
 
 def map_companions(measured: Measurements, offsets: Tensor | None = None) -> CompanionMap:
-    """The best contrast of a companion at each of `offsets` (M, 2) [rad], (east, north); None: those of `raster`.
+    """Fit the contrast of a companion at each of `offsets` (M, 2) [rad], (east, north); None: those of `raster`.
 
-    Squared visibilities and closure phases count by their covariances. Where a model of a star with the best companion
-    of the map leaves more than the errors say, errors of the contrast grow with what it leaves.
+    Squared visibilities and closure phases are weighted by their covariances. If the residuals with the best companion
+    exceed the measurement errors, the errors of the contrast are scaled up accordingly.
 
     Raises
     ------
     ValueError
-        If fewer numbers were measured than a companion has, 3.
+        If there are fewer than 3 independent measurements, as a companion has 3 parameters.
 
     Examples
     --------
@@ -169,24 +173,25 @@ def map_companions(measured: Measurements, offsets: Tensor | None = None) -> Com
 
 
 def fit_pair(measured: Measurements, start: Tensor, steps: int = _STEPS) -> PairFit:
-    """The companion (3,) that explains the measurements best, from one within half the finest fringe of it.
+    """Fit a companion to the measurements, from a start within half the finest fringe of it.
 
     Parameters
     ----------
     measured : Measurements
+        Squared visibilities and closure phases.
     start : (3,) tensor
-        Contrast, east and north [rad], as `CompanionMap.best`.
+        Initial contrast, east and north [rad], such as `CompanionMap.best`.
     steps : int
-        Of Gauss-Newton, at most; a step that makes the fit worse is halved.
+        Maximum number of Gauss-Newton steps; a step that makes the fit worse is halved.
 
     Raises
     ------
     ValueError
-        If fewer numbers were measured than a companion has, 3, or all baselines lie along one line.
+        If there are fewer than 3 independent measurements, or all baselines have the same direction.
 
     Examples
     --------
-    Closure phases of three triangles tell where a faint companion is, as a start near it is enough:
+    Closure phases of three triangles are enough to locate a faint companion, if the start is near it:
 
     >>> from torchmask.interferometry.measurements import Measurements
     >>> from torchmask.interferometry.pair_model import pair_visibilities
@@ -205,7 +210,7 @@ def fit_pair(measured: Measurements, start: Tensor, steps: int = _STEPS) -> Pair
     values, vectors = torch.linalg.eigh(slopes.T @ slopes)
     if not values[0] > _LEAST_CURVATURE * values[-1]:
         raise ValueError(
-            "the measurements do not tell where a companion is: they need baselines in more than one direction"
+            "the measurements do not constrain a companion's position: baselines in more than one direction are needed"
         )
     scale = _unexplained(square(residual), freedom)
     covariance = scale * (vectors / values) @ vectors.T * problem.unit[:, None] * problem.unit

@@ -1,4 +1,4 @@
-"""The fringes of all baselines fitted together to each frame, with the covariance that noise leaves."""
+"""Joint fit of the fringes of all baselines to each frame, with the covariance of their noise."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from torchmask.interferometry.visibilities import fringe_waves, pairs_and_triang
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.pixel import PixelResponse
 
-_FIELD = 4  # the envelope of the fringes is computed on a field this many times as wide, against its wrap-around
-_WORST_CONDITION = 1e6  # of the normal equations of the fringes
-_DARKEST = 1e-3  # of the largest noise variance: no pixel counts as less noisy than this
+_FIELD = 4  # width of the field for the fringes' envelope, relative to the frames, to avoid wrap-around
+_WORST_CONDITION = 1e6  # maximum condition number of the normal equations of the fringes
+_DARKEST = 1e-3  # minimum noise variance of a pixel, relative to the largest
 
 
 @dataclass(frozen=True, eq=False)
 class FringeFit:
-    """The fringes of T frames: K = 1 + 2 B parameters each, the light and the fringes' real and imaginary parts.
+    """Fitted fringes of T frames, with K = 1 + 2 B parameters: total light, and real and imaginary parts of B fringes.
 
-    values : (T, K) [electrons]
-    covariance : (T, K, K), by the noise of the pixels
-    cubes : (T, 1 + C) complex, what that noise adds to the cube of the light and to the product of the fringes of each
-        triangle, on average
+    values : (T, K) parameters [electrons]
+    covariance : (T, K, K) covariance from the noise of the pixels
+    cubes : (T, 1 + C) complex, mean bias by that noise of the cube of the light and of the product of the fringes of
+        each triangle
     """
 
     values: Tensor
@@ -34,27 +34,27 @@ class FringeFit:
 
     @property
     def light(self) -> Tensor:
-        """(T,)"""
+        """Total light of each frame (T,) [electrons]."""
         return self.values[:, 0]
 
     @property
     def fringes(self) -> Tensor:
-        """(T, B) complex."""
+        """Complex fringes (T, B) [electrons]."""
         return as_complex(self.values[:, 1:])
 
     @property
     def fringe_noise(self) -> Tensor:
-        """(T, B) mean square of what noise adds to a fringe."""
+        """Noise variance of each complex fringe (T, B)."""
         return torch.stack(self.covariance.diagonal(dim1=1, dim2=2)[:, 1:].chunk(2, 1)).sum(0)
 
 
 @dataclass(frozen=True, eq=False)
 class PixelNoise:
-    """The noise of each pixel of the frames (T, H, W).
+    """Noise of each pixel of the frames (T, H, W).
 
-    variance : [electrons^2]; it may be negative where it is an unbiased estimate
-    is_own : whether it is counted from the pixel's own light, with whose noise it then goes up and down
-    light : [electrons], whose third central moment is that of the noise, as that of a Poisson variable is its mean
+    variance : variance [electrons^2], which may be negative if it is an unbiased estimate
+    is_own : whether the variance is estimated from the pixel's own light, and thus correlated with its noise
+    light : light [electrons], which equals the third central moment of the noise, as for a Poisson variable
     """
 
     variance: Tensor
@@ -63,16 +63,16 @@ class PixelNoise:
 
     @property
     def third(self) -> Tensor:
-        """What the triple product of estimates needs once the products with their covariances have been taken off.
+        """Correction of triple products that remains after subtracting the products of values and covariances.
 
-        E(xyz) - XYZ = X cov(y, z) + Y cov(x, z) + Z cov(x, y) + third moment. Measured values in place of X, Y and Z
-        and a measured covariance whose noise goes with theirs take off three covariances (v, x) too many.
+        E(xyz) - XYZ = X cov(y, z) + Y cov(x, z) + Z cov(x, y) + third moment. With measured values for X, Y and Z and
+        a measured covariance that is correlated with their noise, three covariances (v, x) are subtracted too much.
         """
         return 3 * self.variance - self.light if self.is_own else -self.light
 
 
 class FringeModel:
-    """The pattern of light and fringes of a mask, under the diffraction pattern of one hole and seen by pixels."""
+    """Linear model of a mask's fringes, with the diffraction pattern of one hole as envelope and the pixels' blur."""
 
     aperture: Aperture
     grid: Grid
@@ -90,15 +90,15 @@ class FringeModel:
         self._seen = None if pixel is None else pixel.transfer(self._nu_y, self._nu_x)
 
     def blur(self, image: Tensor) -> Tensor:
-        """An image (H, W), dark outside, through one hole."""
+        """Blur an image (H, W), dark outside, by the diffraction pattern of one hole."""
         height, width = self.grid.shape
         wide = torch.fft.ifft2(torch.fft.fft2(image, s=self._wide.shape) * self._transfer).real
         return wide[:height, :width]
 
     def centre(self, image: Tensor) -> tuple[float, float]:
-        """(x, y) where an image, blurred by one hole, is brightest: to a fraction of a pixel, by a parabola.
+        """Return the peak (x, y) of an image blurred by one hole, relative to [H // 2, W // 2] [pixel].
 
-        In pixels from [H // 2, W // 2].
+        A parabola gives it to a fraction of a pixel.
         """
         blurred = self.blur(image)
         row, column = divmod(int(blurred.argmax()), self.grid.shape[1])
@@ -112,10 +112,10 @@ class FringeModel:
         return offsets[0], offsets[1]
 
     def columns(self, x: float, y: float) -> Tensor:
-        """(K, P): frame = columns^T (light, real and imaginary parts of the fringes), around (x, y) [pixel].
+        """Return the matrix (K, P) of frame = columns^T (light, real and imaginary parts), around (x, y) [pixel].
 
-        A fringe of frequency nu, envelope(x) 2 Re(fringe exp(2 pi i nu . x)), goes through the pixels' response with
-        its envelope, so that patches of frequencies are seen as a whole.
+        The pixels' response is applied to the fringe of frequency nu including its envelope,
+        envelope(x) 2 Re(fringe exp(2 pi i nu . x)), and so to its whole patch of frequencies.
         """
         height, width = self.grid.shape
         ramp = -2 * math.pi * (self._nu_x * (x + width // 2) + self._nu_y * (y + height // 2))
@@ -131,7 +131,7 @@ class FringeModel:
         return torch.cat([light[None], 2 * fringes.real, -2 * fringes.imag])
 
     def _wide_waves(self) -> list[tuple[Tensor, Tensor]]:
-        """exp(2 pi i nu . x) of every baseline on the wide field, as a factor for its rows and one for its columns."""
+        """Return exp(2 pi i nu . x) of every baseline on the wide field, factored into rows and columns."""
         centers = self.aperture.centers.detach().double().cpu()
         nu = (centers[self.pairs[:, 1]] - centers[self.pairs[:, 0]]) / self.grid.period
         places = [
@@ -145,19 +145,20 @@ class FringeModel:
         return [(wave(float(v) * places[0]), wave(float(u) * places[1])) for u, v in nu]
 
     def _through_pixels(self, wide: Tensor) -> Tensor:
-        """(P,) of an image on the wide field."""
+        """Return the pixel values (P,) of an image on the wide field."""
         height, width = self.grid.shape
         assert self._seen is not None
         return torch.fft.ifft2(torch.fft.fft2(wide) * self._seen)[:height, :width].flatten()
 
 
 def fit_fringes(frames: Tensor, valid: Tensor, noise: PixelNoise, model: FringeModel) -> FringeFit:
-    """Weighted least squares over the valid pixels of each of `frames` (T, H, W), all centred where their mean is.
+    """Fit fringes by weighted least squares to the valid pixels of each of `frames` (T, H, W).
 
-    A centre of its own would follow the noise of a faint frame. Weights are one over the variance of the mean frame,
-    blurred by one hole: weights that know the noise of a pixel would prefer the low ones.
+    All frames share the centre of their mean, as the centre of a single faint frame would follow its noise. Weights are
+    one over the variance of the mean frame, blurred by one hole: weights correlated with the noise of a pixel would
+    favour low values and bias the fit.
 
-    Raises ValueError if two baselines lie too close together to be told apart.
+    Raises ValueError if two baselines are too similar to be separated.
     """
     columns = model.columns(*model.centre(frames.mean(0)))
     weights = _weights(noise.variance, valid, model)
@@ -176,13 +177,16 @@ def fit_fringes(frames: Tensor, valid: Tensor, noise: PixelNoise, model: FringeM
 
 
 def as_complex(parts: Tensor) -> Tensor:
-    """(..., B) complex from (..., 2 B) real and imaginary parts."""
+    """Return complex numbers (..., B) from real and imaginary parts (..., 2 B)."""
     real, imaginary = parts.chunk(2, -1)
     return torch.complex(real, imaginary)
 
 
 def complex_covariances(covariance: Tensor, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """E(f g) and E(f g*) of the fringes number `first` and `second` (M,), both (T, M), from `covariance` (T, K, K)."""
+    """Return E(f g) and E(f g*), both (T, M), of the noise of fringes `first` and `second` (M,).
+
+    `covariance` (T, K, K) is that of the parameters.
+    """
     size = covariance.shape[-1] // 2
     real, imaginary = slice(1, 1 + size), slice(1 + size, None)
     rr, ii = covariance[:, real, real][:, first, second], covariance[:, imaginary, imaginary][:, first, second]
@@ -191,7 +195,7 @@ def complex_covariances(covariance: Tensor, first: Tensor, second: Tensor) -> tu
 
 
 def _weights(variance: Tensor, valid: Tensor, model: FringeModel) -> Tensor:
-    """(P,) one over the variance of a pixel of the mean frame."""
+    """Return weights (P,), one over the variance of a pixel of the mean frame."""
     counted = valid.double().mean(0)
     mean = torch.where(valid, variance, 0.0).mean(0)
     smooth = model.blur(mean) / model.blur(counted).clamp(min=torch.finfo(torch.float64).tiny)
@@ -200,20 +204,20 @@ def _weights(variance: Tensor, valid: Tensor, model: FringeModel) -> Tensor:
 
 
 def _estimator(columns: Tensor, weights: Tensor, model: FringeModel) -> Tensor:
-    """(K, P): parameters = estimator frame."""
+    """Return the matrix (K, P) for which parameters = estimator @ frame."""
     weighted = columns * weights
     normal = weighted @ columns.T
     values = torch.linalg.eigvalsh(normal)
     if not values[0] * _WORST_CONDITION > values[-1]:
         raise ValueError(
-            f"the fringes of some of the {len(model.pairs)} baselines cannot be told apart: {_closest(model.aperture)};"
+            f"the fringes of some of the {len(model.pairs)} baselines cannot be separated: {_closest(model.aperture)};"
             " use restored_observables, a mask without redundant baselines or a wider field"
         )
     return torch.linalg.solve(normal, weighted)
 
 
 def _cubes(estimator: Tensor, third: Tensor, model: FringeModel) -> Tensor:
-    """(T, 1 + C) sums over the pixels of the product of three estimators and `third` (T, P)."""
+    """Return the sums (T, 1 + C) over the pixels of the product of three estimators and `third` (T, P)."""
     light, fringes = estimator[0], as_complex(estimator[1:].T).T
     one, two, three = triangle_sides(model.pairs, model.triangles)
     of_light = third @ light**3
@@ -225,7 +229,7 @@ def _cubes(estimator: Tensor, third: Tensor, model: FringeModel) -> Tensor:
 
 
 def _closest(aperture: Aperture) -> str:
-    """Words for the two baselines, of either direction, that lie closest together."""
+    """Describe the two baselines, of either direction, that are closest to each other."""
     centers = aperture.centers.detach().double()
     pairs, _ = pairs_and_triangles(aperture)
     baselines = centers[pairs[:, 1]] - centers[pairs[:, 0]]

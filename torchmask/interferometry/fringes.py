@@ -1,4 +1,4 @@
-"""Visibilities and closure phases straight from the frames, by a fit of all fringes, freed of what noise adds."""
+"""Visibilities and closure phases from frames by a fit of all fringes, corrected for the bias by noise."""
 
 from __future__ import annotations
 
@@ -20,41 +20,40 @@ from torchmask.optics.pixel import PixelResponse
 
 
 def frame_observables(observation: Observation, pixel: PixelResponse | None = None) -> Observables:
-    """Visibilities and closure phases straight from the frames, without a restoration.
+    """Measure visibilities and closure phases directly on the frames, without a restoration.
 
-    In each frame the fringes of all baselines are fitted together, by least squares over the valid pixels weighed by
-    their noise, under the diffraction pattern of one hole: this averages the frame's Fourier transform over each
-    baseline's patch. Products are then averaged over the frames, so that pistons cancel in |V|^2 and closure phases.
+    In each frame the fringes of all baselines are fitted jointly, by least squares over the valid pixels weighted by
+    their noise, with the diffraction pattern of one hole as envelope: this averages the frame's Fourier transform over
+    each baseline's patch. Products are then averaged over the frames; pistons cancel in |V|^2 and closure phases.
 
     Parameters
     ----------
     observation : Observation
-        Of a mask of two holes or more whose baselines can be told apart. Subtract the sky beforehand: it counts as
-        light without fringes. Where its `readout_noise` is None it is measured, beyond the cut-off frequency.
+        Observation with a mask of at least two holes whose baselines are distinct. Subtract the sky beforehand, as it
+        counts as light without fringes. If its `readout_noise` is None, it is measured beyond the cut-off frequency.
     pixel : PixelResponse, optional
-        How the detector's pixels blur the image, which lowers the fringes of long baselines most. None: pixels are
-        points.
+        Blur by the detector's pixels, which lowers the fringes of long baselines most. None: pixels are points.
 
     Returns
     -------
     Observables
-        As measured: not calibrated for what lowers the contrast of a point source (band width, motion within an
-        exposure, aberrations within a hole): `Observables.calibrate` divides by a star. Variances are the larger of
-        the scatter over the frames and of the noise (`errors`, or photon and read-out noise) carried through the fit,
-        correlations are the mean of both, weighed as so many frames as there are observables count for the noise.
+        Raw values, not calibrated for effects that lower the contrast of a point source (band width, motion within an
+        exposure, aberrations within a hole); `Observables.calibrate` divides by a star. Variances are the larger of
+        the scatter over the frames and the noise (`errors`, or photon and read-out noise) propagated through the fit;
+        correlations are the mean of both, in which the noise has the weight of as many frames as there are observables.
 
     Raises
     ------
     ValueError
-        If the aperture has fewer than two sub-apertures, two baselines lie too close together for this field and
-        band to tell, a frame is refused by `check_frames`, or the read-out noise is neither known nor measurable.
+        If the aperture has fewer than two sub-apertures, two baselines are too similar to be separated with this field
+        and band, `check_frames` rejects a frame, or the read-out noise is neither known nor measurable.
 
     Notes
     -----
-    The light's and the fringes' variances are subtracted from their squares, and of products of three all that the
-    noise of the pixels adds on average (Wirnitzer 1985, J. Opt. Soc. Am. A 2, 14, for photon noise): no mean is biased
-    by noise, however few the photons. All frames are centred where their mean is. What lies at an angle s from there
-    is dimmed as the overlap of a hole's diffraction pattern with itself shifted by s: a companion must lie well within
+    The variances of light and fringes are subtracted from their squares, and the mean contribution of the pixels' noise
+    from triple products (Wirnitzer 1985, J. Opt. Soc. Am. A 2, 14, for photon noise), so that means are unbiased even
+    for few photons. All frames share the centre of their mean. Light at an angle s from it is attenuated by the overlap
+    of a hole's diffraction pattern with itself shifted by s, so a companion must be well within
     wavelength / (hole diameter).
 
     Examples
@@ -95,7 +94,7 @@ def frame_observables(observation: Observation, pixel: PixelResponse | None = No
 
 
 def _pixel_noise(observation: Observation, frames: Tensor, valid: Tensor) -> PixelNoise:
-    """The noise of frames (T, H, W), without bias where it is counted from the frames themselves."""
+    """Return the noise of frames (T, H, W), unbiased if it is estimated from the frames themselves."""
     if observation.errors is not None:
         return PixelNoise(observation.errors.double().cpu() ** 2, is_own=False, light=frames)
     readout = observation.readout_noise
@@ -103,7 +102,7 @@ def _pixel_noise(observation: Observation, frames: Tensor, valid: Tensor) -> Pix
         measured = noise_variance(frames, observation.grid, observation.aperture, valid)
         if measured is None:
             raise ValueError(
-                "readout_noise is None, and the grid has no frequencies beyond the cut-off to measure it at: give it "
+                "readout_noise is None, and the grid has no frequencies beyond the cut-off to measure it: give it "
                 "[electrons rms], or errors"
             )
         readout = max(0.0, measured - float(frames.mean())) ** 0.5
@@ -111,7 +110,7 @@ def _pixel_noise(observation: Observation, frames: Tensor, valid: Tensor) -> Pix
 
 
 def _squares(fit: FringeFit, n_holes: int) -> tuple[Tensor, Tensor]:
-    """|V|^2 (B,) and its covariance (B, B)."""
+    """Return |V|^2 (B,) and its covariance (B, B)."""
     squares = fit.values**2 - fit.covariance.diagonal(dim1=1, dim2=2)
     light = squares[:, :1]
     real, imaginary = squares[:, 1:].chunk(2, 1)
@@ -123,13 +122,13 @@ def _squares(fit: FringeFit, n_holes: int) -> tuple[Tensor, Tensor]:
     noise = torch.zeros_like(each)
     for values, covariance in zip(fit.values, fit.covariance, strict=True):
         slopes = weights * values
-        # the slopes' own noise counts 4 tr(M C M C) too many, of which 2 tr(M C M C) belong there
+        # the noise of the slopes adds 4 tr(M C M C), of which only 2 tr(M C M C) are part of the variance
         noise += 4 * slopes @ covariance @ slopes.T - 2 * weights @ covariance**2 @ weights.T
     return ratio, _covariance(power - ratio * light, noise) / light.sum() ** 2
 
 
 def _triples(fit: FringeFit, model: FringeModel, n_holes: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Triple products (C,) complex, and the covariances (C, C) of their amplitudes and phases."""
+    """Return complex triple products (C,), and the covariances (C, C) of their amplitudes and of their phases."""
     sides = triangle_sides(model.pairs, model.triangles)
     first, second, third = sides
     a, b, c = fit.fringes[:, first], fit.fringes[:, second], fit.fringes[:, third].conj()
@@ -152,10 +151,10 @@ def _triples(fit: FringeFit, model: FringeModel, n_holes: int) -> tuple[Tensor, 
 def _triple_noise(
     fit: FringeFit, sides: tuple[Tensor, Tensor, Tensor], turn: Tensor, n_holes: int
 ) -> tuple[Tensor, Tensor]:
-    """Covariances (C, C), summed over frames, that the noise leaves along the mean triple products and across them.
+    """Return covariances (C, C) by noise, summed over frames, along the mean triple products and across them.
 
-    To first order, which is right for bright frames; where the noise is as strong as the fringes, variances are set
-    right by what independent fringes of the same power and noise have.
+    They are to first order, which is accurate for bright frames; where the noise is as strong as the fringes, variances
+    are replaced by those of independent fringes of the same power and noise.
     """
     n_triangles, size = len(turn), fit.fringes.shape[1]
     rows = torch.arange(n_triangles)
@@ -181,10 +180,10 @@ def _triple_noise(
 
 
 def _covariance(rest: Tensor, noise: Tensor) -> Tensor:
-    """Covariance (M, M) of sums over frames: their scatter, `rest` (T, M), or `noise` (M, M) where that is more.
+    """Return the covariance (M, M) of sums over frames, from their scatter `rest` (T, M), or `noise` (M, M) if larger.
 
-    Few frames leave a covariance that is singular and full of chance. As a prior the noise's correlations count like M
-    frames.
+    The sample covariance of few frames is singular and noisy, so the correlations of the noise enter as a prior with
+    the weight of M frames.
     """
     n, size = rest.shape
     variance = noise.diagonal()
@@ -202,9 +201,9 @@ def _correlation(covariance: Tensor) -> Tensor:
 
 
 def _ratio(values: Tensor, scale: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-    """sum(values) / sum(scale) over frames and its error: scatter over the frames or noise, whichever is larger.
+    """Return sum(values) / sum(scale) over frames and its error, the larger of scatter over the frames and noise.
 
-    values (T, M) complex; scale (T,) positive; noise (T, M) the variance of a real part.
+    `values` (T, M) are complex, `scale` (T,) is positive, `noise` (T, M) is the variance of a real part.
     """
     total = scale.sum()
     ratio = values.sum(0) / total

@@ -1,6 +1,6 @@
-"""Squared visibilities and closure phases as a list of numbers on the sky, whichever instrument measured them.
+"""Squared visibilities and closure phases of any instrument, as lists of numbers with baselines on the sky.
 
-Signs as in `torchmask.interferometry.observables`.
+Signs are those of `torchmask.interferometry.observables`.
 """
 
 from __future__ import annotations
@@ -13,21 +13,23 @@ from torch import Tensor
 
 from torchmask.record import Brief
 
-SAME = 1e-3  # relative: baselines of one array, which lies otherwise on the sky from one star to the next, and colours
+SAME = 1e-3  # relative tolerance for equal baselines and wavelengths, as an array's projection differs between stars
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Measurements(Brief):
-    """B squared visibilities and C closure phases, each on baselines and at a wavelength of its own.
+    """B squared visibilities and C closure phases, each with its own baselines and wavelength.
 
     baselines : (B, 2) u and v, towards east and north [m]
-    wavelengths : (B,) [m]
-    vis2, vis2_errors : (B,) |V|^2 and its rms
-    vis2_correlation : (B, B), or None if the errors are independent
-    triangles : (C, 2, 2) first and second baseline of each triangle; the third leads back [m]
-    triangle_wavelengths : (C,) [m]
-    closure_phases, closure_errors : (C,) [rad]
-    closure_correlation : (C, C), or None if the errors are independent
+    wavelengths : (B,) wavelength of each squared visibility [m]
+    vis2 : (B,) squared visibilities |V|^2
+    vis2_errors : (B,) their rms errors
+    vis2_correlation : (B, B) correlation of the errors, or None if they are independent
+    triangles : (C, 2, 2) first and second baseline of each triangle [m]; the third closes it
+    triangle_wavelengths : (C,) wavelength of each closure phase [m]
+    closure_phases : (C,) closure phases [rad]
+    closure_errors : (C,) their rms errors [rad]
+    closure_correlation : (C, C) correlation of the errors, or None if they are independent
 
     Raises ValueError if they disagree in shape, are not finite, or a wavelength or an error is not positive.
 
@@ -73,32 +75,32 @@ class Measurements(Brief):
 
     @property
     def frequencies(self) -> Tensor:
-        """(B, 2) of the baselines [cycles per radian]."""
+        """Spatial frequencies (B, 2) of the baselines [cycles per radian]."""
         return self.baselines / self.wavelengths[:, None]
 
     @property
     def triangle_frequencies(self) -> Tensor:
-        """(C, 3, 2) of the three baselines of every triangle [cycles per radian]; they add up to 0."""
+        """Spatial frequencies (C, 3, 2) of the three baselines of every triangle [cycles per radian], of sum 0."""
         sides = torch.cat([self.triangles, -self.triangles.sum(1, keepdim=True)], 1)
         return sides / self.triangle_wavelengths[:, None, None]
 
     @property
     def finest(self) -> float:
-        """Wavelength over the longest baseline, the least of all measurements [rad]."""
+        """Smallest wavelength over baseline length of all measurements [rad]."""
         return 1 / float(self._lengths().max())
 
     @property
     def widest(self) -> float:
-        """Wavelength over the shortest baseline, the largest of all measurements [rad]."""
+        """Largest wavelength over baseline length of all measurements [rad]."""
         return 1 / float(self._lengths().min())
 
     def _lengths(self) -> Tensor:
-        """Of all baselines [cycles per radian]."""
+        """Moduli of the spatial frequencies of all baselines [cycles per radian]."""
         every = torch.cat([self.frequencies, self.triangle_frequencies.flatten(0, 1)])
         return torch.linalg.vector_norm(every, dim=1)
 
     def closures_only(self) -> Measurements:
-        """The closure phases alone, which need no calibration of the contrast."""
+        """Return the closure phases alone, which need no calibration of the contrast."""
         none = slice(0, 0)
         return replace(
             self,
@@ -110,9 +112,9 @@ class Measurements(Brief):
         )
 
     def calibrate(self, star: Measurements) -> Measurements:
-        """These, divided by those of a star that is a point, with the errors of both.
+        """Calibrate with the measurements of an unresolved star, and propagate the errors of both.
 
-        |V|^2 is divided by the star's, closure phases are subtracted. Directions on the sky stay those of the object.
+        |V|^2 is divided by the star's, and its closure phases are subtracted. Baselines are those of the object.
 
         Raises ValueError if the star was not seen on the same baselines and at the same wavelengths in the same order,
         or shows no fringes on one of them.
@@ -142,7 +144,7 @@ class Measurements(Brief):
 
 
 def join(measurements: Sequence[Measurements]) -> Measurements:
-    """All of them as one, those of different ones taken as independent. Raises ValueError if there is none."""
+    """Join sets of measurements, with independent errors between sets. Raises ValueError if there are none."""
     if not measurements:
         raise ValueError("measurements is empty: give at least one")
     names = ("baselines", "wavelengths", "vis2", "vis2_errors")
@@ -156,7 +158,7 @@ def join(measurements: Sequence[Measurements]) -> Measurements:
 
 
 def correlation(covariance: Tensor) -> Tensor | None:
-    """Of a covariance (M, M) with a positive diagonal; None if nothing in it is correlated."""
+    """Return the correlation of a covariance (M, M) with a positive diagonal; None if that is diagonal."""
     scale = covariance.diagonal().rsqrt()
     found = covariance * scale[:, None] * scale
     return None if bool((found == found.diagonal().diag()).all()) else found
@@ -177,7 +179,7 @@ def _require_same(seen: Measurements, star: Measurements) -> None:
         lengths = [torch.linalg.vector_norm(getattr(each, name), dim=-1) for each in (seen, star)]
         if lengths[0].shape != lengths[1].shape or not torch.allclose(*lengths, rtol=SAME, atol=0):
             raise ValueError(
-                f"the star was seen otherwise: its {len(star.vis2)} baselines and {len(star.closure_phases)} triangles "
-                f"and the {len(seen.vis2)} and {len(seen.closure_phases)} of the object must be the same, at the same "
-                "wavelengths, in the same order"
+                f"the star was observed differently: its {len(star.vis2)} baselines and {len(star.closure_phases)} "
+                f"triangles and the {len(seen.vis2)} and {len(seen.closure_phases)} of the object must be the same, at "
+                "the same wavelengths, in the same order"
             )

@@ -1,4 +1,4 @@
-"""What an interferometer measures, for every baseline and triangle of a mask.
+"""Interferometric observables of every baseline and triangle of a mask.
 
 Signs, as in OIFITS (Pauls et al. 2005, PASP 117, 1255; Duvert et al. 2017, A&A 597, A8): the visibility of a brightness
 I(E, N), east and north in radians, on the baseline (u, v) metres is
@@ -25,14 +25,17 @@ class Observables(Brief):
     """Visibilities of B = N (N - 1) / 2 baselines and closure phases of C = N (N - 1) (N - 2) / 6 triangles.
 
     pairs : (B, 2) holes i < j of each baseline
-    triangles : (C, 3) holes i < j < k
+    triangles : (C, 3) holes i < j < k of each triangle
     stations : (N, 2) centres of the holes, (u, v) towards east and north [m]
-    visibilities : (B,) complex; from frames, pistons and all
-    visibility_errors : (B,) rms of the amplitude, and of the phase times the amplitude
-    vis2, vis2_covariance : (B,) and (B, B), |V|^2
-    closure_phases, closure_covariance : (C,) rad and (C, C); triangles share baselines, so it has no inverse from four
-        holes on unless each triangle has noise of its own
-    triple_amplitudes, triple_covariance : (C,) and (C, C), |V_ij V_jk V_ki|
+    visibilities : (B,) complex visibilities, which include pistons if measured on frames
+    visibility_errors : (B,) rms error of the amplitude, and of the phase times the amplitude
+    vis2 : (B,) squared visibilities |V|^2
+    vis2_covariance : (B, B) covariance of |V|^2
+    closure_phases : (C,) closure phases [rad]
+    closure_covariance : (C, C) covariance of the closure phases; triangles share baselines, so that for four or more
+        holes it is singular unless each triangle has independent noise
+    triple_amplitudes : (C,) amplitudes |V_ij V_jk V_ki|
+    triple_covariance : (C, C) covariance of the triple amplitudes
 
     Examples
     --------
@@ -59,26 +62,26 @@ class Observables(Brief):
 
     @property
     def vis2_errors(self) -> Tensor:
-        """(B,) rms of |V|^2."""
+        """Rms errors of |V|^2 (B,)."""
         return self.vis2_covariance.diagonal().sqrt()
 
     @property
     def closure_errors(self) -> Tensor:
-        """(C,) rms of the closure phases [rad]."""
+        """Rms errors of the closure phases (C,) [rad]."""
         return self.closure_covariance.diagonal().sqrt()
 
     @property
     def triple_errors(self) -> Tensor:
-        """(C,) rms of the amplitudes of triple products."""
+        """Rms errors of the triple amplitudes (C,)."""
         return self.triple_covariance.diagonal().sqrt()
 
     @property
     def baselines(self) -> Tensor:
-        """(B, 2) (u, v) of each pair [m]."""
+        """Baseline (u, v) of each pair (B, 2) [m]."""
         return self.stations[self.pairs[:, 1]] - self.stations[self.pairs[:, 0]]
 
     def measurements(self, wavelength: float) -> Measurements:
-        """What of these a model of the object is compared with, as `load_oifits` reads it from a file.
+        """Return |V|^2 and closure phases as `Measurements`, as `load_oifits` reads them from a file.
 
         Raises ValueError if the wavelength [m] or an error is not positive.
         """
@@ -97,21 +100,21 @@ class Observables(Brief):
         )
 
     def calibrate(self, star: Observables) -> Observables:
-        """These, divided by those of a star that is a point: what lowers the contrast of both alike drops out.
+        """Calibrate with the observables of an unresolved star, which removes losses of contrast common to both.
 
-        |V|^2 and triple amplitudes are divided by the star's, closure phases are subtracted, complex visibilities are
-        divided, which is of use only where pistons stay as they are. Errors and covariances of both add up, to first
-        order. Directions on the sky stay those of the object.
+        |V|^2 and triple amplitudes are divided by the star's, and its closure phases are subtracted. Complex
+        visibilities are divided too, which is meaningful only for stable pistons. Errors and covariances of both are
+        propagated to first order. Directions on the sky are those of the object.
 
         Parameters
         ----------
         star : Observables
-            Of an unresolved star through the same mask and band, by the same function.
+            Observables of an unresolved star with the same mask and band, by the same function.
 
         Raises
         ------
         ValueError
-            If the star was seen through another mask, or shows no fringes on some baseline.
+            If the star was observed with another mask, or has no fringes on some baseline.
 
         Examples
         --------
@@ -160,6 +163,6 @@ class Observables(Brief):
 
 
 def _divide(values: Tensor, covariance: Tensor, by: Tensor, by_covariance: Tensor) -> tuple[Tensor, Tensor]:
-    """values / by (M,) and its covariance (M, M), to first order."""
+    """Return values / by (M,) and its covariance (M, M), to first order."""
     ratio, outer = values / by, by[:, None] * by
     return ratio, (covariance + ratio[:, None] * ratio * by_covariance) / outer

@@ -1,6 +1,6 @@
-"""Visibilities and closure phases as an OIFITS file, which interferometry's own programs read.
+"""Write visibilities and closure phases to OIFITS files, for other programs of interferometry.
 
-The second version of the standard (Duvert, Young & Hummel 2017, A&A 597, A8), one row of OI_ARRAY per hole.
+Files follow version 2 of the standard (Duvert, Young & Hummel 2017, A&A 597, A8), with one row of OI_ARRAY per hole.
 """
 
 from __future__ import annotations
@@ -34,26 +34,28 @@ def save_oifits(
     Parameters
     ----------
     path : str or Path
-        Ends in .fits or .oifits. The file appears whole or not at all, and never replaces another.
+        Name of the new file, which ends in .fits or .oifits. Existing files are not overwritten, and a file that cannot
+        be written completely is not left behind.
     observables : Observables
-        From `frame_observables` or `restored_observables`.
+        Result of `frame_observables` or `restored_observables`.
     observation : Observation
-        That they come from. Its header tells target, telescope, date and orientation; without sky coordinates u runs
-        along the columns and v along the rows of the image, and a COMMENT says so.
+        Observation that they come from. Its header gives target, telescope, date and orientation; without sky
+        coordinates u is along the columns and v along the rows of the image, and a COMMENT says so.
     bandwidth : float, optional
         Width of the band [m], EFF_BAND. None: that of the header's FILTER, if it is known.
 
     Raises
     ------
     ValueError
-        If the band's width is neither given nor known, the observables belong to another mask, or the file exists,
-        its folder does not, or its name is wrong.
+        If the width of the band is neither given nor known, the observables belong to another mask, the file exists,
+        its folder does not exist, or its name has another ending.
 
     Notes
     -----
-    Signs as in `torchmask.interferometry.visibilities`. STA_INDEX counts holes from 1, in the order of the centres;
-    U1COORD, V1COORD belong to the first pair of a triangle (i, j), U2COORD, V2COORD to the second (j, k). STAXYZ are
-    the holes' places in the pupil, towards east and north, FRAME = 'SKY'. What is not finite is flagged.
+    Signs are those of `torchmask.interferometry.observables`. STA_INDEX counts holes from 1, in the order of the
+    centres; U1COORD, V1COORD belong to the first pair of a triangle (i, j), U2COORD, V2COORD to the second (j, k).
+    STAXYZ are the holes' positions in the pupil, towards east and north, FRAME = 'SKY'. Values that are not finite are
+    flagged.
 
     Examples
     --------
@@ -80,7 +82,7 @@ def save_oifits(
     if bandwidth is None:
         band = filter_of_header(header)
         if band is None:
-            raise ValueError("the width of the band is not known (no FILTER that is): give bandwidth [m]")
+            raise ValueError("the header has no known FILTER, which gives the width of the band: give bandwidth [m]")
         bandwidth = band.width
     if not (math.isfinite(bandwidth) and bandwidth > 0):
         raise ValueError(f"bandwidth is {bandwidth}: it must be finite and positive, in m")
@@ -102,7 +104,7 @@ def save_oifits(
 
 
 def _measurements(observables: Observables, common: Mapping[str, str], mjd: float, seconds: float) -> list[Any]:
-    """OI_VIS, OI_VIS2 and, for three holes or more, OI_T3."""
+    """Return the tables OI_VIS, OI_VIS2 and, for three holes or more, OI_T3."""
     values, errors = observables.visibilities, observables.visibility_errors
     u, v = observables.baselines.T
     uv = {"UCOORD": ("1D", "m", u), "VCOORD": ("1D", "m", v)}
@@ -115,7 +117,7 @@ def _measurements(observables: Observables, common: Mapping[str, str], mjd: floa
     }
     vis2 = {"VIS2DATA": ("1D", None, observables.vis2), "VIS2ERR": ("1D", None, observables.vis2_errors)}
     absolute, correlated = {"AMPTYP": "absolute", "PHITYP": "absolute"}, {**common, "CORRNAME": _CORRELATIONS}
-    n, first = len(pairs), len(pairs) + len(triangles)  # data that stand before those of a table in OI_CORR
+    n, first = len(pairs), len(pairs) + len(triangles)  # number of data before those of a table in OI_CORR
     tables = [
         _table("OI_VIS", {**common, **absolute}, _rows(vis, uv, pairs, mjd, seconds)),
         _table("OI_VIS2", correlated, _rows(vis2, uv | _places_of("VIS2DATA", 0, n), pairs, mjd, seconds)),
@@ -136,12 +138,12 @@ def _measurements(observables: Observables, common: Mapping[str, str], mjd: floa
 
 
 def _places_of(name: str, before: int, count: int) -> dict[str, Any]:
-    """The column that says where data stand in OI_CORR."""
+    """Return the column with the indices of data in OI_CORR."""
     return {f"CORRINDX_{name}": ("1J", None, np.arange(before + 1, before + 1 + count, dtype=np.int32))}
 
 
 def _correlations(observables: Observables) -> Any:
-    """OI_CORR of |V|^2, triple amplitudes and closure phases."""
+    """Return the table OI_CORR of |V|^2, triple amplitudes and closure phases."""
     covariances = (observables.vis2_covariance, observables.triple_covariance, observables.closure_covariance)
     i, j, values = correlation_triplets(covariances)
     columns = {"IINDX": ("1J", None, i), "JINDX": ("1J", None, j), "CORR": ("1D", None, values)}
@@ -152,7 +154,7 @@ def _correlations(observables: Observables) -> Any:
 def _rows(
     measured: dict[str, Any], places: dict[str, Any], holes: Tensor, mjd: float, seconds: float
 ) -> dict[str, Any]:
-    """The columns that all tables of measurements share, around their own."""
+    """Return the columns of a table of measurements: those that all tables share, around its own."""
     n = len(holes)
     bad = ~np.all([np.isfinite(as_array(values)) for _, _, values in measured.values()], axis=0)
     return {
@@ -168,19 +170,19 @@ def _rows(
 
 
 def _spectrum(values: Any) -> np.ndarray:
-    """(n, 1): one value per wavelength, and one wavelength."""
+    """Return values as (n, 1), with one column for the single wavelength."""
     return as_array(values)[:, None]
 
 
 def _table(name: str, cards: Mapping[str, Any], columns: Mapping[str, tuple[str, str | None, Any]]) -> Any:
-    """A binary table from {column: (format, unit, values)}, of the second revision."""
+    """Return a binary table of revision 2 from {column: (format, unit, values)}."""
     with extra("oifits"):
         from astropy.io import fits
 
     arrays = {column: (code, unit, as_array(values)) for column, (code, unit, values) in columns.items()}
     table = fits.BinTableHDU.from_columns(
         [
-            # without TDIM, readers take a spectrum of one wavelength for a plain number
+            # without TDIM, readers take a spectrum of one wavelength for a scalar
             fits.Column(
                 name=column, format=code, unit=unit, array=values, dim="(1)" if values.shape[1:] == (1,) else None
             )
@@ -243,7 +245,7 @@ def _target(header: Mapping[str, Any]) -> Any:
 
 
 def _array(observables: Observables, observation: Observation) -> Any:
-    """One row per hole; the field of view is the width of a hole's diffraction pattern."""
+    """Return OI_ARRAY with one row per hole; the field of view is the width of a hole's diffraction pattern."""
     n, aperture = len(observables.stations), observation.aperture
     names = [f"H{index + 1}" for index in range(n)]
     places = np.concatenate([as_array(observables.stations), np.zeros((n, 1))], axis=1)
@@ -269,7 +271,7 @@ def _text(header: Mapping[str, Any], name: str) -> str:
 
 
 def _date(header: Mapping[str, Any]) -> tuple[str, float]:
-    """Date and time (ISO) and MJD of the observation: MJD-AVG, MJD-OBS or DATE-OBS; MJD 0 where nothing is known."""
+    """Return date and time (ISO) and MJD of the observation, from MJD-AVG, MJD-OBS or DATE-OBS, or else MJD 0."""
     with extra("oifits"):
         from astropy.time import Time
 
@@ -286,5 +288,5 @@ def _date(header: Mapping[str, Any]) -> tuple[str, float]:
         try:
             time = Time(text)
         except ValueError as error:
-            raise ValueError(f"DATE-OBS is {text!r}, which is no date") from error
+            raise ValueError(f"DATE-OBS is {text!r}: a date such as 2025-01-31 is needed") from error
     return time.isot[:19], float(time.mjd)

@@ -1,7 +1,7 @@
-"""OI_CORR, the table of an OIFITS file that says which errors go together.
+"""OI_CORR, the table of an OIFITS file with the correlations of errors.
 
-A matrix for all data of a file: a row for each pair of them that is correlated. Each row of a table of measurements
-says where its first wavelength stands in that matrix, counted from 1 (CORRINDX_...).
+It is a sparse matrix for all data of a file, with a row for each correlated pair. Each row of a table of measurements
+has the index of its first wavelength in that matrix, counted from 1 (CORRINDX_...).
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import torch
 from torch import Tensor
 
 Triplets = tuple[np.ndarray, np.ndarray, np.ndarray]  # IINDX, JINDX and CORR
-_NO_INDEX = 0  # a row whose data have no place in the matrix
+_NO_INDEX = 0  # for a row whose data are not in the matrix
 
 
 def correlation_triplets(covariances: Sequence[Tensor]) -> Triplets:
-    """IINDX < JINDX, counted from 1, and CORR of several (M, M) covariances, one after the other.
+    """Return IINDX < JINDX, counted from 1, and CORR of several (M, M) covariances, one after the other.
 
-    What is not finite is left out.
+    Correlations that are not finite are left out.
     """
     first, rows, columns, values = 1, [], [], []
     for covariance in covariances:
@@ -37,7 +37,7 @@ def correlation_triplets(covariances: Sequence[Tensor]) -> Triplets:
 
 
 def read_correlations(hdus: Any) -> dict[str, Triplets]:
-    """IINDX, JINDX and CORR of every OI_CORR by its CORRNAME."""
+    """Read IINDX, JINDX and CORR of every OI_CORR, by its CORRNAME."""
     found = {}
     for hdu in hdus:
         if hdu.name == "OI_CORR":
@@ -47,7 +47,7 @@ def read_correlations(hdus: Any) -> dict[str, Triplets]:
 
 
 def correlation_of(names: np.ndarray, places: np.ndarray, triplets: Mapping[str, Triplets]) -> Tensor | None:
-    """(M, M) of data that stand at `places` (M,) of the matrices called `names` (M,); None if none is correlated."""
+    """Return the correlation (M, M) of data at indices `places` (M,) of matrices `names` (M,); None if independent."""
     matrix = torch.eye(len(places), dtype=torch.float64)
     correlated = False
     for name, (i, j, values) in triplets.items():

@@ -1,6 +1,6 @@
-"""OIFITS files of this library and of other instruments, read back as a list of measurements.
+"""Read OIFITS files of this library and of other instruments as measurements.
 
-First and second version of the standard (Pauls et al. 2005, PASP 117, 1255; Duvert et al. 2017, A&A 597, A8).
+Versions 1 and 2 of the standard are read (Pauls et al. 2005, PASP 117, 1255; Duvert et al. 2017, A&A 597, A8).
 """
 
 from __future__ import annotations
@@ -22,11 +22,13 @@ _SHARED_SIDE = 1 / 3  # correlation of two closure phases that share a baseline,
 
 @dataclass(frozen=True)
 class _Rows:
-    """Measurements of all tables of a kind, a row for each number: `columns` (M, ...), and what says where it is from.
+    """Measurements of all tables of a kind, with a row for each number.
 
-    stations : (M, 2 or 3), -1 where unknown
+    columns : (M, ...) values
+    stations : (M, 2 or 3) stations of the baseline or triangle, -1 where unknown
     exposure : (M, 3) number of its table, time and wavelength
-    corrname, place : (M,) where the number stands in which matrix of correlations; 0 if nowhere
+    corrname : (M,) name of the number's matrix of correlations
+    place : (M,) index in that matrix, 0 if it is in none
     """
 
     columns: dict[str, np.ndarray]
@@ -38,29 +40,29 @@ class _Rows:
 
 
 def load_oifits(path: str | Path, target: str | None = None) -> Measurements:
-    """Squared visibilities and closure phases of an OIFITS file, with the correlations of their errors.
+    """Read squared visibilities and closure phases of an OIFITS file, with the correlations of their errors.
 
     Parameters
     ----------
     path : str or Path
-        Of one or more instruments, times and wavelengths.
+        OIFITS file, with one or more instruments, times and wavelengths.
     target : str, optional
-        Which one is meant, where the file holds several.
+        Name of the target, for a file with several.
 
     Returns
     -------
     Measurements
-        Of OI_VIS2 and OI_T3, table by table, row by row and wavelength by wavelength, but for what is flagged or not
-        finite or has no positive error. Correlations are those of OI_CORR. Closure phases without it count as sums of
-        phases of baselines that are all as noisy: where two triangles share a baseline their correlation is 1/3, or
-        -1/3 if they run along it in opposite directions. Taken as independent they would count several times, since
-        only (N - 1)(N - 2)/2 of N holes' N (N - 1)(N - 2)/6 are.
+        Values of OI_VIS2 and OI_T3, ordered by table, row and wavelength, without those that are flagged, are not
+        finite or have no positive error. Correlations are those of OI_CORR. Without it, closure phases are taken as
+        sums of phases of equally noisy baselines: if two triangles share a baseline their correlation is 1/3, or -1/3
+        if they traverse it in opposite directions. As independent values they would be counted several times, since
+        only (N - 1)(N - 2)/2 of the N (N - 1)(N - 2)/6 closure phases of N holes are independent.
 
     Raises
     ------
     ValueError
-        If the file is missing or no OIFITS, a table lacks a column or its OI_WAVELENGTH, it holds several targets and
-        none is named or that one is not there, or nothing is left.
+        If the file is missing or is not OIFITS, a table lacks a column or its OI_WAVELENGTH, the target is not in the
+        file or not named although there are several, or no valid measurement is left.
 
     Examples
     --------
@@ -92,7 +94,7 @@ def load_oifits(path: str | Path, target: str | None = None) -> Measurements:
         with fits.open(path, memmap=False) as hdus:
             return _read(path, hdus, target)
     except (OSError, TypeError, KeyError) as error:
-        raise ValueError(f"{path} is no OIFITS file, or is damaged: {error}") from error
+        raise ValueError(f"{path} is not an OIFITS file, or is damaged: {error}") from error
 
 
 def _read(path: Path, hdus: Any, target: str | None) -> Measurements:
@@ -107,7 +109,7 @@ def _read(path: Path, hdus: Any, target: str | None) -> Measurements:
     sides = ("U1COORD", "V1COORD", "U2COORD", "V2COORD")
     t3 = _gather(path, hdus, "OI_T3", ("T3PHI", "T3PHIERR"), sides, chosen, waves)
     if not len(vis2.wavelength) and not len(t3.wavelength):
-        raise ValueError(f"{path} holds no squared visibility and no closure phase that is finite and not flagged")
+        raise ValueError(f"{path} has no squared visibility and no closure phase that is finite and not flagged")
     closure_correlation = correlation_of(t3.corrname, t3.place, triplets)
     return Measurements(
         baselines=_tensor(vis2, "UCOORD", "VCOORD"),
@@ -124,12 +126,12 @@ def _read(path: Path, hdus: Any, target: str | None) -> Measurements:
 
 
 def _target_number(path: Path, hdus: Any, target: str | None) -> int | None:
-    """TARGET_ID of the target that is meant; None if the file names none."""
+    """Return the TARGET_ID of the target; None if the file names none."""
     tables = [hdu.data for hdu in hdus if hdu.name == "OI_TARGET"]
     names = {str(row["TARGET"]).strip(): int(row["TARGET_ID"]) for table in tables for row in table}
     if target is not None:
         if target not in names:
-            raise ValueError(f"{path} has no target {target!r}: it holds {', '.join(names) or 'none with a name'}")
+            raise ValueError(f"{path} has no target {target!r}: it has {', '.join(names) or 'none with a name'}")
         return names[target]
     if len(names) > 1:
         raise ValueError(f"{path} holds several targets: say which of {', '.join(names)} is meant")
@@ -145,14 +147,14 @@ def _gather(
     target: int | None,
     waves: dict[str, np.ndarray],
 ) -> _Rows:
-    """All good numbers of the tables of a kind; `measured` names those of values and errors."""
+    """Read all valid numbers of the tables of a kind; `measured` names the columns of values and errors."""
     parts: list[_Rows] = []
     for hdu in hdus:
         if hdu.name != kind:
             continue
         instrument = str(hdu.header["INSNAME"]).strip()
         if instrument not in waves:
-            raise ValueError(f"{path}: {kind} is of {instrument}, for which there is no OI_WAVELENGTH")
+            raise ValueError(f"{path}: {kind} is of instrument {instrument}, which has no OI_WAVELENGTH")
         parts.append(_good_rows(hdu, len(parts), measured, places, target, waves[instrument]))
     if not parts:
         none = np.zeros(0)
@@ -180,7 +182,7 @@ def _good_rows(
         good &= np.asarray(data["TARGET_ID"]).reshape(-1, 1) == target
 
     def spread(column: Any) -> np.ndarray:
-        """Of the rows, for each good number."""
+        """Return a column's value of the row of each valid number."""
         return np.broadcast_to(np.asarray(column).reshape(-1, 1), shape)[good]
 
     columns = {measured[0]: values[good], measured[1]: errors[good]}
@@ -198,7 +200,7 @@ def _good_rows(
 
 
 def _shared_sides(rows: _Rows) -> Tensor | None:
-    """(C, C) correlation of closure phases that are sums of phases of equally noisy baselines; None if none share."""
+    """Return the correlation (C, C) of closure phases with equally noisy baselines; None if no baseline is shared."""
     matrix = np.eye(len(rows.wavelength))
     _, group = np.unique(rows.exposure, axis=0, return_inverse=True)
     for number in range(group.max(initial=-1) + 1):

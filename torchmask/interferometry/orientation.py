@@ -1,4 +1,4 @@
-"""How a mask lies, told by where fringes have their power: the pistons of turbulence drop out of it."""
+"""Orientation of a mask from the power of its fringes, which does not depend on the pistons of turbulence."""
 
 from __future__ import annotations
 
@@ -13,38 +13,38 @@ from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture, SparseAperture
 from torchmask.optics.geometry import MaskGeometry
 
-_FINENESS = 4  # of the frequencies, against those of the frames
-_TURNS = 181  # tried over half a turn: the other half looks the same
+_FINENESS = 4  # oversampling of the frequencies relative to those of the frames
+_TURNS = 181  # number of rotations tried over 180 degrees: the other half looks the same
 _SCALES = (0.95, 0.96, 0.97, 0.98, 0.99, 1.0, 1.01, 1.02, 1.03, 1.04, 1.05)
-_ALIKE = 0.05  # in the mean logarithm of the fringes' power: less tells nothing against less of a turn, or none
+_ALIKE = 0.05  # difference in the mean logarithm of the power below which the smaller rotation is preferred
 
 
 class FirstLook(NamedTuple):
-    """The geometry, to about a degree and a percent, and whether a mirrored mask would look otherwise."""
+    """The geometry, to about a degree and a percent, and whether a mirrored mask would look different."""
 
     geometry: MaskGeometry
     mirror_seen: bool
 
 
 def mean_power(frames: Tensor, centers: Tensor, grid: Grid) -> Tensor:
-    """Power |DFT|^2 of frames (T, H, W), averaged over them, at the B baselines of `centers` (..., N, 2) [m]."""
+    """Return the power |DFT|^2, averaged over frames (T, H, W), at the B baselines of `centers` (..., N, 2) [m]."""
     fine = tuple(_FINENESS * side for side in frames.shape[-2:])
     power = (torch.fft.fft2(frames, s=fine).abs() ** 2).mean(0)
     power = torch.cat([power, power[:1]])
-    power = torch.cat([power, power[:, :1]], 1)  # the torus, with its seam on both sides
+    power = torch.cat([power, power[:, :1]], 1)  # periodic, with the seam on both sides
     n = centers.shape[-2]
     i, j = torch.triu_indices(n, n, 1).unbind()
     nu = (centers[..., i, :] - centers[..., j, :]) / grid.period
-    places = 2 * (nu - nu.floor()) - 1  # (x, y) in [-1, 1], as grid_sample counts
+    places = 2 * (nu - nu.floor()) - 1  # (x, y) in [-1, 1], the convention of grid_sample
     places = places.reshape(1, -1, 1, 2).to(power)
     sampled = torch.nn.functional.grid_sample(power[None, None], places, align_corners=True)
     return sampled.flatten().view(nu.shape[:-1])
 
 
 def first_look(frames: Tensor, centers: Tensor, grid: Grid) -> FirstLook:
-    """The turn, mirror and magnification under which the fringes of a star's frames (T, H, W) have most power.
+    """Return rotation, mirror and magnification with the most power at the baselines in a star's frames (T, H, W).
 
-    Of geometries that explain the power alike, as those of a symmetric mask, the one that is nearest to what is told.
+    Among geometries that explain the power equally well, as for a symmetric mask, it is the one nearest to the given.
     """
     turns = [math.pi * (k / (_TURNS - 1) - 0.5) for k in range(_TURNS)]
     tried = [
@@ -75,12 +75,12 @@ _OTHERS = {
     "turned by 90 degrees": MaskGeometry(math.pi / 2),
 }
 _AT_A_TIME = 32  # frames
-_CERTAIN = 2.0  # standard errors, from which a correlation is no accident
-_SEEN = 2.0  # standard errors of the noise's power, above which a frequency tells something
+_CERTAIN = 2.0  # standard errors above which a correlation is significant
+_SEEN = 2.0  # standard errors of the noise's power above which a frequency has a signal
 
 
 def warn_of_orientation(frames: Tensor, aperture: Aperture, grid: Grid) -> None:
-    """Warn the caller's caller as `orientation_warning` says; a full pupil and two holes have nothing to be seen by."""
+    """Issue the warning of `orientation_warning`, if any; a full pupil and two holes do not show an orientation."""
     if isinstance(aperture, SparseAperture) and aperture.n_subapertures > 2:
         message = orientation_warning(frames.double(), aperture, grid)
         if message is not None:
@@ -88,13 +88,13 @@ def warn_of_orientation(frames: Tensor, aperture: Aperture, grid: Grid) -> None:
 
 
 def orientation_warning(frames: Tensor, aperture: SparseAperture, grid: Grid) -> str | None:
-    """What is wrong if the power of frames (T, H, W) fits another orientation of the mask better; None if nothing is.
+    """Return a warning if the power of frames (T, H, W) fits another orientation of the mask better, or else None.
 
-    Power that fringes bring stands where the mask has baselines, whatever the object: its logarithm over frequencies,
-    without its trend along the radius, correlates with that of the power a point source would have. The standard error
-    of such a correlation over N (N - 1) patches is (N (N - 1))^(-1/2). Another orientation is told if its correlation
-    is above twice that and better than the given one's by more than that. A turn by 180 degrees, and a mirror of
-    symmetric baselines, change nothing there.
+    Fringes have power at the mask's baselines for any object: its logarithm over frequencies, without the radial trend,
+    correlates with that of a point source. The standard error of this correlation over N (N - 1) patches is
+    (N (N - 1))^(-1/2). The warning names another orientation if its correlation exceeds twice this error and that of
+    the given orientation by more than that. Rotations by 180 degrees, and mirrors of symmetric baselines, have no
+    effect on the power.
     """
     nu_y, nu_x = grid.frequencies(torch.float64, frames.device)
     radius = torch.hypot(nu_y, nu_x)
@@ -127,21 +127,21 @@ def orientation_warning(frames: Tensor, aperture: SparseAperture, grid: Grid) ->
     error = (n * (n - 1)) ** -0.5
     if others[name] > max(told + error, _CERTAIN * error):
         return (
-            f"the fringes of the frames fit the mask better {name} than as told (correlation {others[name]:.2f} "
-            f"against {told:.2f}): check how it lies, or measure it by calibrate_mask on frames of a star"
+            f"the fringes of the frames fit the mask better {name} than as given (correlation {others[name]:.2f} "
+            f"instead of {told:.2f}): check its orientation, or measure it with calibrate_mask on frames of a star"
         )
     return None
 
 
 def _without_trend(values: Tensor, trend: Tensor) -> Tensor:
-    """Values (P,) without what columns (P, K) explain of them."""
+    """Return values (P,) minus their least-squares fit by the columns (P, K)."""
     return values - trend @ torch.linalg.lstsq(trend, values[:, None]).solution[:, 0]
 
 
 def _fringe_power(aperture: SparseAperture, grid: Grid) -> Tensor:
-    """(H, W) sum of |OTF|^2 over the pairs of holes, as independent pistons leave it.
+    """Return the sum (H, W) of |OTF|^2 over the pairs of holes, its mean for independent pistons.
 
-    One patch convolved with all baselines, whose transform is |sum of exp(2 pi i x . nu_m)|^2 - N.
+    It is one patch convolved with all baselines, whose transform is |sum of exp(2 pi i x . nu_m)|^2 - N.
     """
     nu_y, nu_x = grid.frequencies(torch.float64, aperture.centers.device)
     shift = torch.stack(torch.broadcast_tensors(nu_x, nu_y), -1) * grid.period

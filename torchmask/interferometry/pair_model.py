@@ -1,8 +1,8 @@
-"""A star and its companion as visibilities, and how measurements of them differ from the model.
+"""Visibility model of a star and its companion, and residuals of measurements from it.
 
-A star of flux 1 and a companion of flux c at (east, north) show the visibility V = (1 + c exp(-2 pi i f . s)) / (1 + c)
-at the frequency f = (u, v) / wavelength (Berger & Segransan 2007, New Astronomy Reviews 51, 576). Contrasts below 0
-are what noise makes of none.
+A star of flux 1 and a companion of flux c at s = (east, north) have the visibility
+V = (1 + c exp(-2 pi i f . s)) / (1 + c) at the frequency f = (u, v) / wavelength (Berger & Segransan 2007, New
+Astronomy Reviews 51, 576). Contrasts below 0 are allowed, as noise can give them where there is no companion.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ from torch import Tensor
 from torchmask.interferometry.measurements import Measurements
 
 PARAMETERS = 3  # of a companion: contrast, east and north
-_FAINTEST, _BRIGHTEST = -0.5, 0.98  # contrasts of a map; at 1 no measurement changes with the contrast
-_STEPS = 12  # of Gauss-Newton for the contrast at each place
-_HALVINGS = 20  # of a step that makes a fit worse
-_ENOUGH = 1e-6  # chi-square gained for each measurement: the end of a fit
-_LEAST_EIGENVALUE = 1e-6  # of a correlation matrix, over its largest: below, measurements say nothing new
+_FAINTEST, _BRIGHTEST = -0.5, 0.98  # range of contrasts of a map; at 1 the derivatives in the contrast vanish
+_STEPS = 12  # number of Gauss-Newton steps for the contrast at each position
+_HALVINGS = 20  # maximum number of halvings of a step that makes a fit worse
+_ENOUGH = 1e-6  # decrease of chi-square per measurement at which a fit ends
+_LEAST_EIGENVALUE = 1e-6  # of a correlation matrix, over its largest: below, measurements are redundant
 
 
 def pair_visibilities(frequencies: Tensor, companion: Tensor) -> Tensor:
-    """(..., F) complex, of a star and its companion (..., 3) at frequencies (F, 2) [cycles per radian].
+    """Return complex visibilities (..., F) of a star and companion (..., 3) at frequencies (F, 2) [cycles per radian].
 
     Examples
     --------
-    A companion as bright as the star, half a fringe away, leaves nothing:
+    A companion as bright as the star, half a fringe away, cancels the fringe:
 
     >>> place = torch.tensor([1.0, 5e-7, 0.0], dtype=torch.float64)
     >>> found = pair_visibilities(torch.tensor([[1e6, 0.0]], dtype=torch.float64), place)
@@ -39,10 +39,10 @@ def pair_visibilities(frequencies: Tensor, companion: Tensor) -> Tensor:
 
 
 class PairResiduals:
-    """Residuals of measurements in units of their errors, without what their correlations make superfluous."""
+    """Whitened residuals of measurements, from which redundant combinations of correlated ones are removed."""
 
     size: int
-    unit: Tensor  # (3,) of a companion: contrast, and the finest fringe
+    unit: Tensor  # (3,) units of a companion's parameters: contrast 1, and the finest fringe
 
     def __init__(self, measured: Measurements) -> None:
         self._seen = measured
@@ -53,18 +53,18 @@ class PairResiduals:
         self.size = self._vis2.shape[1] + self._closures.shape[1]
         if self.size < PARAMETERS:
             raise ValueError(
-                f"{self.size} independent numbers were measured: a companion's contrast and place need {PARAMETERS}"
+                f"there are {self.size} independent measurements: a companion's contrast and position need {PARAMETERS}"
             )
 
     def residuals(self, companion: Tensor) -> Tensor:
-        """(..., K) measured less model, of companions (..., 3)."""
+        """Return whitened differences (..., K) of measurements and model, for companions (..., 3)."""
         vis2, phases = self._model(companion)
         away = self._seen.closure_phases - phases
         away = torch.atan2(away.sin(), away.cos())
         return torch.cat([(self._seen.vis2 - vis2) @ self._vis2, away @ self._closures], -1)
 
     def slopes(self, companion: Tensor) -> Tensor:
-        """(K, 3) of the whitened model by the companion (3,)."""
+        """Return derivatives (K, 3) of the whitened model in the companion (3,)."""
         (of_vis2, vis2_turns), (of_phases, phase_turns) = self._slopes(companion)
         sides = phase_turns[:, None] * self._sides
         vis2 = torch.cat([of_vis2[:, None], vis2_turns[:, None] * self._frequencies], 1)
@@ -72,7 +72,7 @@ class PairResiduals:
         return torch.cat([self._vis2.T @ vis2, self._closures.T @ phases])
 
     def descend(self, start: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-        """Gauss-Newton from a companion (3,), to the best one near it; with its residuals (K,)."""
+        """Fit a companion by Gauss-Newton steps from `start` (3,); return it and its residuals (K,)."""
         found, residual = start, self.residuals(start)
         for _ in range(steps):
             slopes = self.slopes(found) * self.unit
@@ -92,7 +92,7 @@ class PairResiduals:
         return found, residual
 
     def best_contrasts(self, offsets: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Contrast, its error and chi-square (M,) at offsets (M, 2), by Gauss-Newton from no companion."""
+        """Fit the contrast at offsets (M, 2), starting from 0; return contrast, error and chi-square, (M,) each."""
         companion = torch.cat([offsets.new_zeros(len(offsets), 1), offsets], 1)
         for step in range(_STEPS + 1):
             (of_vis2, _), (of_phases, _) = self._slopes(companion)
@@ -110,10 +110,10 @@ class PairResiduals:
         return vis2, sides.unflatten(-1, (-1, 3)).prod(-1).angle()
 
     def _slopes(self, companion: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
-        """Of |V|^2 (..., B), and of the phases of all sides of triangles (..., 3 C): by the contrast, and by what the
-        frequency is multiplied with.
+        """Return derivatives of |V|^2 (..., B), and of the phases of all sides of triangles (..., 3 C).
 
-        In closed form: differentiating complex numbers forwards takes far longer than computing them.
+        They are those in the contrast, and the factor of the frequency in those in the position. Closed forms are used
+        because forward differentiation of complex numbers takes far longer.
         """
         c = companion[..., :1]
         turns = 2 * math.pi * (companion[..., 1:] @ self._frequencies.T)
@@ -126,12 +126,12 @@ class PairResiduals:
 
 
 def square(residual: Tensor) -> float:
-    """Chi-square of residuals (K,)."""
+    """Return the chi-square of residuals (K,)."""
     return float(residual.square().sum())
 
 
 def _whitening(errors: Tensor, correlation: Tensor | None) -> Tensor:
-    """(M, K), K <= M: what turns residuals (..., M) into independent ones of variance 1."""
+    """Return the matrix (M, K), K <= M, that turns residuals (..., M) into independent ones of unit variance."""
     if correlation is None:
         return (1 / errors).diag()
     values, vectors = torch.linalg.eigh(correlation)

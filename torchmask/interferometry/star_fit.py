@@ -1,4 +1,4 @@
-"""Aberrations of every frame of a star, and what all frames share, fitted together by Gauss-Newton steps."""
+"""Joint fit of the aberrations of every frame of a star and of shared parameters, by Gauss-Newton steps."""
 
 from __future__ import annotations
 
@@ -9,20 +9,21 @@ from torch import Tensor
 
 from torchmask.interferometry.star_model import MAP, PLACE, Shared, StarModel
 
-_STEPS = 30  # of each fit, at most
-_ENOUGH = 0.01  # a step that promises to lower the squared residuals by less is the last: no error bar sees it
-_HALVINGS = 8  # of a step that makes the fit worse
-_DAMPING = (1e-3, 1e8)  # of Levenberg and Marquardt: the first, and the one at which a frame rests
-_LOOSE = (10.0, 3.0)  # [rad] rms that pistons and tilts, and higher modes may have: holds what nothing else holds
-_EVEN = 1e-3  # rms of the mean of the logarithms of transmissions, which the light of the frames holds as well
+_STEPS = 30  # maximum number of steps of each fit
+_ENOUGH = 0.01  # predicted decrease of the squared residuals at which a fit ends: far below the error bars
+_HALVINGS = 8  # maximum number of halvings of a step that makes the fit worse
+_DAMPING = (1e-3, 1e8)  # Levenberg-Marquardt damping: initial value, and value at which a frame's fit ends
+_LOOSE = (10.0, 3.0)  # [rad] prior rms of pistons and tilts, and of higher modes: loose, for what data do not constrain
+_EVEN = 1e-3  # prior rms of the mean log transmission, which is degenerate with the light of the frames
 
 
 @dataclass(frozen=True, eq=False)
 class StarFit:
-    """Where a fit stands.
+    """Present state of a fit.
 
-    own : (T, 2 + N J) parameters of the frames; shared : those of all
-    images : (T, pixels) the model
+    own : (T, 2 + N J) parameters of each frame
+    shared : parameters shared by all frames
+    images : (T, pixels) model of the frames
     """
 
     own: Tensor
@@ -32,11 +33,12 @@ class StarFit:
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """What frames tell of the shared parameters once their own ones are fitted.
+    """Fisher information of the frames on the shared parameters, marginal over each frame's own parameters.
 
-    matrices : (T, S, S) of each frame; scores : (T, S) half the slopes of its squared residuals, downwards
-    own_covariances : (T, K, K) of the own parameters if the shared ones are known
-    prior : (S, S) of what is held besides
+    matrices : (T, S, S) information of each frame
+    scores : (T, S) minus half the gradient of its squared residuals
+    own_covariances : (T, K, K) covariance of the own parameters for known shared ones
+    prior : (S, S) information of the prior
     """
 
     matrices: Tensor
@@ -46,12 +48,12 @@ class Information:
 
     @property
     def noise_covariance(self) -> Tensor:
-        """(S, S) that the noise of the pixels leaves."""
+        """Covariance (S, S) from the noise of the pixels."""
         return torch.linalg.inv(self.matrices.sum(0) + self.prior)
 
     @property
     def covariance(self) -> Tensor:
-        """(S, S) from how much the frames disagree (a sandwich estimate), as soon as there are several."""
+        """Covariance (S, S) from the scatter between frames (sandwich estimate), or from noise for a single frame."""
         bread, n = self.noise_covariance, len(self.scores)
         return bread if n == 1 else bread @ (self.scores.T @ self.scores) @ bread * (n / (n - 1))
 
@@ -59,11 +61,11 @@ class Information:
 def start_frame(
     model: StarModel, frame: Tensor, weight: Tensor, shared: Shared, kernels: tuple[Tensor, Tensor]
 ) -> Tensor:
-    """Own parameters (2 + N J,) of a frame (pixels,) without aberrations but the pistons its fringes tell.
+    """Return initial parameters (2 + N J,) of a frame (pixels,), with pistons from its fringes as only aberrations.
 
-    At the baseline of holes m and n a frame carries exp(i (phase_n - phase_m)): the phases of the leading eigenvector
-    of the matrix of all pairs agree best with all of them (angular synchronisation; Singer, Appl. Comput. Harmon. Anal.
-    30, 20, 2011).
+    At the baseline of holes m and n a frame has the phasor exp(i (phase_n - phase_m)); the phases of the leading
+    eigenvector of the matrix of all pairs agree best with all of them (angular synchronisation; Singer, Appl. Comput.
+    Harmon. Anal. 30, 20, 2011).
     """
     carrier = kernels[1]
     counts = weight > 0
@@ -82,7 +84,7 @@ def start_frame(
 def fit_frame(
     model: StarModel, frame: Tensor, weight: Tensor, own: Tensor, shared: Shared, kernels: tuple[Tensor, Tensor]
 ) -> Tensor:
-    """Own parameters (2 + N J,) that fit a frame (pixels,) best, by the method of Levenberg and Marquardt."""
+    """Fit the own parameters (2 + N J,) of a frame (pixels,) by the Levenberg-Marquardt method."""
     hold, damping = _hold(model), _DAMPING[0]
 
     def cost(own: Tensor) -> float:
@@ -108,7 +110,7 @@ def fit_frame(
 
 
 def fit_together(model: StarModel, frames: Tensor, weights: Tensor, fit: StarFit) -> tuple[StarFit, Information]:
-    """The best fit of everything to `frames` (T, pixels) whose pixels count with `weights` (T, pixels)."""
+    """Fit all parameters jointly to `frames` (T, pixels) with `weights` (T, pixels)."""
     cost = _cost(model, frames, weights, fit)
     for _ in range(_STEPS):
         step, steps, promised, information = _step(model, frames, weights, fit)
@@ -127,7 +129,7 @@ def fit_together(model: StarModel, frames: Tensor, weights: Tensor, fit: StarFit
 
 
 def evaluate(model: StarModel, own: Tensor, shared: Shared) -> StarFit:
-    """The images of these parameters with them."""
+    """Return the fit with these parameters and their images."""
     kernels = model.kernels(shared.matrix)
     return StarFit(own, shared, torch.stack([model.image(row, shared, kernels) for row in own]))
 
@@ -138,9 +140,9 @@ def _cost(model: StarModel, frames: Tensor, weights: Tensor, fit: StarFit) -> fl
 
 
 def _step(model: StarModel, frames: Tensor, weights: Tensor, fit: StarFit) -> tuple[Tensor, Tensor, float, Information]:
-    """Steps of the shared parameters (S,) and of the frames' own ones (T, K), what they promise, and what is known.
+    """Return steps of shared (S,) and own (T, K) parameters, the predicted decrease of the cost, and the information.
 
-    The own parameters of a frame are eliminated from its normal equations (the Schur complement).
+    The own parameters of a frame are eliminated from its normal equations (Schur complement).
     """
     hold, kernels = _hold(model), model.kernels(fit.shared.matrix)
     matrices, scores, back, ahead, known, promised = [], [], [], [], [], 0.0
@@ -168,7 +170,7 @@ def _step(model: StarModel, frames: Tensor, weights: Tensor, fit: StarFit) -> tu
 
 
 def _hold(model: StarModel) -> Tensor:
-    """Inverse variances of what is expected of a frame's own parameters, (2 + N J,)."""
+    """Return the prior's inverse variances (2 + N J,) of a frame's own parameters."""
     low, high = _LOOSE
     modes = torch.full((model.n_modes,), high**-2, dtype=torch.float64)
     modes[:3] = low**-2

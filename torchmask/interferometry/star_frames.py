@@ -1,4 +1,4 @@
-"""The pixels around a star in its frames, and whether it is one."""
+"""Cut-outs around a star from its frames, and a test that it is a point source."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ from torch import Tensor
 from torchmask.grid import Grid
 from torchmask.interferometry.orientation import mean_power
 
-_LEAST_CONTRAST = 0.05  # squared visibility of a star, through turbulence that is twice too strong for the holes
+_LEAST_CONTRAST = 0.05  # squared visibility of a star through turbulence with r0 of half a hole's diameter
 
 
 @dataclass(frozen=True, eq=False)
 class StarFrames:
-    """Squares of pixels around a star.
+    """Square cut-outs around a star.
 
-    pixels : (T, S, S) electrons; counted : (T, S, S) bool, False where a pixel is not valid or lies beyond the frame
-    middles : (T, 2) place (x, y) of the squares' middles from pixel [H // 2, W // 2]
+    pixels : (T, S, S) electrons
+    counted : (T, S, S) bool, False where a pixel is not valid or is outside the frame
+    middles : (T, 2) position (x, y) of the middle of each square relative to pixel [H // 2, W // 2] [pixel]
     """
 
     pixels: Tensor
@@ -27,7 +28,7 @@ class StarFrames:
 
     @classmethod
     def around(cls, frames: Tensor, valid: Tensor, reach: int) -> StarFrames:
-        """Squares of 2 reach + 1 pixels around the brightest place of frames (T, H, W)."""
+        """Cut out squares of 2 reach + 1 pixels around the brightest position of frames (T, H, W)."""
         blur = 2 * (reach // 4) + 1
         smooth = torch.nn.functional.avg_pool2d(frames[:, None], blur, 1, blur // 2, count_include_pad=False)
         height, width = frames.shape[-2:]
@@ -45,14 +46,14 @@ class StarFrames:
 
     @property
     def light(self) -> Tensor:
-        """(T, S, S) electrons above the median of each square, 0 where pixels do not count."""
+        """Electrons above the median of each square (T, S, S), 0 where pixels are not valid."""
         level = torch.stack([square[good].median() for square, good in zip(self.pixels, self.counted, strict=True)])
         return torch.where(self.counted, self.pixels - level[:, None, None], 0.0)
 
     def require_fringes(self, centers: Tensor, grid: Grid) -> None:
-        """Raise ValueError unless fringes at the baselines of `centers` (N, 2) [m] have the contrast of a star's.
+        """Raise ValueError unless fringes at the baselines of `centers` (N, 2) [m] have the contrast of a star.
 
-        It is freed of photon noise, and that of most baselines counts.
+        The contrast is the median over baselines, corrected for photon noise.
         """
         light = self.light
         total = light.sum((1, 2))

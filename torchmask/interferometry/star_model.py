@@ -1,7 +1,7 @@
-"""Images of a star through a mask that lies somewhat otherwise than told, with all derivatives in closed form.
+"""Images of a star through a mask with an affine map of its geometry, with all derivatives in closed form.
 
-The focal amplitude is the sum of the holes' diffraction integrals, by a quadrature that is exact over each hole. The
-affine map of the pupil stands in its exponent, so holes turn and stretch with it.
+The focal amplitude is the sum of the holes' diffraction integrals, by a quadrature over each hole. The affine map of
+the pupil is in its exponent, so that holes are rotated and stretched too.
 """
 
 from __future__ import annotations
@@ -17,41 +17,42 @@ from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.pixel import PixelResponse
 from torchmask.optics.zernike import aperture_modes, noll
 
-PLACE = 2  # parameters of a frame before its aberrations: logarithm of the light, and background
-MAP = 4  # elements of the affine map, the first of the shared parameters
-_SPARE_DEGREE = 10  # of the quadrature, beyond the phase that turns most: the error falls faster than exponentially
+PLACE = 2  # number of parameters of a frame before its aberrations: logarithm of the light, and background
+MAP = 4  # number of elements of the affine map, the first of the shared parameters
+_SPARE_DEGREE = 10  # of the quadrature, beyond the largest phase: the error falls faster than exponentially
 
 
 @dataclass(frozen=True, eq=False)
 class Shared:
-    """What all frames of a star have in common.
+    """Parameters shared by all frames of a star.
 
-    matrix : (2, 2) from the mask as told to where it lies
-    log_transmission : (N,) logarithm of the light through each hole against the mean
+    matrix : (2, 2) affine map from the given to the actual geometry of the mask
+    log_transmission : (N,) logarithm of the light through each hole relative to the mean
     """
 
     matrix: Tensor
     log_transmission: Tensor
 
     def moved(self, step: Tensor) -> Shared:
-        """After a step (4 + N,)."""
+        """Return the parameters after a step (4 + N,)."""
         return Shared(self.matrix + step[:MAP].view(2, 2), self.log_transmission + step[MAP:])
 
 
 class StarModel:
-    """Images of a star near the middle of a square of pixels, from its own parameters and shared ones.
+    """Model of images of a star near the middle of a square of pixels, from own and shared parameters.
 
     Parameters
     ----------
     aperture : SparseAperture
-        As told.
+        Mask with its given geometry.
     grid : Grid
-        Of the frames; coefficients are rad at its wavelength.
+        Grid of the frames; coefficients are in rad at its wavelength.
     reach : int
-        The square has 2 reach + 1 pixels to a side.
+        Half-width of the square, which has 2 reach + 1 pixels to a side.
     n_modes : int
-        J, Zernike modes of every hole, at least 3.
+        Number J of Zernike modes of every hole, at least 3.
     pixel : PixelResponse, optional
+        Blur by the detector's pixels. None: they are points.
 
     Notes
     -----
@@ -80,34 +81,34 @@ class StarModel:
 
     @property
     def n_holes(self) -> int:
-        """N."""
+        """Number N of holes."""
         return len(self.centers)
 
     def kernels(self, matrix: Tensor) -> tuple[Tensor, Tensor]:
-        """exp(-i k x . A r) for the points of a hole (pixels, Q), and for the centres (pixels, N)."""
+        """Return exp(-i k x . A r) for the points of a hole (pixels, Q), and for the centres (pixels, N)."""
         directions = self._wave * self.pixels @ matrix
         return _phasor(-directions @ self._points.T), _phasor(-directions @ self.centers.T)
 
     def image(self, own: Tensor, shared: Shared, kernels: tuple[Tensor, Tensor]) -> Tensor:
-        """One frame (pixels,) [electrons]."""
+        """Return the image of one frame (pixels,) [electrons]."""
         amplitude = (self._holes(own, shared) @ kernels[0].T).T * kernels[1]
         return self._seen(own[0].exp() * amplitude.sum(1).abs() ** 2) + own[1]
 
     def linearise(self, own: Tensor, shared: Shared, kernels: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-        """The image (pixels,), and its derivatives by own (pixels, 2 + N J) and shared parameters (pixels, 4 + N)."""
+        """Return the image (pixels,) and its derivatives in own (pixels, 2 + N J) and shared (pixels, 4 + N) ones."""
         hole, carrier = kernels
         pupil = self._holes(own, shared)  # (N, Q)
         columns = torch.cat([self._modes, self._points], 1).to(pupil)  # (Q, J + 2)
         parts = hole @ (pupil[..., None] * columns).permute(1, 0, 2).flatten(1)  # (pixels, N (J + 2))
         parts = parts.unflatten(1, (self.n_holes, -1)) * carrier[..., None]
-        single, weighted = parts[..., 0], parts[..., self.n_modes :]  # Noll 1 is 1; the point's place, x and y
+        single, weighted = parts[..., 0], parts[..., self.n_modes :]  # of Noll mode 1, which is 1, and of x and y
         total = single.sum(1)
         light = own[0].exp()
         factor = 2 * light * total.conj()[:, None]
         by_modes = -(factor[..., None] * parts[..., : self.n_modes]).imag.flatten(1)
         by_transmission = (factor * single).real / 2
-        radius = (weighted + single[..., None] * self.centers).sum(1)  # sum of amplitudes by their r, (pixels, 2)
-        slope = (factor * radius).imag * self._wave  # by a turn of the phase k x . A r, along r
+        radius = (weighted + single[..., None] * self.centers).sum(1)  # sum of amplitudes times their r, (pixels, 2)
+        slope = (factor * radius).imag * self._wave  # derivative in the phase k x . A r, along r
         by_map = (self.pixels[:, :, None] * slope[:, None, :]).flatten(1)
         intensity = light * total.abs() ** 2
         image = self._seen(intensity)
@@ -117,9 +118,9 @@ class StarModel:
         return image + own[1], by_own, by_shared
 
     def offset_slopes(self, shared: Shared) -> Tensor:
-        """(2 + N J, 2) pixels (x, y) by which a unit of each own parameter moves the image: the mean tilt of the holes.
+        """Return the image's shift (x, y) [pixel] per unit of each own parameter (2 + N J, 2): mean tilt of the holes.
 
-        A phase k s . A r moves the image by s, and least squares over a hole take its slope along r out of a mode.
+        A phase k s . A r shifts the image by s; the slope of a mode along r is its least-squares fit over a hole.
         """
         centred = self._points - self._weights @ self._points
         inertia = (centred.T * self._weights) @ centred
@@ -128,12 +129,12 @@ class StarModel:
         return torch.cat([moves.new_zeros(PLACE, 2), moves.T.repeat(self.n_holes, 1)])
 
     def _holes(self, own: Tensor, shared: Shared) -> Tensor:
-        """Field (N, Q) on the points of every hole, of unit sum without aberrations."""
+        """Return the field (N, Q) on the points of every hole, of unit sum without aberrations."""
         phase = own[PLACE:].view(self.n_holes, self.n_modes) @ self._modes.T
         return (0.5 * shared.log_transmission).exp()[:, None] * self._weights * _phasor(phase)
 
     def _seen(self, images: Tensor) -> Tensor:
-        """Images (pixels, ...) as the detector's pixels see them."""
+        """Blur images (pixels, ...) by the detector's pixels."""
         if self._transfer is None:
             return images
         flat = images.view(self.side, self.side, -1)

@@ -20,11 +20,11 @@ _SAMPLES_PER_HOLE = 8
 
 
 class Restored(Protocol):
-    """What of a restoration its visibilities need; a `RestorationResult` has it.
+    """Part of a restoration's result that is needed for visibilities; a `RestorationResult` has it.
 
-    object : (H, W) on the frames' pixels, in the frames' units
+    object : (H, W) object on the frames' pixels, in the frames' unit
     coefficients : (T, N, J) Zernike coefficients of the frames [rad rms]
-    noise : rms of a pixel of a frame, in the frames' units
+    noise : rms noise of a pixel of a frame, in the frames' unit
     chi_square : (T,) mean square of the residuals in units of the noise
     """
 
@@ -42,24 +42,24 @@ class Restored(Protocol):
 
 
 def restored_observables(result: Restored, observation: Observation) -> Observables:
-    """Visibilities and closure phases of a restored object, freed of the aberrations that were restored with it.
+    """Return visibilities and closure phases of a restored object, free of the restored aberrations.
 
-    Errors are those that noise alone would leave if the restored aberrations were exact: the noise of the frames (or
-    what the model leaves unexplained, if that is more) over the light that their transfer functions, made from the
-    restored coefficients, send into the patch of each baseline. The prior and the uncertainty of the aberrations are
-    not in them: at high flux these are larger.
+    Errors are those by noise if the restored aberrations were exact: the noise of the frames (or the residual of the
+    model, if that is larger) over the light that the transfer functions of the restored coefficients transmit in the
+    patch of each baseline. They do not include the effect of the prior and the uncertainty of the aberrations, which
+    dominate at high flux.
 
     Parameters
     ----------
     result : RestorationResult
-        Or anything else that is `Restored`.
+        Result of a restoration, or another object with the attributes of `Restored`.
     observation : Observation
-        That it was restored from.
+        Observation that was restored.
 
     Raises
     ------
     ValueError
-        If the aperture has fewer than two sub-apertures, or the object is black or does not lie on the frames' pixels.
+        If the aperture has fewer than two sub-apertures, or the object is zero or has another shape than the frames.
 
     Examples
     --------
@@ -82,7 +82,7 @@ def restored_observables(result: Restored, observation: Observation) -> Observab
         raise ValueError(f"the object has shape {tuple(scene.shape)}: the observation's frames have {grid.shape}")
     light = float(scene.sum())
     if not light > 0:
-        raise ValueError("the restored object is black: it has no visibilities")
+        raise ValueError("the restored object is zero everywhere: it has no visibilities")
     values = (fringe_waves(aperture, grid, pairs).conj() @ scene.to(torch.complex128).flatten()) / light
     variance = result.noise**2 * max(1.0, float(result.chi_square.mean()))
     noise = variance * math.prod(grid.shape) / (light**2 * _transmitted(result, aperture, grid, pairs))
@@ -112,13 +112,13 @@ def restored_observables(result: Restored, observation: Observation) -> Observab
 def pairs_and_triangles(aperture: Aperture) -> tuple[Tensor, Tensor]:
     n = aperture.n_subapertures
     if aperture.centers.ndim != 2 or n < 2:
-        raise ValueError(f"the aperture has centres of shape {tuple(aperture.centers.shape)}: two holes are the least")
+        raise ValueError(f"the aperture has centres of shape {tuple(aperture.centers.shape)}: give at least two holes")
     pairs = torch.tensor(list(itertools.combinations(range(n), 2)))
     return pairs, torch.tensor(list(itertools.combinations(range(n), 3)), dtype=torch.long).reshape(-1, 3)
 
 
 def triangle_sides(pairs: Tensor, triangles: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Indices of the baselines ij, jk and ik of every triangle; ki is ik turned round."""
+    """Return the indices of the baselines ij, jk and ik of every triangle; ki is ik reversed."""
     number = {pair: index for index, pair in enumerate(map(tuple, pairs.tolist()))}
     rows = [[number[i, j], number[j, k], number[i, k]] for i, j, k in triangles.tolist()]
     first, second, third = torch.tensor(rows, dtype=torch.long).reshape(-1, 3).unbind(1)
@@ -126,7 +126,7 @@ def triangle_sides(pairs: Tensor, triangles: Tensor) -> tuple[Tensor, Tensor, Te
 
 
 def sky_stations(observation: Observation) -> Tensor:
-    """(N, 2) centres of the holes towards east and north [m]; along columns and rows if no sky coordinates are known.
+    """Return the holes' centres (N, 2) towards east and north [m], or along columns and rows without sky coordinates.
 
     With the matrix M from pixels to the sky, nu . x = u . (M x) for u = M^-T nu.
     """
@@ -138,13 +138,13 @@ def sky_stations(observation: Observation) -> Tensor:
 
 
 def pixel_positions(grid: Grid) -> Tensor:
-    """(P, 2) pixels (x, y) relative to [H // 2, W // 2]."""
+    """Return the positions (x, y) of the pixels (P, 2), relative to [H // 2, W // 2]."""
     rows, columns = (torch.arange(n, dtype=torch.float64) - n // 2 for n in grid.shape)
     return torch.stack(torch.meshgrid(rows, columns, indexing="ij"), -1).flatten(0, 1).flip(-1)
 
 
 def fringe_waves(aperture: Aperture, grid: Grid, pairs: Tensor) -> Tensor:
-    """(B, P) exp(2 pi i nu . x) of every baseline."""
+    """Return exp(2 pi i nu . x) of every baseline (B, P)."""
     centers = aperture.centers.detach().double().cpu()
     nu = (centers[pairs[:, 1]] - centers[pairs[:, 0]]) / grid.period
     phase = 2 * math.pi * nu @ pixel_positions(grid).T
@@ -152,7 +152,7 @@ def fringe_waves(aperture: Aperture, grid: Grid, pairs: Tensor) -> Tensor:
 
 
 def _transmitted(result: Restored, aperture: Aperture, grid: Grid, pairs: Tensor) -> Tensor:
-    """(1 + B,) |OTF|^2 of the restored aberrations, summed over frames and the frequencies around 0 and baselines."""
+    """Return |OTF|^2 (1 + B,) of the restored aberrations, summed over frames and the patches of 0 and baselines."""
     n_modes = result.coefficients.shape[-1]
     samples = _SAMPLES_PER_HOLE * grid.period / (aperture.subaperture_diameter * min(grid.shape))
     oversampling = max(1, math.ceil(samples))
