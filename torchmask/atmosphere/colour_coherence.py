@@ -1,8 +1,9 @@
-"""How far the light of two wavelengths is coherent that the same holes bring to the same frequency.
+"""Coherence under turbulence of the light of two wavelengths from the same holes at the same spatial frequency.
 
-Light of the phases a and a' times those at the reference wavelength comes from baselines b / a and b / a', so from
-other points of the holes, and its phases differ by (a - a') phi. Over the geometric mean of what turbulence leaves of
-either alone, it keeps exp(-k), k even in a - a': the ratio is taken where a hole's lenses of both are alike.
+Light whose phases are a and a' times those at the reference wavelength comes from baselines b / a and b / a', that is
+from different points of the holes, and its phases differ by (a - a') phi. Relative to the geometric mean of the |OTF|^2
+of either wavelength, their product keeps exp(-k), with k even in a - a'. This ratio is computed where both wavelengths
+have the same lens of a hole.
 """
 
 from __future__ import annotations
@@ -19,14 +20,14 @@ from torchmask.optics.band import Band
 from torchmask.optics.shape_base import Shape
 
 _BASELINES = (16, 16)
-_STEPS = (0.4, 0.75, 1.0)  # of the largest a - a', where k is taken
+_STEPS = (0.4, 0.75, 1.0)  # fractions of the largest a - a' at which k is computed
 _PER_HOLE, _PER_R0 = 12, 6
-_THINNEST = 0.9  # of a hole's reach: lenses further out carry nothing
-_LOST = 1e-2  # of the light, in modes that are left out
+_THINNEST = 0.9  # of a hole's reach: thinner lenses, further out, transmit almost nothing
+_LOST = 1e-2  # fraction of the light in modes that are left out
 
 
 class ColourCoherence:
-    """Of the wavelengths of a band, at any baseline up to `longest` [m], for holes of one shape."""
+    """Coherence between the wavelengths of a band, at any baseline up to `longest` [m], for holes of one shape."""
 
     def __init__(
         self, shape: Shape, diameter: float, seeing: Seeing, band: Band, reference: float, longest: float
@@ -36,7 +37,7 @@ class ColourCoherence:
         widest = self.scales.max() - self.scales.min()
         isotropic = shape.is_round and seeing.is_isotropic
         nodes = PolarTable.nodes((_BASELINES[0], 1 if isotropic else _BASELINES[1]), longest, 2.0).flatten(0, 1)
-        # lenses further apart than a hole's reach to either side have no frequency in common
+        # lenses further apart than twice a hole's reach have no frequency in common
         met = 2 * _THINNEST * shape.outer_diameter(diameter) / nodes.norm(dim=-1).clamp(min=1e-9)
         steps = torch.minimum(met, widest)[:, None] * torch.tensor(_STEPS, dtype=torch.float64)
         lost = torch.stack([_lost(shape, diameter, seeing, nodes, step) for step in steps.T], -1)
@@ -46,13 +47,13 @@ class ColourCoherence:
         self.factors: PolarTable = PolarTable(factors.expand(-1, -1, _BASELINES[1]).contiguous(), longest, 2.0)
 
     def between(self, baselines: Tensor) -> Tensor:
-        """exp(-k) (P, W, W) of all pairs of wavelengths at baselines (P, 2) [m]."""
+        """Return exp(-k) (P, W, W) for all pairs of wavelengths at baselines (P, 2) [m]."""
         step = (self.scales[:, None] - self.scales) ** 2
         second, fourth = self.factors(baselines)[..., None, None]
         return torch.exp(-((second + fourth * step).clamp(min=0) * step))
 
     def modes(self, baselines: Tensor) -> Tensor:
-        """The matrices (M, W, P) whose products with themselves, over M, are exp(-k)."""
+        """Return M modes (M, W, P) whose outer products in W, summed over M, approximate exp(-k)."""
         root = self.shares.sqrt()
         size, vectors = torch.linalg.eigh(self.between(baselines) * root[:, None] * root)
         size = size.clamp(min=0)
@@ -63,7 +64,7 @@ class ColourCoherence:
 
 
 def _lost(shape: Shape, diameter: float, seeing: Seeing, baselines: Tensor, step: Tensor) -> Tensor:
-    """k (P,) at baselines (P, 2) [m], for phases that differ by `step` (P,) times those at the reference."""
+    """Return k (P,) at baselines (P, 2) [m], for phases that differ by `step` (P,) times those at the reference."""
     one, other = (1 + step / 2)[:, None], (1 - step / 2)[:, None]
     reach = shape.outer_diameter(diameter)
     first, second = baselines / one, baselines / other

@@ -1,13 +1,13 @@
-"""What turbulence leaves of the overlap of two equal holes, as a short sum with factors that tables hold.
+"""Coherence under turbulence of the overlap of two equal holes, as a short sum of functions with tabulated factors.
 
-Two holes of a pupil let a baseline b through where b differs from their own by u, less than a hole: their overlap is
-then a lens, whatever the holes' places. Of its |OTF|^2 turbulence and exposure keep the part
+Two holes of a pupil transmit a baseline b if it differs from their own by u, less than a hole; their overlap is then a
+lens, wherever the holes are. Turbulence and exposure leave the fraction
 
     c(b, u) = < exp(-Q(b, s) / 2) >,   Q(b, s) = 2 D(b) + 2 D(s) - D(s + b) - D(s - b),
 
-the mean over pairs of points of the lens, s apart. The length of a thin lens goes with the cube root of its
-transmission T(u), and it loses about (length / r0)^(5/3), T^(5/9): so c is nearly straight in T^(1/2), and a cubic in
-that with what the direction of u adds is c to one or two per cent.
+of its |OTF|^2, the mean over pairs of points of the lens, of separation s. The length of a thin lens is proportional to
+the cube root of its transmission T(u), and its loss to about (length / r0)^(5/3), or T^(5/9). Hence c is nearly linear
+in T^(1/2), and a cubic in it with terms for the direction of u approximates c to one or two per cent.
 """
 
 from __future__ import annotations
@@ -27,39 +27,41 @@ from torchmask.optics.shape_base import Shape
 
 _PER_HOLE, _PER_R0, _PER_SHARED = 20, 6, 10  # samples
 _MOST_LAGS = 12
-_PLACES = (12, 16)  # distances and directions (of half a turn) of places in the overlap
-_BASELINES = (16, 16)  # of baselines
-_SHARED_BASELINES = (9, 12)  # below a hole, of lenses of holes with themselves
-_SEPARATIONS = (28, 12)  # of these holes
-_TOLERANCE = 1e-3  # of the lenses that holes share, in the norm of the table
-_FAINT = 0.05  # errors of c count in proportion to T^(1/2) and this: thin lenses carry little
-_STRENGTH = 9 / 5  # phases that are a times as large act like a lens with a^(9/5) times the root of T
+_PLACES = (12, 16)  # number of distances and directions (over half a turn) of u
+_BASELINES = (16, 16)  # the same for the baselines b
+_SHARED_BASELINES = (9, 12)  # the same for baselines within a hole, of lenses of holes with themselves
+_SEPARATIONS = (28, 12)  # the same for the separations of these holes
+_TOLERANCE = 1e-3  # of the table of lenses of holes with themselves, in its norm
+_FAINT = 0.05  # errors of c are weighted by T^(1/2) plus this: thin lenses transmit little
+_STRENGTH = 9 / 5  # phases scaled by a act like a lens with a^(9/5) times the root of T
 
 
 class PolarTable:
-    """A function that is even in the plane, known at distances `longest` (i / (n - 1))^power and evenly spread
-    directions over half a turn: values (..., distances, directions)."""
+    """Table of an even function in the plane, with values (..., distances, directions).
+
+    Distances are `longest` (i / (n - 1))^power, and directions are evenly spaced over half a turn.
+    """
 
     values: np.ndarray
     longest: float
     power: float
 
     def __init__(self, values: Tensor, longest: float, power: float) -> None:
-        # half a turn to either side, so that a cubic spline does not feel the seam
+        # half a turn more to either side, so that a cubic spline is smooth at the seam
         self.values, self.longest, self.power = torch.cat([values] * 3, -1).numpy(), longest, power
         self.n_directions: int = values.shape[-1]
 
     @staticmethod
     def nodes(sizes: tuple[int, int], longest: float, power: float) -> Tensor:
-        """Where the function must be known, (distances, directions, 2)."""
+        """Return the points (distances, directions, 2) at which the function is tabulated."""
         radius = longest * torch.linspace(0, 1, sizes[0], dtype=torch.float64) ** power
         angle = math.pi * torch.arange(sizes[1], dtype=torch.float64) / sizes[1]
         return radius[:, None, None] * torch.stack([angle.cos(), angle.sin()], -1)
 
     def __call__(self, points: Tensor) -> Tensor:
-        """At points (P, 2): (..., P), by cubic splines; beyond `longest` as there."""
+        """Return the values (..., P) at points (P, 2), by cubic splines; beyond `longest` they are constant."""
         x, y = points.double().cpu().numpy().T
-        opposite = (y < 0) | ((y == 0) & (x < 0))  # of which all is even to the last digit
+        opposite = (y < 0) | ((y == 0) & (x < 0))  # mapped to their opposites, for exact evenness
         x, y = np.where(opposite, -x, x), np.where(opposite, -y, y)
         n = self.values.shape[-2] - 1
         distance = np.minimum(np.hypot(x, y) / self.longest, 1) ** (1 / self.power) * n
@@ -71,35 +73,37 @@ class PolarTable:
 
 
 class SharedCoherence(NamedTuple):
-    """A function of the baseline and of the separation of two holes, as the sum of products of one of either."""
+    """A function of the baseline and of the separation of two holes, as a sum of products of functions of each."""
 
     by_baseline: PolarTable
     by_place: PolarTable
 
 
 def lens_functions(root: Tensor, x: Tensor, y: Tensor) -> list[Tensor]:
-    """The functions whose sum with the factors of `lens_coherence` is c: each of the shape of all three.
+    """Return the functions whose sum with the factors of `lens_coherence` is c, each of the shape of the arguments.
 
-    root is the square root of T, times that of `strength_of`; x and y are u over the holes' outer diameter
+    `root` is the square root of T times `strength_of`; x and y are u over the holes' outer diameter.
     """
     return [torch.ones_like(root), root, root * root, root * (x * x - y * y), root * (2 * x * y)]
 
 
 def strength_of(scale: Tensor | float) -> Tensor:
-    """What the root of T is multiplied by for light whose phases are `scale` times those of the reference."""
+    """Return the factor on the root of T for light whose phases are `scale` times those of the reference."""
     return torch.as_tensor(scale) ** _STRENGTH
 
 
 def lens_coherence(
     shape: Shape, diameter: float, seeing: Seeing, longest: float, scales: tuple[float, ...] = (1.0,)
 ) -> PolarTable:
-    """The factors of c by the baseline, up to `longest` [m], for holes of one shape and phases that are `scales` times
-    those of the seeing."""
+    """Tabulate the factors of c against the baseline, up to `longest` [m], for holes of one shape.
+
+    `scales` are those of the phases, relative to the seeing.
+    """
     reach = shape.outer_diameter(diameter)
     nodes = PolarTable.nodes(_PLACES, reach, 1.0)
     places = nodes.flatten(0, 1)
     drift, shares = lens_drift(seeing)
-    fewest = _PER_HOLE if len(drift) == 1 else _PER_HOLE * 3 // 5  # the drift smooths
+    fewest = _PER_HOLE if len(drift) == 1 else _PER_HOLE * 3 // 5  # fewer, as the drift smooths
     per_hole = max(fewest, math.ceil(_PER_R0 * diameter / seeing.r0))
     separations, densities = lens_densities(shape, diameter, places, per_hole)
     structure = seeing.structure(longest + 2 * reach + float(drift.norm(dim=-1).max()))
@@ -123,8 +127,11 @@ def lens_coherence(
 
 
 def shared_coherence(shape: Shape, diameter: float, seeing: Seeing, longest: float) -> SharedCoherence:
-    """The factors of what the lenses of two holes with themselves share, by the baseline u, below a hole, and the
-    separation of the holes, up to `longest` [m]: <exp(-Q(u, c + t) / 2)>, t between two points of one lens."""
+    """Tabulate the coherence <exp(-Q(u, c + t) / 2)> of the lenses of two holes, each with itself.
+
+    It depends on the baseline u, smaller than a hole, and on the separation c of the holes, up to `longest` [m]; the
+    mean is over the separation t of two points of one lens.
+    """
     reach = shape.outer_diameter(diameter)
     between = PolarTable.nodes(_SEPARATIONS, longest, 1.5).flatten(0, 1)[:, None]
     drift, shares = lens_drift(seeing)
@@ -148,8 +155,10 @@ def shared_coherence(shape: Shape, diameter: float, seeing: Seeing, longest: flo
 
 
 def _table(function: Callable[[Tensor], Tensor], baselines: Tensor, others: tuple[int, int], isotropic: bool) -> Tensor:
-    """`function` (..., distances times directions of the others) of all polar baselines (n, m, 2): (n m, ...). Where no
-    direction is distinguished, all follow from the first, as only the angle between both counts."""
+    """Return `function` of all polar baselines (n, m, 2), with values for all other points, as (n m, ...).
+
+    If it is isotropic, all directions follow from the first, as only the angle between both arguments matters.
+    """
     if not isotropic:
         return function(baselines.flatten(0, 1))
     first = function(baselines[:, 0]).unflatten(-1, others)
@@ -158,7 +167,7 @@ def _table(function: Callable[[Tensor], Tensor], baselines: Tensor, others: tupl
 
 
 def lens_drift(seeing: Seeing) -> tuple[Tensor, list[float]]:
-    """Displacements (L, 2) [m] during the exposure, each with its opposite, and their shares."""
+    """Return displacements (L, 2) [m] during the exposure, each with its opposite, and their weights."""
     if seeing.exposure == 0:
         return torch.zeros(1, 2, dtype=torch.float64), [1.0]
     n = 3 + math.ceil(2 * seeing.exposure * seeing.speed / seeing.r0)
@@ -167,14 +176,14 @@ def lens_drift(seeing: Seeing) -> tuple[Tensor, list[float]]:
 
 
 def _kernel(structure: StructureFunction, baseline: Tensor, separation: Tensor, own: Tensor | None = None) -> Tensor:
-    """exp(-Q / 2) (...); `own` is the structure function of the separation where it is known."""
+    """Return exp(-Q / 2) (...); `own` is the structure function of the separation, if it is known already."""
     own = structure(separation) if own is None else own
     crossed = structure(separation + baseline) + structure(separation - baseline)
     return torch.exp(crossed / 2 - own - structure(baseline))
 
 
 def _factors(table: Tensor) -> tuple[Tensor, Tensor]:
-    """Rows (R, n) and columns (R, m) whose products sum to the table (n, m)."""
+    """Return rows (R, n) and columns (R, m) whose outer products sum to the table (n, m)."""
     left, size, right = torch.linalg.svd(table, full_matrices=False)
     rank = max(1, int((size > _TOLERANCE * size[0]).sum()))
     root = size[:rank].sqrt()
@@ -182,8 +191,10 @@ def _factors(table: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def lens_densities(shape: Shape, diameter: float, places: Tensor, per_hole: int) -> tuple[Tensor, Tensor]:
-    """Separations (S, 2) [m] of half the plane, and how often the points of the lens at `places` (U, 2) are so far
-    apart, (U, S) of unit sum. A lens of no extent keeps everything: separation 0."""
+    """Return separations (S, 2) [m] in half the plane, and their densities (U, S) in the lenses at `places` (U, 2).
+
+    Densities have unit sum. A lens without extent has separation 0 only.
+    """
     step = diameter * shape.fineness / per_hole
     size = math.ceil(shape.outer_diameter(diameter) / step) + 2
     axis = (torch.arange(size, dtype=torch.float64) - (size - 1) / 2) * step

@@ -1,4 +1,4 @@
-"""What the air does during one exposure: turbulence of some strength, carried along by a wind."""
+"""Turbulence during one exposure: its strength, and the wind that carries it."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ class Seeing:
     Parameters
     ----------
     r0 : float
-        Fried's parameter at the reference wavelength, that of the grid [m].
+        Fried parameter at the reference wavelength, that of the grid [m].
     outer_scale : float
-        L0 [m]; infinite for Kolmogorov turbulence.
+        Outer scale L0 [m]; infinite for Kolmogorov turbulence.
     exposure : float
-        T [s]; 0 for instantaneous frames.
+        Exposure time T [s]; 0 for instantaneous frames.
     wind : float or (float, float)
-        Its speed [m/s], all directions being equally likely, or its velocity (vx, vy).
+        Wind speed [m/s] with all directions equally likely, or wind velocity (vx, vy) [m/s].
 
     Raises
     ------
     ValueError
-        For a length that is not positive, a negative exposure or speed, a number that is not finite, and an exposure
-        without wind, which would be instantaneous however long.
+        If a length is not positive, the exposure or the speed is negative, a number is not finite, or an exposure is
+        given without wind, in which case its length would have no effect.
 
     Examples
     --------
@@ -47,7 +47,7 @@ class Seeing:
     wind: float | tuple[float, float] = 0.0
 
     def __post_init__(self) -> None:
-        self.structure()  # which checks the scales
+        self.structure()  # checks the scales
         if not (math.isfinite(self.exposure) and self.exposure >= 0):
             raise ValueError(f"exposure is {self.exposure}: it must be finite and not negative, in s")
         pair = isinstance(self.wind, tuple | list)
@@ -64,7 +64,7 @@ class Seeing:
 
     @property
     def tau0(self) -> float:
-        """Time in which two points of Kolmogorov turbulence change by 1 rad rms against each other [s]."""
+        """Coherence time [s], in which the phase at a point changes by 1 rad rms in Kolmogorov turbulence."""
         return math.inf if self.speed == 0 else coherence_distance(self.r0) / self.speed
 
     @property
@@ -73,14 +73,14 @@ class Seeing:
         return self.exposure == 0 or not isinstance(self.wind, tuple | list)
 
     def structure(self, reach: float = math.inf) -> StructureFunction:
-        """The structure function of the phase, for displacements up to `reach` [m]."""
+        """Return the structure function of the phase, for displacements up to `reach` [m]."""
         return StructureFunction(self.r0, self.outer_scale, reach)
 
     def drift(self, n_lags: int = 7, n_directions: int = 8) -> tuple[Tensor, Tensor]:
-        """How far the turbulence moves between two instants of an exposure: displacements (L, 2) [m], weights (L,).
+        """Return displacements (L, 2) [m] of the turbulence between two instants of an exposure, with weights (L,).
 
-        The lag of two instants of [0, T] has the density 2 (1 - x) / T, x = lag / T, whose Gauss quadrature this is;
-        a displacement stands for its opposite too.
+        They are a Gauss quadrature over the lag of two instants of [0, T], of density 2 (1 - x) / T with x = lag / T. A
+        displacement represents its opposite too.
         """
         if self.exposure == 0:
             return torch.zeros(1, 2, dtype=torch.float64), torch.ones(1, dtype=torch.float64)
@@ -95,6 +95,6 @@ class Seeing:
 
 
 def _triangle_quadrature(n: int) -> tuple[Tensor, Tensor]:
-    """Nodes and weights on [0, 1] of the mean with the density 2 (1 - x), exact for polynomials of degree 2 n - 1."""
+    """Return nodes and weights on [0, 1] for the density 2 (1 - x), exact for polynomials of degree 2 n - 1."""
     nodes, weights = roots_jacobi(n, 1, 0)
     return torch.from_numpy((np.asarray(nodes) + 1) / 2), torch.from_numpy(np.asarray(weights) / np.sum(weights))

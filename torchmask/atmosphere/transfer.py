@@ -1,12 +1,12 @@
-"""The mean squared transfer function of an aperture under turbulence, for any pupil, by sampling it.
+"""The mean squared transfer function of any aperture under turbulence, computed on a sampled pupil.
 
 For a pupil P and the baseline b = wavelength * (angular frequency), H(b) is the mean of exp(i (phi(x) - phi(x + b)))
 over the overlap P(x) P(x + b), times the overlap. So (Korff, J. Opt. Soc. Am. 63, 971, 1973)
 
     E|H(b)|^2 = T(b)^2 < exp(-Q(b, s) / 2) >,   Q(b, s) = 2 D(b) + 2 D(s) - D(s + b) - D(s - b),
 
-with T the transfer function without turbulence, D the phase structure function, and the mean over all pairs of points
-of the overlap, s apart: over the autocorrelation of the overlap. Nothing else is approximated here than the sampling.
+with T the transfer function without turbulence, D the phase structure function, and the mean taken over all pairs of
+points of the overlap, of separation s: over the autocorrelation of the overlap. Sampling is the only approximation.
 """
 
 from __future__ import annotations
@@ -23,26 +23,27 @@ from torchmask.grid import Grid
 from torchmask.optics.band import Band
 from torchmask.optics.pupil import Aperture
 
-_PER_R0 = 6  # samples
-_NOTHING = 1e-12  # of a density: rounding of its Fourier transform
+_PER_R0 = 6  # samples per r0
+_NOTHING = 1e-12  # of a density, below which it is a rounding error of its Fourier transform
 
 
 def mean_square_otf(
     aperture: Aperture, grid: Grid, frequencies: Tensor, seeing: Seeing, band: Band | None = None
 ) -> Tensor:
-    """E|OTF|^2 of one aperture at some frequencies, with nothing but sampling approximated: slow, and general.
+    """Return E|OTF|^2 of one aperture at given frequencies, for any pupil but slowly; only sampling is approximated.
 
     Parameters
     ----------
     aperture : Aperture
         One mask or full pupil, centres (N, 2).
     grid : Grid
-        Its pixel scale turns frequencies into baselines; its wavelength is the one that r0 belongs to.
+        Grid whose pixel scale converts frequencies to baselines, and whose wavelength r0 refers to.
     frequencies : (F, 2)
-        (nu_x, nu_y) [cycles/pixel]; they are not wrapped around the frequency torus.
+        Spatial frequencies (nu_x, nu_y) [cycles/pixel], which are not wrapped around.
     seeing : Seeing
+        Turbulence and exposure.
     band : Band, optional
-        None: the wavelength of the grid alone.
+        Wavelengths of the light. None: that of the grid.
 
     Returns
     -------
@@ -52,16 +53,16 @@ def mean_square_otf(
     Raises
     ------
     ValueError
-        For a population of masks.
+        If several masks are given.
 
     Notes
     -----
-    For each frequency, each pair of wavelengths takes a Fourier transform of the pupil's raster, which has 6 samples to
-    r0 and 24 to a hole. The overlap T is exact, and the mean over it is accurate to about 0.5 %.
+    For each frequency, each pair of wavelengths takes a Fourier transform of the pupil's raster, which has 6 samples
+    per r0 and 24 per hole. The overlap T is exact, and the mean over it is accurate to about 0.5 %.
 
     Examples
     --------
-    The speckle transfer function of a full pupil, over 0.435 (r0/D)^2 T, which it tends to at high D/r0.
+    The speckle transfer function of a full pupil, over its limit 0.435 (r0/D)^2 T for high D/r0:
 
     >>> from torchmask.optics.aperture import FullAperture
     >>> grid = Grid.nyquist(1.0, 550e-9, 64)
@@ -99,9 +100,10 @@ def difference_variance(
     scale: float | Tensor = 1.0,
     other_scale: float | Tensor = 1.0,
 ) -> Tensor:
-    """E[(a (phi_1 - phi_2) - a' (phi_3 - phi_4))^2] (...) [rad^2] of two pairs of points, whose middles are s apart.
+    """Return E[(a (phi_1 - phi_2) - a' (phi_3 - phi_4))^2] (...) [rad^2] of two pairs of points.
 
-    separation, baseline, other : (..., 2) s, x_2 - x_1 and x_4 - x_3 [m]
+    separation : (..., 2) vector s between the middles of the pairs [m]
+    baseline, other : (..., 2) x_2 - x_1 and x_4 - x_3 [m]
     scale, other_scale : a and a', the reference wavelength over that of the pair
     """
     half, mean = (other - baseline) / 2, (other + baseline) / 2
@@ -112,12 +114,13 @@ def difference_variance(
 
 
 class OverlapRaster:
-    """The pupil of one aperture as samples, and what the means over its overlaps take.
+    """The sampled pupil of one aperture, with the functions for means over its overlaps.
 
-    aperture : centres (N, 2)
-    shortest : the shortest wavelength over the reference one, at most 1
-    longest : the longest baseline at which the overlaps are to be used [m], if it is not that of the aperture
-    per_hole : samples across the finest part of a hole; where r0 asks for more there are more
+    aperture : one aperture, centres (N, 2)
+    seeing : turbulence and exposure
+    shortest : shortest wavelength over the reference wavelength, at most 1
+    longest : longest baseline for which overlaps are needed [m]; 0: that of the aperture
+    per_hole : minimum number of samples across the finest part of a hole; a small r0 may need more
     """
 
     def __init__(
@@ -140,7 +143,7 @@ class OverlapRaster:
         self.structure: StructureFunction = seeing.structure(furthest + max(2 * reach, longest))
 
     def _coverage(self, shift: Tensor) -> Tensor:
-        """The open fraction of each cell of the pupil moved by -shift (2,)."""
+        """Return the open fraction of each cell of the pupil shifted by -shift (2,)."""
         diameter = self.aperture.subaperture_diameter
         total = torch.zeros(self.points.shape[:-1], dtype=torch.float64)
         for center in self.centers:
@@ -148,9 +151,9 @@ class OverlapRaster:
         return total
 
     def samples(self, baseline: Tensor) -> tuple[float, Tensor]:
-        """T at the baseline (2,) [m], exactly, and the overlap's samples (size, size) at `points`, of unit sum.
+        """Return the exact T at the baseline (2,) [m], and the overlap (size, size) at `points`, of unit sum.
 
-        The overlap is P(x - b/2) P(x + b/2): the middles of the pairs of points that the baseline joins.
+        The overlap P(x - b/2) P(x + b/2) consists of the middles of the pairs of points that the baseline joins.
         """
         pairs = self.centers[None] - self.centers[:, None] - baseline
         transfer = float(self.aperture.shape.otf(pairs, self.aperture.subaperture_diameter).sum()) / len(self.centers)
@@ -159,16 +162,16 @@ class OverlapRaster:
         return (0.0, samples) if total == 0 or transfer <= 0 else (transfer, samples / total)
 
     def overlap(self, baseline: Tensor) -> tuple[float, Tensor]:
-        """T at the baseline (2,) [m], and the Fourier transform of the overlap's samples."""
+        """Return T at the baseline (2,) [m], and the Fourier transform of the overlap's samples."""
         transfer, samples = self.samples(baseline)
         return transfer, torch.fft.rfft2(samples, s=self.padded)
 
     def density(self, one: Tensor, other: Tensor) -> Tensor:
-        """Of the separations between the middles of two overlaps, on the lattice (S,); of unit sum."""
+        """Return the density (S,) of separations between points of two overlaps, on the lattice, of unit sum."""
         return torch.fft.irfft2(one.conj() * other, s=self.padded).flatten()
 
     def kernel(self, points: Tensor, baseline: Tensor, other: Tensor, scale: float, other_scale: float) -> Tensor:
-        """exp(-Q / 2) at separations (S, 2) of the middles, averaged over the exposure (S,)."""
+        """Return exp(-Q / 2) (S,) at separations (S, 2) of the middles, averaged over the exposure."""
         total = torch.zeros(len(points), dtype=torch.float64)
         for step, weight in zip(self.drift[0], self.drift[1].tolist(), strict=True):
             variance = difference_variance(self.structure, points + step, baseline, other, scale, other_scale)

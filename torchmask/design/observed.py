@@ -1,4 +1,4 @@
-"""The criterion of an observation: what an instrument, and the light through a mask, say of the error."""
+"""The design criterion for an observation, from an instrument and the light through a mask."""
 
 from __future__ import annotations
 
@@ -13,17 +13,18 @@ from torchmask.optics.pixel import SquarePixel
 def instrument_criterion(
     instrument: Instrument, area: float, n_pixels: int = 256, turbulence: bool = True
 ) -> TurbulentMSE:
-    """The criterion of all masks that open the same area of an instrument's pupil.
+    """Return the criterion for all masks with the same open area of an instrument's pupil.
 
     Parameters
     ----------
     instrument : Instrument
+        Instrument, source and turbulence.
     area : float
         Open area of the pupil [m^2], `aperture.area`, which sets the light.
     n_pixels : int
-        Of the grid of frequencies, per side; the noise counts the pixels of the camera.
+        Number of samples per side of the frequency grid. The noise is that of the camera's pixels regardless.
     turbulence : bool
-        False: a random piston for each hole and nothing else, as `AsymptoticMSE`; quick, for a first search.
+        False: only a random piston for each hole, as in `AsymptoticMSE`, which is quick and suits a first search.
 
     Raises
     ------
@@ -63,9 +64,9 @@ def instrument_criterion(
 
 
 def change_light(criterion: TurbulentMSE, instrument: Instrument, area: float) -> None:
-    """Make a criterion that of another open area [m^2] of the same instrument, whose turbulence it keeps.
+    """Change a criterion in place to another open area [m^2] of the same instrument.
 
-    What takes seconds to compute of turbulence does not depend on the light, and is used again.
+    The effect of turbulence, which takes seconds to compute, does not depend on the light and is kept.
     """
     other = instrument_criterion(instrument, area, criterion.grid.shape[0])
     criterion.load_state_dict(other.state_dict())

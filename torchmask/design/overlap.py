@@ -1,12 +1,12 @@
-"""MSE_a at the cost of the support of its terms: every baseline is one small patch of pixels.
+"""Fast evaluation of MSE_a, in which every baseline is one small patch of pixels.
 
-The sum over ordered pairs of sub-apertures of |OTF(nu - baseline)|^2 is even in nu. So half the frequency plane is
-enough (rows nu_y >= 0, a few more on either side), each unordered pair leaves one patch there, the patches are
-scattered into the plane, and what falls on the border of the half-plane or beyond it is reflected back. A patch is a
-rectangle of pixels: the squared distance to its baseline is an outer sum, and one function of it is left to compute.
+The sum over ordered pairs of sub-apertures of |OTF(nu - baseline)|^2 is even in nu. Half the frequency plane is
+therefore enough (rows nu_y >= 0, with a few more on either side): each unordered pair has one patch there, the patches
+are added to the plane, and pixels on the border of the half-plane or beyond it are reflected back. A patch is a
+rectangle of pixels in which the squared distance to its baseline is an outer sum, so only one function of it remains.
 
-Nothing here is differentiated by autograd. The gradient is made right after the value, while the patches are in the
-cache: it has the size of the centres, and nothing else needs to be kept for a backward pass.
+Autograd is not used here. The gradient is computed right after the value, while the patches are in the cache: it has
+the size of the centres, and nothing else needs to be stored for a backward pass.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ _CHUNK = {"cpu": 2**18, "cuda": 2**24}
 
 
 class Geometry(NamedTuple):
-    """What the sum over baselines needs to know of an aperture and a grid, besides the centres."""
+    """Properties of an aperture and a grid that the sum over baselines needs besides the centres."""
 
     grid: tuple[int, int]  # rows and columns of the frequency plane
     period: float  # length in the pupil of one cycle per pixel [m]
     shape: Shape
-    diameter: float  # of a sub-aperture [m]
+    diameter: float  # diameter of a sub-aperture [m]
     reach: float  # radius of the support of a sub-aperture's OTF [m], at most half the period
 
 
 class PatchPlan(NamedTuple):
-    """Index arithmetic that depends on the geometry and the number of sub-apertures alone.
+    """Indices that depend only on the geometry and the number of sub-apertures.
 
-    The plane has `above` rows before those of the half-plane and some below, and is flat.
+    The plane is flattened, and has `above` rows before those of the half-plane and some after them.
     """
 
     patches: Patches
@@ -51,9 +51,9 @@ class PatchPlan(NamedTuple):
     column: Tensor  # (Kx,) whole pixels
     row: Tensor  # (Ky,) whole pixels, where they start in the plane
     n_plane: int
-    half: slice  # of the plane: the half-plane
-    outside: Tensor  # of the plane: rows on the border of the half-plane and beyond it
-    mirrored: Tensor  # of the half-plane: where those are reflected to
+    half: slice  # the half-plane, in the plane
+    outside: Tensor  # rows of the plane on the border of the half-plane and beyond it
+    mirrored: Tensor  # rows of the half-plane to which those are reflected
 
 
 def make_plan(geometry: Geometry, n: int, dtype: torch.dtype, device: torch.device) -> PatchPlan:
@@ -91,7 +91,7 @@ cached_plan = lru_cache(maxsize=32)(make_plan)
 
 
 def baseline_mse(centers: Tensor, weight: Tensor, ratio: Tensor, geometry: Geometry) -> Tensor:
-    """MSE_a (B,) of masks with `centers` (B, N, 2) [m], differentiable once in them.
+    """Return MSE_a (B,) of masks with `centers` (B, N, 2) [m], differentiable once in them.
 
     `weight` and `ratio` (layers, H // 2 + 1, W) hold the PSDs: MSE_a is the sum of weight / (transfer + ratio) over the
     half-plane, with transfer = N^2 |h|^2 + sum_{m != n} |h(nu - nu_m + nu_n)|^2 and h the OTF over N.
@@ -101,7 +101,7 @@ def baseline_mse(centers: Tensor, weight: Tensor, ratio: Tensor, geometry: Geome
 
 
 class _BaselineMSE(torch.autograd.Function):
-    """`baseline_mse` and, if asked for, its gradient, which the backward pass then only has to scale."""
+    """`baseline_mse` and, if requested, its gradient, which the backward pass only scales."""
 
     @staticmethod
     def forward(
@@ -137,7 +137,7 @@ class _BaselineMSE(torch.autograd.Function):
         geometry: Geometry,
         differentiate: bool,
     ) -> tuple[tuple[Tensor, Tensor], tuple[int, int]]:
-        """What is mapped over is one more axis of the population."""
+        """Treat the mapped axis as one more axis of the population."""
         if in_dims[0] is None or in_dims[1:3] != (None, None):
             raise ValueError("torch.func.vmap over MSE_a runs over the centres: the PSDs must be the same for all")
         rows = centers.movedim(in_dims[0], 0)
@@ -148,7 +148,7 @@ class _BaselineMSE(torch.autograd.Function):
 
 
 class _DifferentiatedOnce(torch.autograd.Function):
-    """A gradient that says so when it is differentiated: torch would take it for a constant, and Hessians for 0."""
+    """A gradient that raises an error when it is differentiated, where torch would give zero Hessians silently."""
 
     generate_vmap_rule = True
 
@@ -168,7 +168,7 @@ class _DifferentiatedOnce(torch.autograd.Function):
 def _mse_and_gradient(
     centers: Tensor, weight: Tensor, ratio: Tensor, geometry: Geometry, plan: PatchPlan, differentiate: bool
 ) -> tuple[Tensor, Tensor]:
-    """MSE_a (B,) and its gradient by the centres (B, N, 2), or (0, N, 2) if it is not asked for."""
+    """Return MSE_a (B,) and its gradient in the centres (B, N, 2), or one of shape (0, N, 2) if not requested."""
     (rows, columns), period = geometry.grid, geometry.period
     # baselines in cycles/pixel, the nearest image on the torus, and of the two opposite ones that with nu_y >= 0
     nu = (centers.index_select(1, plan.first) - centers.index_select(1, plan.second)).mul_(1 / period)
@@ -197,7 +197,7 @@ def _mse_and_gradient(
     value = error.sum((1, 2))  # not a matmul, which autocast and TF32 would round
     if not differentiate:
         return value, centers.new_empty(0, *centers.shape[1:])
-    slope = error.mul_(inverse).sum(1)  # of MSE_a by the transfer, but for its sign
+    slope = error.mul_(inverse).sum(1)  # minus the derivative of MSE_a in the transfer
     half.copy_(slope)
     plane[:, : plan.half.start].zero_()
     plane[:, plan.half.stop :].zero_()
