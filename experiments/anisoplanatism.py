@@ -38,11 +38,11 @@ class Options(ObservingOptions):
     """What the restorations depend on."""
 
     fields: tuple[float, ...] = (0.25, 0.5, 1.0, 2.0, 4.0)
-    """Larger side of the scene over theta0, with half of the turbulence in height."""
+    """Values of the scene's larger side over theta0, with half of the turbulence in the high layer."""
     shares: tuple[float, ...] = (0.1, 0.25, 0.5, 1.0)
-    """Of the turbulence in height, at the height of --share-field."""
+    """Shares of the turbulence in the high layer, at the height set by --share-field."""
     share_field: float = 2.0
-    """Field over theta0 that sets the height at which the shares vary, by a share of one half."""
+    """Field over theta0, for a share of one half, that sets the height of the layer whose share varies."""
     n_photons: float = 1e7
     """Electrons per frame through the mask."""
 
@@ -136,7 +136,7 @@ def is_varied(cell: Mapping[str, Any], options: Options) -> bool:
 
 
 def run(options: Options) -> None:
-    """Simulate, restore and compare in a new folder."""
+    """Simulate, restore and compare, with results in a new folder."""
     if options.smoke:
         options = smoke(options, fields=(0.5, 2.0), shares=(0.25, 1.0))
     check(options, fields=options.fields, shares=options.shares)

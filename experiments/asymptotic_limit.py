@@ -54,27 +54,27 @@ class Options(SweepOptions):
     d_over_r0: float = 7.0
     """Strength of the turbulence, D / r0."""
     outer_scale: float = 20.0
-    """Of the turbulence, in units of D."""
+    """Outer scale of the turbulence, in units of D."""
     fill_factor: float = 0.15
     """Collecting area N d^2 / D^2."""
     n_photons: float = 1e7
-    """Per exposure."""
+    """Number of photons per exposure."""
     exponent: float = 1.5
-    """Of the power-law power spectrum of the object."""
+    """Exponent of the object's power-law power spectrum."""
     n_pixels: int = 256
-    """Of the image, per side."""
+    """Number of pixels per side of the image."""
     oversampling: int = 2
-    """Of the pupil under von Karman screens; the numbers say what error it leaves."""
+    """Oversampling of the pupil under von Karman screens; its error is given with the results."""
     n_subapertures: int = 11
-    """Holes of the mask that is searched, beside Golay-6."""
+    """Number of holes of the searched mask, which is compared with Golay-6."""
     budget: int = 20_000
-    """Evaluations of that search."""
+    """Number of evaluations of that search."""
     piston_stacks: int = 200
-    """Stacks of max(K) exposures drawn with random pistons."""
+    """Number of stacks of max(K) exposures drawn with random pistons."""
     screen_stacks: int = 20
-    """Stacks drawn with von Karman screens."""
+    """Number of stacks drawn with von Karman screens."""
     seed: int = 0
-    """Of the search and the draws."""
+    """Seed of the search and the draws."""
 
 
 class PistonOTFs:
@@ -102,7 +102,7 @@ class PistonOTFs:
 
 
 def uniform_pistons(n_frames: int, n: int, generator: torch.Generator) -> torch.Tensor:
-    """(F, N) [rad]."""
+    """Draw uniform pistons (F, N) [rad]."""
     return 2 * math.pi * torch.rand(n_frames, n, dtype=torch.float64, generator=generator)
 
 
@@ -214,7 +214,7 @@ def compare(options: Options, callback: Callback) -> list[dict[str, Any]]:
 
 
 def check(options: Options) -> None:
-    """Raise ValueError for what the draws would refuse: the search takes long."""
+    """Raise ValueError for options that the draws would reject, before the long search begins."""
     if not options.frames or min(options.frames) < 1:
         raise ValueError(f"frames is {options.frames}: it must hold at least one number, and each at least 1")
     if not options.d_over_r0 > 0:

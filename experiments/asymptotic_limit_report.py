@@ -1,4 +1,4 @@
-"""What the draws of `asymptotic_limit` say: in sentences, as a table, as a figure."""
+"""Report of `asymptotic_limit`: findings, table and figure."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ class Options(ObservingOptions):
     """What the restorations depend on."""
 
     widths: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.4)
-    """Of the filter, over the wavelength."""
+    """Widths of the filter over the wavelength."""
     n_photons: float = 1e5
     """Electrons per frame through the mask in a filter of a tenth of the wavelength."""
 

@@ -30,11 +30,11 @@ class Options(WorkerOptions, DebugOptions):
     """What the table depends on."""
 
     folder: tyro.conf.Positional[Path]
-    """Of the tasks and the table."""
+    """Folder of the tasks and the table."""
     space: DesignSpace = field(default_factory=DesignSpace)
-    """What is varied and what is held fixed: see `torchmask.design.space.DesignSpace`."""
+    """Values that are varied and values that are fixed, see `torchmask.design.space.DesignSpace`."""
     smoke: bool = False
-    """Everything tiny, to see that it runs."""
+    """Run everything at a tiny size, as a test."""
 
 
 def run(options: Options) -> None:

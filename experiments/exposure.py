@@ -28,7 +28,7 @@ class Options(ObservingOptions):
     """What the restorations depend on."""
 
     exposures: tuple[float, ...] = (0.25, 0.5, 1.0, 2.0, 4.0)
-    """How long a frame lasts, T / tau0."""
+    """Exposure times of a frame, T / tau0."""
     n_photons: float = 1e5
     """Electrons through the mask in tau0."""
 

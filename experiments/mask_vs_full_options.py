@@ -1,4 +1,4 @@
-"""What `mask_vs_full` varies and what it holds fixed."""
+"""Options of `mask_vs_full`."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ VIEWS = {"satellite, oblique": (25.0, -30.0, 15.0), "satellite, front": (0.0, 0.
 
 @dataclass(frozen=True, kw_only=True)
 class MaskSearchOptions(SweepOptions):
-    """The mask."""
+    """Options for the choice of the mask."""
 
     mask: Path | None = None
-    """A mask to use (.json, .dxf or .fits); None: the best that a search finds."""
+    """File of the mask to use (.json, .dxf or .fits); None: search for one."""
     n_subapertures: int = 11
-    """Holes of the mask that is searched."""
+    """Number of holes of the searched mask."""
     fill_factor: float = 0.15
-    """Its collecting area N d^2 / D^2."""
+    """Collecting area N d^2 / D^2 of the searched mask."""
     budget: int = 20_000
-    """Evaluations of the search."""
+    """Number of evaluations of the search."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,29 +45,29 @@ class Options(MaskSearchOptions):
     d_over_r0: tuple[float, ...] = (3.0, 7.0, 15.0)
     """Strengths of the turbulence, D / r0."""
     seeds: tuple[int, ...] = (0, 1)
-    """Of the turbulence and the noise."""
+    """Seeds of the turbulence and the noise."""
     views: int = 2
-    """How many of the two views of the packaged satellite are scenes: 0, 1 or 2."""
+    """Number of views of the packaged satellite used as scenes: 0, 1 or 2."""
     scenes: tuple[Path, ...] = ()
     """Further scenes: meshes (.obj, .stl, .ply, .glb ...) or images (.npz, .png, .fits)."""
     n_frames: int = 10
-    """Short exposures, T."""
+    """Number T of short exposures."""
     n_pixels: int = 96
-    """Of the image, per side."""
+    """Number of pixels per side of the image."""
     iterations: int = 2400
-    """At most, of all starts of a restoration."""
+    """Maximum number of iterations over all starts of a restoration."""
     restarts: int = 1
-    """Restorations of the full pupil."""
+    """Number of restorations of the full pupil, of which the best fit is kept."""
     readout_noise: float = 1.5
-    """Electrons rms per pixel and frame."""
+    """Read-out noise [electrons rms per pixel and frame]."""
     outer_scale: float = 20.0
-    """Of the turbulence, in units of D."""
+    """Outer scale of the turbulence, in units of D."""
     full: bool = False
-    """The whole grid, for hours on many cores."""
+    """Run the whole grid, which takes hours on many cores."""
 
 
 def with_presets(options: Options) -> Options:
-    """The options that run: `full` and `smoke` replace what they stand for."""
+    """Return the options with the replacements of `full` and `smoke`."""
     if options.full and options.smoke:
         raise ValueError("full and smoke are both given: choose one")
     if options.full:
@@ -82,7 +82,7 @@ def with_presets(options: Options) -> Options:
 
 
 def check(options: Options) -> None:
-    """Raise ValueError for what the restorations would refuse: the search takes long."""
+    """Raise ValueError for options that the restorations would reject, before the long search begins."""
     for name in ("photons", "d_over_r0", "seeds"):
         values = getattr(options, name)
         if not values or len(set(values)) < len(values):

@@ -1,4 +1,4 @@
-"""What the restorations of `mask_vs_full` say: paired ratios, sentences made from them, a table, a figure."""
+"""Report of `mask_vs_full`: paired ratios of scores, findings, table and figure."""
 
 from __future__ import annotations
 

@@ -40,9 +40,9 @@ class Options(SearchedMaskOptions):
     d_over_r0: float = 7.0
     """Strength of the turbulence, D / r0."""
     max_hole_over_r0: float = 1.5
-    """Largest holes that are tried in that turbulence, d / r0."""
+    """Largest holes to try in that turbulence, d / r0."""
     n_draws: int = 4
-    """Stacks of K exposures drawn through each mask."""
+    """Number of stacks of K exposures drawn through each mask."""
 
 
 def curve(options: Options, still: DesignTable, turbulent: DesignTable) -> list[dict[str, Any]]:

@@ -63,25 +63,25 @@ class Options(ExperimentOptions):
     data: Path = Path("niriss")
     """Folder of the exposures."""
     target: str = "ab-dor"
-    """Files of the star are <target>_*.fits."""
+    """Name of the target, whose files are <target>_*.fits."""
     calibrator: str = "hd-37093"
-    """Files of the single star, observed in the same way."""
+    """Name of the calibrator, a single star observed in the same way; its files are <calibrator>_*.fits."""
     crop: int = 48
     """Side of the field around the star [pixels]."""
     radius: float = 16.0
-    """Pixels this far from the star take part in the fits: the bright part of the image of one hole."""
+    """Radius around the star of the pixels in the fits: the bright part of the image of one hole [pixels]."""
     n_wavelengths: int = 3
-    """In the filter, with equal weights."""
+    """Number of wavelengths in the filter, with equal weights."""
     static_modes: int = 10
-    """Zernike modes of every hole that are common to all exposures."""
+    """Number of Zernike modes of every hole that are common to all exposures."""
     r0: float = 20.0
-    """Of the small aberrations of each exposure, as if they were turbulence [m]: 0.07 rad rms over a hole."""
+    """Fried parameter that represents the small aberrations of each exposure [m]: 20 m for 0.07 rad rms over a hole."""
     max_iterations: int = 3200
-    """Of each restoration, all its starts together."""
+    """Maximum number of iterations over all starts of a restoration."""
     n_injections: int = 8
-    """Companions put beside the calibrator, around the clock, to see how well they are found."""
+    """Number of companions injected beside the calibrator, all around it, to measure the errors."""
     step: float = 0.05
-    """Of the search for companions [arcsec]."""
+    """Step of the search for companions [arcsec]."""
 
 
 def read(folder: Path, star: str, crop: int) -> tuple[Exposures, Grid]:

@@ -40,13 +40,13 @@ class Options(ExperimentOptions):
     data: Path = Path("niriss")
     """Folder of the exposures."""
     star: str = "hd-37093"
-    """Files of the single star are <star>_*.fits."""
+    """Name of the single star, whose files are <star>_*.fits."""
     exposures: int = 7
-    """How many of them are used."""
+    """Number of exposures to use."""
     crop: int = 52
     """Side of the field around the star [pixels]."""
     n_modes: int = 6
-    """Zernike modes of every hole in each exposure."""
+    """Number of Zernike modes of every hole in each exposure."""
 
 
 @dataclass(frozen=True)

@@ -49,25 +49,25 @@ class ObservingOptions(MaskSearchOptions):
     """What the restorations depend on."""
 
     budget: int = 3000
-    """Evaluations of the search."""
+    """Number of evaluations of the search."""
     instruments: tuple[str, ...] = ("mask", "full")
-    """Which of mask and full; the full pupil reaches as far and gets the light of its area."""
+    """Instruments to compare, of mask and full; the full pupil reaches the same frequencies, with light by area."""
     d_over_r0: float = 4.0
     """Strength of the turbulence, D / r0."""
     outer_scale: float = 20.0
-    """Of the turbulence, in units of D."""
+    """Outer scale of the turbulence, in units of D."""
     n_photons: float = 1e6
     """Electrons per frame through the mask; with `exposure` in tau0, with `band` in 10 percent of the wavelength."""
     readout_noise: float = 1.5
-    """Electrons rms per pixel and frame."""
+    """Read-out noise [electrons rms per pixel and frame]."""
     seeds: tuple[int, ...] = (0, 1, 2)
-    """Of the turbulence and the noise."""
+    """Seeds of the turbulence and the noise."""
     n_frames: int = 8
-    """Short exposures."""
+    """Number of short exposures."""
     n_pixels: int = 64
-    """Of the image, per side."""
+    """Number of pixels per side of the image."""
     iterations: int = 300
-    """At most, of a restoration."""
+    """Maximum number of iterations of a restoration."""
 
 
 def smoke(options: Any, **few: Any) -> Any:

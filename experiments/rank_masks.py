@@ -70,15 +70,15 @@ class Options(ExperimentOptions):
     fill_factor: float = 0.15
     """Collecting area N d^2 / D^2 of round holes; hexagons get the same area."""
     exponent: float = 1.5
-    """Of the power-law power spectrum of the object."""
+    """Exponent of the object's power-law power spectrum."""
     n_frequencies: int = 256
-    """Frequency grid of the criterion, per side."""
+    """Number of samples per side of the criterion's frequency grid."""
     own: tuple[int, ...] = (3, 6, 7, 9, 10, 11, 12)
     """Numbers of holes for which this library searches a mask."""
     budget: int = 20_000
-    """Evaluations of each search."""
+    """Number of evaluations of each search."""
     seed: int = 0
-    """Of the searches."""
+    """Seed of the searches."""
 
 
 def make_criterion(options: Options) -> AsymptoticMSE:

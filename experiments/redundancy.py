@@ -48,19 +48,19 @@ class Options(ExperimentOptions):
     d_over_r0: float = 7.0
     """Strength of the turbulence, D / r0."""
     outer_scale: float = 20.0
-    """Of the turbulence, in units of D."""
+    """Outer scale of the turbulence, in units of D."""
     fill_factor: float = 0.15
     """Collecting area N d^2 / D^2 of Golay-6."""
     row_holes: int = 12
-    """Holes of the redundant row."""
+    """Number of holes of the redundant row."""
     n_pixels: int = 256
-    """Of the image, per side."""
+    """Number of pixels per side of the image."""
     oversampling: int = 2
-    """Of the pupil behind the exposures. The field must hold the light that turbulence scatters."""
+    """Oversampling of the pupil, which widens the field so that it contains the light that turbulence scatters."""
     n_frames: int = 600
-    """Short exposures."""
+    """Number of short exposures."""
     seed: int = 0
-    """Of the exposures."""
+    """Seed of the exposures."""
 
 
 def check(options: Options) -> None:

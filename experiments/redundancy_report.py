@@ -1,4 +1,4 @@
-"""What the exposures of `redundancy` say: in sentences, as a table, as a figure."""
+"""Report of `redundancy`: findings, table and figure."""
 
 from __future__ import annotations
 

@@ -36,13 +36,13 @@ class Options(ObservingOptions):
     """What the restorations depend on."""
 
     modes: tuple[int, ...] = (3, 6, 10, 21, 45, 91, 153, 231)
-    """Zernike modes of the full pupil, from piston."""
+    """Numbers of Zernike modes of the full pupil, from piston."""
     d_over_r0: float = 7.0
     """Strength of the turbulence, D / r0."""
     n_photons: float = 1e7
     """Electrons per frame through the mask."""
     iterations: int = 600
-    """At most, of a restoration."""
+    """Maximum number of iterations of a restoration."""
 
 
 def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""One search for each number of holes and seed: what the gallery and the curve over N have in common."""
+"""One search for each number of holes and seed, shared by the gallery of masks and the curve over N."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from torchmask.design.space import Design, DesignSpace
 
 @dataclass(frozen=True, kw_only=True)
 class SearchedMaskOptions(SweepOptions):
-    """What the searches depend on."""
+    """Options of the searches."""
 
     n_subapertures: tuple[int, ...] = tuple(range(3, 21))
     """Numbers of holes, N."""
     fill_factor: float = 0.15
     """Collecting area N d^2 / D^2."""
     n_photons: float = 1e7
-    """Per exposure."""
+    """Number of photons per exposure."""
     n_frames: int = 20
-    """Exposures, K."""
+    """Number K of exposures."""
     exponent: float = 1.5
-    """Of the power-law power spectrum of the object."""
+    """Exponent of the object's power-law power spectrum."""
     n_pixels: int = 256
-    """Frequency grid, per side."""
+    """Number of samples per side of the frequency grid."""
     seed: tuple[int, ...] = (0, 1)
-    """Of the searches: the best counts, and their scatter is given."""
+    """Seeds of the searches, of which the best result is used; their scatter is given."""
     budget: int = 10_000
-    """Evaluations of each search."""
+    """Number of evaluations of each search."""
 
 
 def design_space(options: SearchedMaskOptions, **changes: Any) -> DesignSpace:

@@ -1,4 +1,4 @@
-"""What `exposure` and `band` share: more light against less contrast, one cell for each instrument and amount."""
+"""Code shared by `exposure` and `band`: the trade of more light against less contrast, for each instrument."""
 
 from __future__ import annotations
 

@@ -44,33 +44,33 @@ class Options(ExperimentOptions):
     """What the network and its stacks depend on."""
 
     mask: str = "golay9"
-    """A Golay array of the catalogue."""
+    """Name of a Golay array of the catalogue."""
     fill_factor: float = 0.15
     """Collecting area N d^2 / D^2."""
     ranges: StackRanges = field(default_factory=StackRanges)
-    """What differs from stack to stack."""
+    """Ranges of the values that differ between stacks."""
     n_pixels: int = 64
-    """Of the image, per side."""
+    """Number of pixels per side of the image."""
     n_frames: int = 8
-    """Short exposures in a stack."""
+    """Number of short exposures in a stack."""
     n_train: int = 256
-    """Stacks to train on."""
+    """Number of stacks to train on."""
     n_held_out: int = 32
-    """Stacks to be scored on."""
+    """Number of held-out stacks for the scores."""
     channels: int = 24
-    """Of the hidden layers."""
+    """Number of channels of the hidden layers."""
     depth: int = 5
-    """Convolutions."""
+    """Number of convolutions."""
     epochs: int = 12
-    """Passes over the training stacks."""
+    """Number of passes over the training stacks."""
     batch_size: int = 8
-    """Stacks in a step of the optimiser."""
+    """Number of stacks in a step of the optimiser."""
     learning_rate: float = 2e-3
-    """Of Adam, at its highest."""
+    """Maximum learning rate of Adam."""
     workers: int = 2
-    """Processes that draw stacks."""
+    """Number of processes that draw stacks."""
     seed: int = 0
-    """Of stacks, network and training."""
+    """Seed of stacks, network and training."""
 
 
 class Restorer(nn.Module):
@@ -222,7 +222,7 @@ def check(options: Options) -> None:
 
 
 def run(options: Options) -> None:
-    """Train in a new folder; an interrupted run leaves there what it reached."""
+    """Train in a new folder, in which an interrupted run leaves its results so far."""
     if options.smoke:
         tiny = {"n_pixels": 32, "n_frames": 2, "n_train": 24, "n_held_out": 4, "channels": 8, "depth": 4}
         options = replace(options, **tiny, epochs=40, workers=0)
