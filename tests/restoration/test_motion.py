@@ -219,5 +219,5 @@ def test_an_exposure_is_a_length_of_time(exposure, methods):
 def test_an_exposure_without_use_is_refused(methods):
     with pytest.raises(ValueError, match="without aberration_prior"):
         methods(1.0, aberration_prior=False)
-    with pytest.raises(ValueError, match="only masks"):
+    with pytest.raises(ValueError, match="for masks only"):
         MyopicDeconvolution(FullAperture(1.0), Grid.nyquist(1.0, 550e-9, SIDE), exposure_tau0=1.0)
