@@ -143,12 +143,12 @@ def test_a_mask_is_searched_under_turbulence(tmp_path):
 
 def test_options_of_turbulence_are_those_of_the_criterion():
     given = {"criterion": "turbulent", "r0": 0.2, "exposure_time": 2e-3}
-    exposure = Options(**given, wind=(10.0,), wavelengths=(530e-9, 570e-9)).turbulence(550e-9)
+    exposure = Options(**given, wind=(10.0,), wavelengths=(530e-9, 570e-9)).turbulence(550e-9, 0.1)
     assert (exposure["exposure"], exposure["wind"]) == (2e-3, 10.0)
-    assert "outer_scale" not in exposure
+    assert exposure["outer_scale"] == math.inf
     assert (exposure["wavelengths"], exposure["weights"]) == ((530e-9, 570e-9), None)
-    assert Options(**given, wind=(3.0, 4.0)).turbulence(550e-9)["wind"] == (3.0, 4.0)
-    assert Options(r0=0.2).turbulence(550e-9) is None
+    assert Options(**given, wind=(3.0, 4.0)).turbulence(550e-9, 0.1)["wind"] == (3.0, 4.0)
+    assert Options(r0=0.2).turbulence(550e-9, 0.1) is None
 
 
 @pytest.mark.parametrize(

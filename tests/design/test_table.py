@@ -123,6 +123,7 @@ def trial(**change):
         "mask_diameter": 1.0,
         "wavelength": 550e-9,
         "n_pixels": 64,
+        "pixel_scale": 275e-9,
         "oversampling": 8,
         "exponent": 1.5,
         "knee": 1 / 64,

@@ -6,7 +6,6 @@ import json
 import math
 
 import asymptotic_limit
-import design_table
 import mse_vs_n
 import numpy as np
 import optimal_masks
@@ -224,19 +223,3 @@ def test_what_could_not_be_drawn_is_told_before_the_search(tmp_path, capsys, opt
     assert asymptotic_limit.main([*options, *out]) == 1
     assert capsys.readouterr().err.startswith(f"asymptotic_limit: error: {message}")
     assert not list(tmp_path.iterdir())
-
-
-def test_the_table_on_the_command_line(tmp_path, capsys):
-    argv = [str(tmp_path / "table"), "--smoke", "--workers", "1"]
-    assert design_table.main(argv) == 0
-    assert "d/r0 is 1.57, above 1.5" in capsys.readouterr().out  # three holes at D/r0 = 7
-    found = json.loads((tmp_path / "table" / "table.json").read_text())["rows"]
-    assert [row["infeasible"] is None for row in found] == [False, True]
-    assert found[1]["wiener_mse"] > 0
-    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "table" / "tasks").iterdir()}
-    assert design_table.main(argv) == 0
-    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "table" / "tasks").iterdir()} == before
-    assert design_table.main([*argv, "--space.diameter-over-r0", "30"]) == 1
-    assert "no combination can be built" in capsys.readouterr().err
-    assert design_table.main([*argv, "--space.exponent", "-3"]) == 1
-    assert capsys.readouterr().err == "design_table: error: exponent is -3.0: it must be finite and not negative\n"

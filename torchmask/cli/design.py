@@ -12,16 +12,17 @@ from typing import Any, Literal
 
 import torch
 
-from torchmask.cli.criterion_options import CriterionOptions
-from torchmask.cli.options import InstrumentOptions, RunOptions, SearchOptions, require_wavelength
+from torchmask.cli.criterion_options import CriterionOptions, exposure_options
+from torchmask.cli.options import RunOptions, SearchOptions, require_wavelength
 from torchmask.cli.report import log_design
 from torchmask.cli.run import new_run
 from torchmask.design.constraint_base import Constraint, project
-from torchmask.design.constraints import InsideDisc, KeepOutDisc, KeepOutSegment, MinimumGap, NoOverlap, RimMargin
+from torchmask.design.constraints import InsideDisc, NoOverlap
 from torchmask.design.criterion import AsymptoticMSE
 from torchmask.design.drawing import LIFE_SIZE, require_scale, save_dxf, save_svg
 from torchmask.design.manufacture import least_pixels, save_fits, save_json
 from torchmask.design.redundancy import analyse_redundancy
+from torchmask.design.rules import MaskRules
 from torchmask.design.search import SearchResult, search_mask
 from torchmask.design.tolerance import Kind, machining_tolerance
 from torchmask.design.turbulent import TurbulentMSE
@@ -38,7 +39,7 @@ _GROWTH, _SUCCESS = 0.01, 0.95  # tolerated growth of the MSE by machining error
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(CriterionOptions, InstrumentOptions, SearchOptions, RunOptions):
+class Options(CriterionOptions, MaskRules, SearchOptions, RunOptions):
     """Search the positions of the holes that minimise the error of the restored image.
 
     Writes mask.json (for `torchmask simulate` and `restore`), mask.fits (an image in metres), the drawings mask.dxf and
@@ -59,16 +60,6 @@ class Options(CriterionOptions, InstrumentOptions, SearchOptions, RunOptions):
     """Pixels per side of the detector's field, which sets the total read-out noise; the criterion has its own grid."""
     method: Literal["hybrid", "cma"] = "hybrid"
     """Search method: descents and basin hopping on a coarse grid, which finds better masks, or CMA-ES, as published."""
-    min_gap: float = 0.0
-    """Smallest width of material between two holes [m]."""
-    rim_margin: float = 0.0
-    """Smallest width of material between a hole and the rim of the mask [m]."""
-    central_obstruction: float = 0.0
-    """Diameter of a central disc to be kept free of holes [m]."""
-    spiders: tuple[tuple[float, float, float, float, float], ...] = ()
-    """Bars to be kept free of holes, five numbers each: from x y to x y, width [m]."""
-    keep_out: tuple[tuple[float, float, float], ...] = ()
-    """Discs to be kept free of holes, three numbers each: x y of the centre, diameter [m]."""
     scale: float = LIFE_SIZE
     """Scale of the drawings: millimetres on the plate for each metre of the pupil; 1000 is full size."""
     seed: int = 0
@@ -76,7 +67,7 @@ class Options(CriterionOptions, InstrumentOptions, SearchOptions, RunOptions):
 
     @classmethod
     def of_instrument(cls, known: Instrument) -> Options:
-        """What an instrument gives, but for its light and its sky."""
+        """What an instrument gives; its light and its sky depend on the collecting area."""
         return cls(
             mask_diameter=known.telescope.diameter,
             central_obstruction=known.telescope.central_obstruction,
@@ -85,6 +76,8 @@ class Options(CriterionOptions, InstrumentOptions, SearchOptions, RunOptions):
             readout_noise=known.camera.readout_noise,
             n_pixels=known.camera.n_pixels,
             r0=known.site.r0,
+            outer_scale=known.site.outer_scale,
+            **exposure_options(known),
             exponent=known.source.exponent,
             knee=known.knee,
         )
@@ -96,8 +89,12 @@ def light(options: Options) -> float:
         return options.n_photons
     if options.instrument is None:
         return _PHOTONS
-    area = math.pi / 4 * options.fill_factor * options.mask_diameter**2
-    return Instrument.load(options.instrument).photons(area)
+    return Instrument.load(options.instrument).photons(open_area(options))
+
+
+def open_area(options: Options) -> float:
+    """Return the area of all holes together [m^2]."""
+    return math.pi / 4 * options.fill_factor * options.mask_diameter**2
 
 
 def make_criterion(
@@ -138,7 +135,7 @@ def run(options: Options) -> None:
     """Search, and write the mask, or the best one so far if interrupted."""
     require_wavelength(options.wavelength)
     require_scale(options.scale)
-    turbulence = options.turbulence(options.wavelength)
+    turbulence = options.turbulence(options.wavelength, open_area(options))
     shortest = min((turbulence or {}).get("wavelengths") or (options.wavelength,))
     sampled = Grid.nyquist(options.mask_diameter, min(shortest, options.wavelength), options.n_frequencies)
     criterion = make_criterion(
@@ -148,7 +145,7 @@ def run(options: Options) -> None:
         options.n_frames,
         turbulence,
     )
-    rules = constraints(options)
+    rules = options.constraints()
     if options.r0 is not None and turbulence is None:
         warn_of_wide_holes(options, options.r0)
     last: list[Record] = []
@@ -179,19 +176,6 @@ def run(options: Options) -> None:
             f"{result.relative_mse:.5g}, {table['relative_mse_above_floor']:.5g} above what no mask of this diameter "
             f"can avoid; {result.evaluations} evaluations, {seconds:.0f} s"
         )
-
-
-def constraints(options: Options) -> list[Constraint]:
-    """Return the constraints of the options, in addition to those on the mask disc and on overlaps."""
-    rules: list[Constraint] = []
-    if options.min_gap:
-        rules.append(MinimumGap(options.min_gap))
-    if options.central_obstruction:
-        rules.append(KeepOutDisc(options.central_obstruction))
-    if options.rim_margin:
-        rules.append(RimMargin(options.rim_margin))
-    rules += [KeepOutDisc(diameter, (x, y)) for x, y, diameter in options.keep_out]
-    return rules + [KeepOutSegment((x, y), (to_x, to_y), width) for x, y, to_x, to_y, width in options.spiders]
 
 
 def warn_of_wide_holes(options: Options, r0: float) -> None:

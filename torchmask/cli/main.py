@@ -13,6 +13,8 @@ from torchmask.cli.program import exit_status, parse
 COMMANDS = {
     "plan": "predict how many holes, of what size, and what exposure an observation needs",
     "design": "search the mask with the smallest error of the restored image",
+    "table": "compare numbers of holes, hole sizes, light and turbulence, with a search for each",
+    "rank": "rank the masks of the catalogue, and your own, by the error of the restored image",
     "simulate": "draw short exposures of a scene through a mask and turbulence",
     "restore": "restore the image behind a stack of short exposures (.npz or FITS)",
     "calibrate": "measure how a mask lies, on exposures of a star",

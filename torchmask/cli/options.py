@@ -111,6 +111,9 @@ class FilterOptions:
     """Filter, by its name (bessell-V, twomass-Ks, ...) or a text file with columns wavelength [m] and transmission."""
     n_wavelengths: int = 5
     """Number of wavelengths that represent the band: 3 suffice for a width of 5 percent of the wavelength, 5 for 15."""
+    temperature: float | None = None
+    """Temperature of the source's black-body spectrum inside the filter [K]; None: equally many photons at each
+    wavelength."""
 
     def filter_band(self, wavelength: float) -> Band | None:
         """Return the band of the filter, None without one. Raises ValueError if it does not pass `wavelength` [m]."""
@@ -123,7 +126,7 @@ class FilterOptions:
                 f"filter {self.filter} passes {first:.4g} to {last:.4g} m, and not the wavelength {wavelength:.4g} m, "
                 f"at which r0 is quoted: give one in between, such as its mean, {passband.mean_wavelength:.4g} m"
             )
-        return Band.from_filter(passband, self.n_wavelengths)
+        return Band.from_filter(passband, self.n_wavelengths, self.temperature)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,6 +142,8 @@ class BandOptions(FilterOptions):
         """Return the band as `MyopicDeconvolution` takes it. Raises ValueError for two bands or another filter."""
         band = self.filter_band(wavelength)
         if band is None:
+            if self.temperature is not None:
+                raise ValueError("--temperature is that of light through --filter: give one, or leave it out")
             return {"wavelengths": self.wavelengths or None, "weights": self.weights or None}
         if self.wavelengths or self.weights:
             raise ValueError("--filter and --wavelengths are both given: give only one of them")

@@ -95,7 +95,10 @@ class ConditionOptions(FilterOptions):
             )
         if self.band_width and self.filter is not None:
             raise ValueError("--conditions.band-width and --conditions.filter are both given: give only one of them")
-        even = Band.top_hat(wavelength, self.band_width, self.n_wavelengths) if self.band_width else None
+        even = None
+        if self.band_width:
+            passband = Passband.top_hat(wavelength, self.band_width)
+            even = Band.from_filter(passband, self.n_wavelengths, self.temperature)
         return Conditions(
             sky=sky if self.sky is None else self.sky,
             transparency_scatter=self.transparency_scatter,
@@ -173,6 +176,7 @@ class Options(InstrumentOptions, MaskOptions, RunOptions):
                 filter=known.filter,
                 band_width=known.width or 0.0,
                 n_wavelengths=known.n_wavelengths,
+                temperature=known.source.temperature,
                 pixel_fill_factor=known.camera.pixel_fill or 0.0,
             ),
             n_frames=known.frames,

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from typing import Any
 
+from torchmask.design.rules import MaskRules
 from torchmask.design.search import METHODS
 from torchmask.grid import Grid
 from torchmask.optics.packing import hole_diameter
@@ -16,11 +17,14 @@ AXES = ("n_subapertures", "fill_factor", "n_photons", "n_frames", "diameter_over
 _WHOLE = ("n_subapertures", "n_frames", "seed", "n_pixels", "n_draws")
 _SAMPLES = 512  # minimum across the pupil raster for turbulence, where the sampled OTF biases the error by 0.1 %
 _MAY_BE_ZERO = ("seed", "exponent", "readout_noise")
+_NOT_NUMBERS = ("method", "budget", "pixel_scale", *(field.name for field in fields(MaskRules)))
 
 
 @dataclass(frozen=True)
-class DesignSpace:
+class DesignSpace(MaskRules):
     """Parameters of a design table, which has a row for every combination of the first six.
+
+    The rules of the telescope and the workshop (`MaskRules`) hold for every mask.
 
     Raises ValueError if an axis is empty or repeats a value, or a value is out of range.
     """
@@ -46,7 +50,9 @@ class DesignSpace:
     wavelength: float = 550e-9
     """Wavelength of the observation [m]."""
     n_pixels: int = 256
-    """Number of pixels per side of the image, which is sampled at Nyquist for D."""
+    """Number of pixels per side of the image."""
+    pixel_scale: float | None = None
+    """Angle on the sky of one pixel [rad]; None: the largest without aliasing for D, at the wavelength."""
     exponent: float = 1.5
     """Exponent of the object's power-law power spectrum."""
     knee: float = 1 / 64
@@ -67,7 +73,7 @@ class DesignSpace:
             raise ValueError(f"method is {self.method!r}: known methods are {', '.join(METHODS)}")
         if self.budget is not None:
             _number("budget", self.budget, whole=True)
-        for name in (field.name for field in fields(self) if field.name not in ("method", "budget")):
+        for name in (field.name for field in fields(self) if field.name not in _NOT_NUMBERS):
             given = getattr(self, name)
             values = tuple(_number(name, v, name in _WHOLE) for v in (given if name in AXES else (given,)))
             if len(set(values)) < len(values) or not (values or name == "diameter_over_r0"):
@@ -75,7 +81,15 @@ class DesignSpace:
             object.__setattr__(self, name, values if name in AXES else values[0])
         if self.n_draws < 2:
             raise ValueError(f"n_draws is {self.n_draws}: a standard error needs at least 2")
-        Grid.nyquist(self.mask_diameter, self.wavelength, self.n_pixels)
+        self.constraints()
+        self.grid.require_sampling(self.mask_diameter)
+
+    @property
+    def grid(self) -> Grid:
+        """Grid of the image."""
+        if self.pixel_scale is None:
+            return Grid.nyquist(self.mask_diameter, self.wavelength, self.n_pixels)
+        return Grid(self.n_pixels, self.pixel_scale, self.wavelength)
 
     @property
     def oversampling(self) -> int:
@@ -111,9 +125,9 @@ class DesignSpace:
         if fill_factor > largest * (1 + 1e-9):
             over = strength * math.sqrt(fill_factor / n)
             return f"d/r0 is {over:.3g}, above {self.max_hole_over_r0:g}: fill_factor must be at most {largest:.4g}"
-        relative = math.sqrt(fill_factor / n)
-        if relative * self.n_pixels * self.oversampling < 4:  # the raster is two mask diameters wide
-            need = math.ceil(4 / relative)
+        relative = self.mask_diameter * math.sqrt(fill_factor / n) / self.grid.period  # of the width of the raster
+        if relative * self.n_pixels * self.oversampling < 2:
+            need = math.ceil(2 / relative)
             return f"a hole spans less than 2 samples of the pupil: n_pixels must be at least {need}"
         return None
 

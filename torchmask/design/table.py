@@ -3,6 +3,7 @@
 MSE_a ignores turbulence within a hole, so by itself it would favour one hole that fills the pupil. The table therefore
 makes the number of photons proportional to the collecting area, excludes holes larger than `max_hole_over_r0` times r0,
 and adds the mean of `wiener_mse` under full von Karman screens, the error of a linear restoration with known OTFs.
+With `conditions` the criterion is `TurbulentMSE`, which knows turbulence, exposure, band, pixels and sky.
 """
 
 from __future__ import annotations
@@ -17,14 +18,17 @@ from typing import Any
 import torch
 
 from torchmask.atmosphere.phase import TurbulencePhase
+from torchmask.design.conditions import ExposureConditions
 from torchmask.design.constraint_base import Infeasible
 from torchmask.design.criterion import AsymptoticMSE, wiener_mse
+from torchmask.design.rules import MaskRules
 from torchmask.design.search import search_mask
 from torchmask.design.space import AXES, Design, DesignSpace
 from torchmask.design.sweep import run_tasks
+from torchmask.design.turbulent import TurbulentMSE
 from torchmask.design.workers import require_backend
 from torchmask.grid import Grid
-from torchmask.io import atomic_write, write_json
+from torchmask.io import atomic_write, from_json, to_json, write_json
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.otf import OTF
 from torchmask.record import Callback
@@ -49,6 +53,7 @@ class DesignTable:
 
     space: DesignSpace
     rows: tuple[Design, ...]
+    conditions: ExposureConditions | None = None
 
     def aperture(self, row: Design) -> SparseAperture:
         """Return the mask of a row. Raises ValueError if it is infeasible."""
@@ -83,6 +88,7 @@ def design_table(
     space: DesignSpace,
     folder: str | Path,
     *,
+    conditions: ExposureConditions | None = None,
     backend: str = "loky",
     n_workers: int | None = None,
     callback: Callback | None = None,
@@ -99,6 +105,9 @@ def design_table(
     folder : path
         Folder for the files of the tasks and of the table: table.csv, and table.json with the centres, which are
         written last and replace those of an earlier call.
+    conditions : ExposureConditions, optional
+        Exposure, band, pixels and sky, the sky at the reference fill factor: masks are then searched and measured by
+        `TurbulentMSE` at the r0 of the row, without screens. None: by `AsymptoticMSE`.
     backend : {"loky", "ray"}
         Processes on this machine, or a Ray cluster; see `torchmask.design.sweep.run_tasks`.
     n_workers : int, optional
@@ -109,7 +118,8 @@ def design_table(
     Raises
     ------
     ValueError
-        Before any work, as `run_tasks` does, or if no combination can be built.
+        Before any work, as `run_tasks` and `TurbulentMSE` do, if no combination can be built, and for conditions of a
+        space without turbulence.
 
     Examples
     --------
@@ -126,18 +136,22 @@ def design_table(
     options: dict[str, Any] = {"backend": backend, "n_workers": n_workers, "callback": callback}
 
     feasible = [k for k, row in enumerate(rows) if not row.infeasible]
-    searches = [_search_task(space, rows[k]) for k in feasible]
+    if conditions is not None and not space.diameter_over_r0:
+        raise ValueError("diameter_over_r0 is (): the conditions of an exposure need turbulence, D / r0")
+    searches = [_search_task(space, rows[k], conditions) for k in feasible]
+    _criterion(to_json(searches[0]))  # raises for conditions that cannot be
     found = run_tasks(search, searches, Path(folder) / "tasks", stage="design/table/search", **options)
     for k, result in zip(feasible, found, strict=True):
         rows[k] = replace(rows[k], **{**result, "centers": tuple(map(tuple, result["centers"]))})
 
-    built = [k for k in feasible if not rows[k].infeasible and rows[k].diameter_over_r0 is not None]
+    drawn = conditions is None and bool(space.diameter_over_r0)
+    built = [k for k in feasible if drawn and not rows[k].infeasible]
     trials = [_turbulence_task(space, rows[k]) for k in built]
     measured = run_tasks(measure, trials, Path(folder) / "tasks", stage="design/table/turbulence", **options)
     for k, result in zip(built, measured, strict=True):
         rows[k] = replace(rows[k], **result)
 
-    table = DesignTable(space, tuple(rows))
+    table = DesignTable(space, tuple(rows), conditions)
     write_json(Path(folder) / "table.json", table, replace=True)
     with atomic_write(Path(folder) / "table.csv", replace=True) as file:
         file.write(table.csv().encode())
@@ -148,14 +162,19 @@ def _scene(space: DesignSpace, row: Design) -> dict[str, Any]:
     """Return the values on which searches and measurements depend besides the mask."""
     names = ("mask_diameter", "wavelength", "n_pixels", "exponent", "knee", "readout_noise")
     return {name: getattr(space, name) for name in names} | {
+        "pixel_scale": space.grid.pixel_scale,
         "photons_per_frame": row.photons_per_frame,
         "n_frames": row.n_frames,
         "seed": row.seed,
     }
 
 
-def _search_task(space: DesignSpace, row: Design) -> dict[str, Any]:
-    own = {"n_subapertures": row.n_subapertures, "fill_factor": row.fill_factor}
+def _search_task(space: DesignSpace, row: Design, conditions: ExposureConditions | None) -> dict[str, Any]:
+    own: dict[str, Any] = {"n_subapertures": row.n_subapertures, "fill_factor": row.fill_factor}
+    own["rules"] = {field.name: getattr(space, field.name) for field in fields(MaskRules)}
+    if conditions is not None:
+        own["conditions"] = asdict(conditions.with_light(row.fill_factor / space.reference_fill_factor))
+        own |= {"diameter_over_r0": row.diameter_over_r0, "outer_scale": space.outer_scale}
     return _scene(space, row) | own | {"method": space.method, "budget": space.budget}
 
 
@@ -167,18 +186,24 @@ def _turbulence_task(space: DesignSpace, row: Design) -> dict[str, Any]:
 
 
 def _criterion(task: dict[str, Any]) -> AsymptoticMSE:
-    grid = Grid.nyquist(task["mask_diameter"], task["wavelength"], task["n_pixels"])
+    grid = Grid(task["n_pixels"], task["pixel_scale"], task["wavelength"])
     photons = task["photons_per_frame"]
     object_psd = PowerLawPSD(task["exponent"], photons, task["knee"])
-    return AsymptoticMSE(grid, object_psd, NoisePSD(photons, task["readout_noise"]), task["n_frames"])
+    noise_psd = NoisePSD(photons, task["readout_noise"])
+    if "conditions" not in task:
+        return AsymptoticMSE(grid, object_psd, noise_psd, task["n_frames"])
+    conditions = from_json(ExposureConditions, task["conditions"])
+    r0 = task["mask_diameter"] / task["diameter_over_r0"]
+    return TurbulentMSE(grid, object_psd, noise_psd, task["n_frames"], **conditions.keywords(r0, task["outer_scale"]))
 
 
 def search(task: dict[str, Any]) -> dict[str, Any]:
     """Run the task of a search: find the best mask for one combination, or say why there is none."""
     criterion = _criterion(task)
     names = ("n_subapertures", "mask_diameter", "fill_factor", "method", "seed", "budget")
+    rules = from_json(MaskRules, task["rules"]).constraints()
     try:
-        result = search_mask(criterion, **{name: task[name] for name in names})
+        result = search_mask(criterion, **{name: task[name] for name in names}, constraints=rules)
     except Infeasible as error:
         return {"centers": [], "infeasible": str(error)}
     floor = criterion.floor(task["mask_diameter"]) / criterion.object_psd.mean()

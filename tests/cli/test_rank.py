@@ -1,0 +1,63 @@
+"""torchmask rank: masks of the catalogue and of files, on one telescope."""
+
+import json
+
+import pytest
+
+from torchmask.cli.main import main
+from torchmask.cli.rank import Options, make_criterion
+from torchmask.design.manufacture import load_mask, save_json
+from torchmask.design.turbulent import TurbulentMSE
+from torchmask.optics.aperture import SparseAperture
+
+TINY = ["--n-frequencies", "32", "--budget", "60"]
+
+
+def test_masks_of_catalogue_files_and_searches_are_ranked(tmp_path, capsys):
+    mine = SparseAperture.from_catalog("golay6", 2.0, 0.05)
+    save_json(tmp_path / "mine.json", mine)
+    masks = ["golay9", "keck_lws_pattern2a_9", str(tmp_path / "mine.json")]
+    assert main(["rank", *masks, "--search", "6", *TINY, "--fill-factor", "0.1", "--out", str(tmp_path / "run")]) == 0
+    written = json.loads((tmp_path / "run/ranking.json").read_text())
+    rows = {(row["mask"], row["layout"]): row for row in written["rows"]}
+    assert set(rows) == {
+        ("golay9", "laid afresh"),
+        ("keck_lws_pattern2a_9", "laid afresh"),
+        ("mine", "laid afresh"),
+        ("mine", "as built"),
+        ("torchmask_6", "searched"),
+    }
+    assert rows["mine", "as built"]["area"] == pytest.approx(float(mine.area) / 4, rel=1e-12)
+    own = load_mask(tmp_path / "run/torchmask_6.json")
+    criterion = make_criterion(Options(n_frequencies=32, fill_factor=0.1))(float(own.area))
+    assert rows["torchmask_6", "searched"]["relative_mse"] == pytest.approx(float(criterion.relative(own)), rel=1e-9)
+    assert (tmp_path / "run/ranking.png").read_bytes().startswith(b"\x89PNG")
+    said = capsys.readouterr().out
+    assert "not ranked: keck_lws_pattern2a_9, as built: 3 pairs of holes overlap" in said
+
+
+def test_light_and_sky_are_in_proportion_to_the_area():
+    seen = {"criterion": "turbulent", "r0": 0.2, "outer_scale": 20.0, "sky": 3.0, "n_photons": 1e6}
+    criterion = make_criterion(Options(**seen, n_frequencies=32, readout_noise=2.0, n_pixels=64))
+    full, half = criterion(0.15 * 3.141592653589793 / 4), criterion(0.15 * 3.141592653589793 / 8)
+    assert isinstance(half, TurbulentMSE)
+    assert half.seeing == full.seeing
+    assert half.seeing.r0 == 0.2
+    noise = [float(each.noise_psd[0, 0]) for each in (full, half)]
+    assert noise == pytest.approx([1e6 + 64**2 * (4 + 3.0), 5e5 + 64**2 * (4 + 1.5)], rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["golay"], "no mask is called 'golay'"),
+        (["--fill-factor", "-0.15"], "fill_factor is -0.15"),
+        (["--wavelength", "550"], "550 nm are 550e-9"),
+        (["--central-obstruction", "0.95"], "no mask is left to rank"),
+        (["--wind", "3"], "--wind needs --criterion turbulent"),
+    ],
+)
+def test_impossible_requests_are_refused(given, said, tmp_path, capsys):
+    assert main(["rank", *given, *TINY, "--out", str(tmp_path / "new" / "run")]) == 1
+    assert said in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,198 @@
+"""`torchmask rank`: masks of the catalogue and of files, by the error of the restored image."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from torchmask.cli.criterion_options import CriterionOptions, exposure_options
+from torchmask.cli.options import RunOptions, is_mask_file, require_wavelength
+from torchmask.cli.run import Run, new_run
+from torchmask.design.criterion import AsymptoticMSE
+from torchmask.design.manufacture import load_mask, save_json
+from torchmask.design.pattern import Pattern
+from torchmask.design.ranking import Layout, Ranking, rank_masks
+from torchmask.design.rules import MaskRules
+from torchmask.design.search import search_mask
+from torchmask.design.turbulent import TurbulentMSE
+from torchmask.grid import Grid
+from torchmask.instrument.instrument import Instrument
+from torchmask.io import atomic_write
+from torchmask.optics import catalog
+from torchmask.optics.aperture import SparseAperture
+from torchmask.record import label_stage
+from torchmask.spectra import NoisePSD, PowerLawPSD
+from torchmask.viz.ranking import ranking_figure
+
+_PHOTONS = 1e7  # per frame, if nothing is given
+_SHOWN = 5  # masks named on the terminal
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(CriterionOptions, MaskRules, RunOptions):
+    """Rank masks by the error of the restored image, on one telescope.
+
+    Each mask is ranked twice: as built, with its own holes and the light that they pass, scaled to the pupil; and laid
+    afresh, its pattern fitted into the pupil with holes of the same collecting area for all. Masks that would overlap
+    or break a rule are named with the reason. Writes ranking.md, ranking.csv, ranking.json, a picture and the searched
+    masks to a new folder.
+    """
+
+    masks: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="NAME|FILE")] = ()
+    """Masks, by their name in the catalogue or their file (.json, .dxf, .fits); none: the whole catalogue."""
+    search: tuple[int, ...] = ()
+    """Numbers of holes for which a mask is searched, to compare with."""
+    mask_diameter: float = 1.0
+    """Diameter of the pupil and of all masks, D [m]."""
+    fill_factor: float = 0.15
+    """Common collecting area N d^2 / D^2 of round holes for masks laid afresh and searched."""
+    wavelength: float = 550e-9
+    """Wavelength of the observation [m]."""
+    n_photons: float | None = None
+    """Electrons per frame at --fill-factor, others in proportion to their area; None: from --instrument, or 1e7."""
+    n_frames: int = 20
+    """Number of short exposures for the restoration."""
+    readout_noise: float = 0.0
+    """Read-out noise [electrons rms per pixel and frame]."""
+    n_pixels: int = 128
+    """Pixels per side of the detector's field, which sets the total read-out noise; the criterion has its own grid."""
+    exponent: float = 1.5
+    """Exponent of the object's power-law power spectrum."""
+    knee: float = 1 / 64
+    """Frequency below which that spectrum is flat [cycles/pixel], one over the object's size in pixels."""
+    n_frequencies: int = 256
+    """Frequencies per side of the criterion's grid."""
+    budget: int = 20_000
+    """Evaluations of each search."""
+    seed: int = 0
+    """Random seed of the searches."""
+    allow_overlap: bool = False
+    """Rank a mask as built although its holes overlap; the criterion counts the light in overlaps twice."""
+
+    @classmethod
+    def of_instrument(cls, known: Instrument) -> Options:
+        """What an instrument gives; its light and its sky depend on the collecting area."""
+        return cls(
+            mask_diameter=known.telescope.diameter,
+            central_obstruction=known.telescope.central_obstruction,
+            wavelength=known.mean_wavelength,
+            n_frames=known.frames,
+            readout_noise=known.camera.readout_noise,
+            n_pixels=known.camera.n_pixels,
+            r0=known.site.r0,
+            outer_scale=known.site.outer_scale,
+            **exposure_options(known),
+            exponent=known.source.exponent,
+            knee=known.knee,
+        )
+
+
+def common_area(options: Options) -> float:
+    """Return the open area of masks laid afresh [m^2]."""
+    return math.pi / 4 * options.fill_factor * options.mask_diameter**2
+
+
+def make_criterion(options: Options) -> Callable[[float], AsymptoticMSE]:
+    """Return the criterion as a function of the open area [m^2], to which light and sky are in proportion."""
+    common = common_area(options)
+    light = options.n_photons
+    if light is None:
+        light = _PHOTONS if options.instrument is None else Instrument.load(options.instrument).photons(common)
+    turbulence = options.turbulence(options.wavelength, common)
+    shortest = min((turbulence or {}).get("wavelengths") or (options.wavelength,))
+    sampled = Grid.nyquist(options.mask_diameter, min(shortest, options.wavelength), options.n_frequencies)
+    grid = replace(sampled, wavelength=options.wavelength)
+
+    def criterion(area: float) -> AsymptoticMSE:
+        photons = light * area / common
+        known: tuple[Any, ...] = (
+            grid,
+            PowerLawPSD(options.exponent, photons, options.knee),
+            NoisePSD(photons, options.readout_noise, options.n_pixels**2),
+            options.n_frames,
+        )
+        if turbulence is None:
+            return AsymptoticMSE(*known)
+        return TurbulentMSE(*known, **(turbulence | {"sky": turbulence["sky"] * area / common}))
+
+    return criterion
+
+
+def patterns(options: Options) -> list[Pattern]:
+    """Return the masks of the options. Raises ValueError for an unknown name or a file that is no mask."""
+    return [
+        Pattern.of(Path(name).stem, load_mask(name)) if is_mask_file(Path(name)) else Pattern.from_catalog(name)
+        for name in options.masks or catalog.names()
+    ]
+
+
+def search_masks(options: Options, criterion: AsymptoticMSE, output: Run) -> dict[str, SparseAperture]:
+    """Search a mask for each number of holes, and write it."""
+    masks = {}
+    for n in options.search:
+        result = search_mask(
+            criterion,
+            n,
+            options.mask_diameter,
+            options.fill_factor,
+            seed=options.seed,
+            budget=options.budget,
+            constraints=options.constraints(),
+            callback=label_stage(output.callback, f"{n}_holes"),
+        )
+        name = f"torchmask_{n}"
+        masks[name] = result.aperture
+        save_json(output.directory / f"{name}.json", result.aperture, options.wavelength)
+    return masks
+
+
+def ranking(options: Options, output: Run) -> Ranking:
+    """Rank, and write everything to the folder of the run."""
+    chosen, criterion = patterns(options), make_criterion(options)
+    found = rank_masks(
+        chosen,
+        criterion,
+        options.mask_diameter,
+        options.fill_factor,
+        searched=search_masks(options, criterion(common_area(options)), output) if options.search else None,
+        rules=MaskRules(**{name: getattr(options, name) for name in asdict(MaskRules())}),
+        allow_overlap=options.allow_overlap,
+        callback=output.callback,
+    )
+    with atomic_write(output.directory / "ranking.csv") as file:
+        file.write(found.csv().encode())
+    rows = [asdict(row) | {"layout": row.layout.value} for row in found.rows]
+    numbers = {"rows": rows, "not_ranked": found.left_out, "floor": found.floor}
+    output.report("ranking", numbers, f"{heading(options)}\n\n{found}", ranking_figure(found))
+    return found
+
+
+def heading(options: Options) -> str:
+    """Return what stands above the table."""
+    air = "independent pistons" if options.criterion == "asymptotic" else f"turbulence of r0 = {options.r0:g} m"
+    return (
+        f"# Masks ranked by the error of the restored image\n\nD = {options.mask_diameter:g} m, "
+        f"{1e9 * options.wavelength:g} nm, {air}, K = {options.n_frames}, p = {options.exponent:g}. The common "
+        f"collecting area is N d^2 / D^2 = {options.fill_factor:g} of round holes. The floor is the part no mask can "
+        "change; torchmask_N are searched masks, with which `over our best` compares those of the same N and area."
+    )
+
+
+def run(options: Options) -> None:
+    """Rank, and name the best."""
+    require_wavelength(options.wavelength)
+    with new_run("rank", options, options.seed) as output:
+        found = ranking(options, output)
+        for title, layouts in (
+            ("the same collecting area", (Layout.AFRESH, Layout.SEARCHED)),
+            ("as built", (Layout.AS_BUILT,)),
+        ):
+            best = [f"{row.mask} {row.relative_mse:.4f}" for row in found.of(*layouts)[:_SHOWN]]
+            if best:
+                output.summary.append(f"{title}, relative MSE of the best: {', '.join(best)}")
+        output.summary.extend(f"not ranked: {name}: {reason}" for name, reason in found.left_out.items())

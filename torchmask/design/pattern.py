@@ -1,0 +1,79 @@
+"""The pattern of a mask apart from its size, to be laid into any pupil."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from torchmask.optics import catalog
+from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.shapes import Disc, Shape
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """Where the holes of a mask lie, and the mask as built.
+
+    centers : (N, 2) in any unit
+    built : the mask as built, of any diameter; None if it has no size of its own
+    """
+
+    name: str
+    centers: np.ndarray
+    shape: Shape
+    built: SparseAperture | None
+
+    @classmethod
+    def from_catalog(cls, name: str) -> Pattern:
+        """Return a mask of the catalogue. Raises ValueError for an unknown name."""
+        entry = catalog.entry(name)
+        built = SparseAperture.from_catalog(entry.name) if entry.as_built else None
+        return cls(entry.name, np.array(entry.centers), entry.shape, built)
+
+    @classmethod
+    def of(cls, name: str, aperture: SparseAperture) -> Pattern:
+        """Return the pattern of a mask, such as one from a file."""
+        return cls(name, aperture.centers.detach().cpu().numpy(), aperture.shape, aperture)
+
+    def scaled(self, mask_diameter: float) -> SparseAperture | None:
+        """Return the mask as built, scaled to a mask diameter [m]; None if it has no size of its own."""
+        if self.built is None:
+            return None
+        scale = mask_diameter / self.built.mask_diameter
+        hole = scale * self.built.subaperture_diameter
+        return SparseAperture(scale * self.built.centers, hole, mask_diameter, self.shape)
+
+    def largest_fill_factor(self) -> float:
+        """Return the largest N d^2 / D^2, in the area of round holes, at which the holes do not overlap.
+
+        With gap m between the closest centres and radius R of their enclosing circle, holes of size d and outer size
+        c d fit if d <= m s and c d + 2 R s <= D for some scale s.
+        """
+        _, radius = catalog.smallest_enclosing_circle(self.centers)
+        first, second = np.triu_indices(len(self.centers), 1)
+        gap = float(self.shape.separation(torch.from_numpy(self.centers[first] - self.centers[second])).min())
+        relative = gap / (2 * radius + self.shape.outer_diameter(gap))
+        return len(self.centers) * relative**2 * self._area_over_disc
+
+    def afresh(self, mask_diameter: float, fill_factor: float) -> SparseAperture:
+        """Return the pattern fitted into a disc [m] with holes of the area of round ones with N d^2 / D^2.
+
+        Its smallest enclosing circle is centred, and its outermost holes touch the rim. Raises ValueError if its holes
+        would overlap, and says how large a fill factor it can carry.
+        """
+        if not (math.isfinite(fill_factor) and fill_factor > 0):
+            raise ValueError(f"fill_factor is {fill_factor}: it must be finite and positive")
+        most = self.largest_fill_factor()
+        if fill_factor > most:
+            raise ValueError(f"its holes would overlap: it carries a fill factor of at most {most:.4g}")
+        hole = mask_diameter * math.sqrt(fill_factor / self._area_over_disc / len(self.centers))
+        middle, radius = catalog.smallest_enclosing_circle(self.centers)
+        room = (mask_diameter - self.shape.outer_diameter(hole)) / 2
+        return SparseAperture((self.centers - middle) * (room / radius), hole, mask_diameter, self.shape)
+
+    @property
+    def _area_over_disc(self) -> float:
+        return self.shape.area(1.0) / Disc().area(1.0)
