@@ -21,9 +21,9 @@ def section(title):
     return TEXT.split(f"\n## {title}\n", 1)[1].split("\n## ", 1)[0]
 
 
-def printed_commands():
+def printed_commands(title="Command line"):
     """The words of each command of the section's console block, without its comment."""
-    block = re.search(r"```console\n(.*?)```", section("Command line"), re.DOTALL)
+    block = re.search(r"```console\n(.*?)```", section(title), re.DOTALL)
     assert block is not None
     lines = block[1].replace("\\\n", " ").splitlines()
     return [shlex.split(line.removeprefix("$ "), comments=True) for line in lines]
@@ -50,6 +50,17 @@ def test_design_simulate_restore_work_one_after_the_other_as_printed(tmp_path):
     assert mask_wavelength(tmp_path / "runs/mask/mask.json") == 2.2e-6
     numbers = json.loads((tmp_path / "runs/image/metrics.json").read_text())
     assert numbers["score"] < 0.5 * numbers["mean_frame_score"]
+
+
+@pytest.mark.slow
+def test_the_plan_works_as_printed(tmp_path):
+    (words,) = printed_commands("Plan an observation")
+    assert words[:2] == ["torchmask", "plan"]
+    program = str(Path(sys.executable).with_name("torchmask"))
+    done = subprocess.run([program, *words[1:]], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    for name in ("plan.md", "plan.png", "mask.json", "instrument.json"):
+        assert (tmp_path / "runs/plan" / name).is_file(), name
 
 
 @pytest.mark.slow

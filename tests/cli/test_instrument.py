@@ -1,13 +1,19 @@
 """One file of what is known of an observation, for several commands: what is given beside it wins."""
 
+import dataclasses
 import json
 import math
 
 import pytest
+import torch
 import yaml
 
+from torchmask.cli import design, plan, rank
 from torchmask.cli.main import main
+from torchmask.cli.program import parse
 from torchmask.design.manufacture import load_mask, mask_wavelength, save_json
+from torchmask.design.observed import instrument_criterion
+from torchmask.design.turbulent import TurbulentMSE
 from torchmask.grid import ARCSEC
 from torchmask.instrument.instrument import Instrument
 from torchmask.instrument.parts import Camera, Site, Source, Telescope
@@ -17,7 +23,7 @@ from torchmask.optics.aperture import SparseAperture
 MASK = SparseAperture.from_catalog("golay6", 1.2, 0.1)
 KNOWN = Instrument(
     telescope=Telescope(diameter=1.2, central_obstruction=0.2, throughput=0.5),
-    source=Source(magnitude=2.0, size=3.0, exponent=2.0),
+    source=Source(magnitude=2.0, size=3.0, exponent=2.0, temperature=3000.0),
     site=Site(r0=0.3, wind=5.0, sky=4.0, outer_scale=30.0),
     camera=Camera(n_pixels=24, readout_noise=2.5, pixel_fill=0.9),
     wavelength=700e-9,
@@ -49,7 +55,8 @@ def test_frames_are_simulated_as_the_instrument_takes_them(folder, capsys):
     config = yaml.safe_load((folder / "run/config.yaml").read_text())
     assert config["turbulence"]["exposure_time"] == 3e-3
     assert config["turbulence"]["wind"] == [5.0, 0.0]
-    assert (config["conditions"]["band_width"], config["conditions"]["pixel_fill_factor"]) == (20e-9, 0.9)
+    conditions = config["conditions"]
+    assert (conditions["band_width"], conditions["pixel_fill_factor"], conditions["temperature"]) == (20e-9, 0.9, 3e3)
     again = ["simulate", "--config", str(folder / "run/config.yaml"), "--out", str(folder / "again")]
     assert main(again) == 0
     assert Observation.load(folder / "again/stack.npz").frames.equal(stack.frames)
@@ -69,7 +76,7 @@ def test_a_mask_is_designed_for_the_instrument(folder):
         "9",
     ]
     told = ["--instrument", str(folder / "instrument.json"), "--out", str(folder / "run")]
-    assert main(["design", *options, *told]) == 0
+    assert main(["design", *options, *told, "--criterion", "asymptotic"]) == 0
     mask = load_mask(folder / "run/mask.json")
     assert mask.mask_diameter == 1.2
     assert mask_wavelength(folder / "run/mask.json") == 700e-9
@@ -84,7 +91,37 @@ def test_a_mask_is_designed_for_the_instrument(folder):
     assert metrics["mse"] / metrics["relative_mse"] == pytest.approx(photons**2 * float(psd), rel=0.02)
 
 
-@pytest.mark.parametrize("command", ["design", "simulate"])
+@pytest.mark.parametrize("module", [design, rank])
+def test_the_criterion_of_an_instrument_is_that_of_its_whole_site(module, folder):
+    options = dataclasses.replace(module.Options.of_instrument(KNOWN), instrument=folder / "instrument.json")
+    area = math.pi / 4 * 0.15 * 1.2**2
+    known = instrument_criterion(KNOWN, area, 32)
+    psds = KNOWN.object_psd(area), KNOWN.noise_psd(area)
+    criterion = TurbulentMSE(known.grid, *psds, KNOWN.frames, **options.turbulence(700e-9, area))
+    for name in ("seeing", "pixel"):
+        assert getattr(criterion, name) == getattr(known, name), name
+    assert criterion.band.wavelengths == known.band.wavelengths
+    assert criterion.band.shares == pytest.approx(known.band.shares, rel=1e-14)
+    torch.testing.assert_close(criterion.noise_psd, known.noise_psd, rtol=1e-12, atol=0)
+    assert dataclasses.replace(options, sky=9.0).turbulence(700e-9, area)["sky"] == 9.0  # given beside it
+    assert dataclasses.replace(options, criterion="asymptotic").turbulence(700e-9, area) is None
+
+
+def test_a_filter_stays_a_filter_with_the_light_of_the_source():
+    filtered = dataclasses.replace(KNOWN, filter="bessell-R", wavelength=None, width=None)
+    options = design.Options.of_instrument(filtered)
+    found = options.turbulence(filtered.mean_wavelength, 0.1)
+    assert (options.filter, options.wavelengths) == ("bessell-R", ())
+    assert (found["wavelengths"], found["weights"]) == (filtered.band.wavelengths, filtered.band.shares)
+
+
+def test_a_plan_is_made_of_the_whole_file(folder):
+    parsed = parse(plan.Options, "plan", ["--instrument", str(folder / "instrument.json"), "--site.wind", "7"], prog="")
+    expected = dataclasses.replace(KNOWN, site=dataclasses.replace(KNOWN.site, wind=7.0))
+    assert plan.instrument_of(parsed) == expected
+
+
+@pytest.mark.parametrize("command", ["plan", "design", "rank", "simulate"])
 def test_files_that_are_no_instrument_are_refused(command, folder, capsys):
     assert main([command, "--instrument", str(folder / "mask.json")]) == 1
     assert "cannot be read as an instrument" in capsys.readouterr().err

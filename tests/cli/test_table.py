@@ -17,7 +17,21 @@ from torchmask.instrument.parts import Camera, Site, Source, Telescope
 from torchmask.optics.aperture import SparseAperture
 from torchmask.spectra import NoisePSD, PowerLawPSD
 
-TINY = "--n-subapertures 3 5 --n-pixels 32 --n-frames 2 --n-draws 2 --budget 64 --workers 1".split()
+TINY = [
+    "--n-subapertures",
+    "3",
+    "5",
+    "--n-pixels",
+    "32",
+    "--n-frames",
+    "2",
+    "--n-draws",
+    "2",
+    "--budget",
+    "64",
+    "--workers",
+    "1",
+]
 
 
 def test_rows_are_written_and_not_computed_twice(tmp_path, capsys):
@@ -67,8 +81,8 @@ def test_conditions_that_cannot_be_are_refused_before_any_work(tmp_path):
     ):
         with pytest.raises(ValueError, match=said):
             design_table(space, tmp_path / "table", conditions=conditions, n_workers=1)
+    still = DesignSpace(n_subapertures=(3,), n_pixels=32, diameter_over_r0=())
     with pytest.raises(ValueError, match="need turbulence"):
-        still = DesignSpace(n_subapertures=(3,), n_pixels=32, diameter_over_r0=())
         design_table(still, tmp_path / "table", conditions=ExposureConditions(), n_workers=1)
     assert not (tmp_path / "table").exists()
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
-from torchmask.cli.options import FULL, CatalogOptions, MaskOptions, RunOptions, load_aperture
+from torchmask.cli.options import FULL, CatalogOptions, InstrumentOptions, MaskOptions, RunOptions, load_aperture
 from torchmask.cli.run import new_run
 from torchmask.design.manufacture import save_json
 from torchmask.instrument.instrument import Instrument
@@ -23,7 +23,7 @@ from torchmask.viz.planning import plan_figure
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(Instrument, CatalogOptions, RunOptions):
+class Options(Instrument, CatalogOptions, InstrumentOptions, RunOptions):
     """Plan an observation: how many holes, of what size, and what exposure restore the best image.
 
     For every number of holes and hole diameter a mask is searched, quickly; for each of them and every exposure the
@@ -49,10 +49,19 @@ class Options(Instrument, CatalogOptions, RunOptions):
     seed: int = 0
     """Of the searches."""
 
+    @classmethod
+    def of_instrument(cls, known: Instrument) -> Options:
+        """What an instrument gives, which is all of it."""
+        return cls(**_fields(known))
+
 
 def instrument_of(options: Instrument) -> Instrument:
     """The instrument among the options."""
-    return Instrument(**{item.name: getattr(options, item.name) for item in dataclasses.fields(Instrument)})
+    return Instrument(**_fields(options))
+
+
+def _fields(known: Instrument) -> dict[str, Any]:
+    return {item.name: getattr(known, item.name) for item in dataclasses.fields(Instrument)}
 
 
 def existing_mask(options: Options) -> Aperture | None:
