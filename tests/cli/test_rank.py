@@ -51,7 +51,7 @@ def test_light_and_sky_are_in_proportion_to_the_area():
     ("given", "said"),
     [
         (["golay"], "no mask is called 'golay'"),
-        (["--fill-factor", "-0.15"], "fill_factor is -0.15"),
+        (["--fill-factor", "-0.15"], "--fill-factor is -0.15"),
         (["--wavelength", "550"], "550 nm are 550e-9"),
         (["--central-obstruction", "0.95"], "no mask is left to rank"),
         (["--wind", "3"], "--wind needs --criterion turbulent"),

@@ -129,11 +129,11 @@ def parse(options: type[T], command: str, argv: Sequence[str], *, prog: str, des
     path, resumed = given.get("config"), given.get("resume")
     if path is None and resumed is not None:
         path = resumed / CONFIG
-    default: dict[str, Any] = {} if path is None else {"default": load_config(path, options, command)}
     instrument = given.get("instrument")
+    if instrument is not None and path is not None:
+        raise ValueError("--instrument and --config both say what is not given here: give one")
+    default: dict[str, Any] = {} if path is None else {"default": load_config(path, options, command)}
     if instrument is not None:
-        if default:
-            raise ValueError("--instrument and --config both say what is not given here: give one")
         default["default"] = typing.cast(Any, options).of_instrument(Instrument.load(instrument))
     with _checked_at_the_end(options):
         return tyro.cli(options, prog=prog, args=argv, description=description, **default)

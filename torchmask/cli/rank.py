@@ -93,7 +93,9 @@ class Options(CriterionOptions, MaskRules, RunOptions):
 
 
 def common_area(options: Options) -> float:
-    """Return the open area of masks laid afresh [m^2]."""
+    """Return the open area of masks laid afresh [m^2]. Raises ValueError for a fill factor that cannot be."""
+    if not (math.isfinite(options.fill_factor) and options.fill_factor > 0):
+        raise ValueError(f"--fill-factor is {options.fill_factor:g}: it must be finite and positive")
     return math.pi / 4 * options.fill_factor * options.mask_diameter**2
 
 

@@ -73,7 +73,7 @@ class DesignSpace(MaskRules):
             raise ValueError(f"method is {self.method!r}: known methods are {', '.join(METHODS)}")
         if self.budget is not None:
             _number("budget", self.budget, whole=True)
-        for name in (field.name for field in fields(self) if field.name not in _NOT_NUMBERS):
+        for name in (field.name for field in fields(DesignSpace) if field.name not in _NOT_NUMBERS):
             given = getattr(self, name)
             values = tuple(_number(name, v, name in _WHOLE) for v in (given if name in AXES else (given,)))
             if len(set(values)) < len(values) or not (values or name == "diameter_over_r0"):
