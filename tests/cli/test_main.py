@@ -37,7 +37,14 @@ def help_of(command, capsys):
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_shows_every_option(command, capsys):
     text = help_of(command, capsys)
-    positional = {"stacks", "files", "name" if command == "masks" else "", "path" if command == "view" else ""}
+    positional = {
+        "stacks",
+        "files",
+        "folder",
+        "name" if command == "masks" else "",
+        "path" if command == "view" else "",
+    }
+    positional |= {"masks"} if command == "rank" else set()
     for name, _ in leaves(options_of(command)):
         if name not in positional:
             assert f"--{name.replace('_', '-')}" in text
@@ -45,6 +52,12 @@ def test_help_shows_every_option(command, capsys):
 
 # What is measured in a unit, and how help writes it; numbers that are not here count things or have none.
 UNITS = {
+    "temperature": r"\[K\]",
+    "conditions.temperature": r"\[K\]",
+    "pixel_scale": r"\[rad\]",
+    "reference_fill_factor": "Fill factor",
+    "diameter_over_r0": "D / r0",
+    "max_hole_over_r0": "units of r0",
     "wavelength": r"\[m\]",
     "wavelengths": r"\[m\]",
     "bandwidth": r"\[m\]",

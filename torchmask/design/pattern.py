@@ -72,7 +72,8 @@ class Pattern:
         hole = mask_diameter * math.sqrt(fill_factor / self._area_over_disc / len(self.centers))
         middle, radius = catalog.smallest_enclosing_circle(self.centers)
         room = (mask_diameter - self.shape.outer_diameter(hole)) / 2
-        return SparseAperture((self.centers - middle) * (room / radius), hole, mask_diameter, self.shape)
+        centers = torch.from_numpy((self.centers - middle) * (room / radius))
+        return SparseAperture(centers, hole, mask_diameter, self.shape)
 
     @property
     def _area_over_disc(self) -> float:

@@ -34,7 +34,7 @@ class DesignSpace(MaskRules):
     fill_factor: tuple[float, ...] = (0.15,)
     """Fill factors N d^2 / D^2, the collecting area of holes of diameter d in a mask of diameter D."""
     n_photons: tuple[float, ...] = (1e7,)
-    """Numbers of photons per frame at `reference_fill_factor`; at others they are in proportion to N d^2."""
+    """Electrons per frame at `reference_fill_factor`; at others they are in proportion to N d^2."""
     n_frames: tuple[int, ...] = (20,)
     """Numbers of exposures, K."""
     diameter_over_r0: tuple[float, ...] = (7.0,)
