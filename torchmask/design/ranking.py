@@ -169,7 +169,7 @@ def rank_masks(
     >>> patterns = [Pattern.from_catalog(name) for name in ("golay6", "jwst_niriss_ami_7")]
     >>> light = lambda area: AsymptoticMSE(grid, PowerLawPSD(1.5, 1e8 * area), NoisePSD(1e8 * area), 20)
     >>> [(row.mask, row.layout.value) for row in rank_masks(patterns, light, 1.0, 0.1).rows]
-    [('golay6', 'laid afresh'), ('jwst_niriss_ami_7', 'laid afresh'), ('jwst_niriss_ami_7', 'as built')]
+    [('jwst_niriss_ami_7', 'laid afresh'), ('golay6', 'laid afresh'), ('jwst_niriss_ami_7', 'as built')]
     """
     names = [pattern.name for pattern in patterns] + list(searched or {})
     if len(set(names)) < len(names):
