@@ -23,7 +23,8 @@ def named_layers(name: str, n_layers: int = 8) -> Layers:
         "hv57" is the Hufnagel-Valley model with an upper-altitude wind of 21 m/s rms and a ground strength of
         1.7e-14 m^(-2/3), named after its r0 of 5 cm and its theta0 of 7 microrad at 500 nm (Tyson, Principles of
         Adaptive Optics, section 2.1; Hardy, Adaptive Optics for Astronomical Telescopes, section 3.6). Its wind is
-        Bufton's, 5 m/s at the ground and 35 m/s at 9.4 km (Appl. Opt. 12, 1785, 1973).
+        Bufton's, 5 m/s at the ground and 35 m/s at 9.4 km (Appl. Opt. 12, 1785, 1973). The r0 of the same profile is
+        4.98 cm where the constant 0.4234 of `Layers.r0` is rounded to 0.42, and 4.96 cm where it is not.
 
         "las_campanas" has seven layers and an r0 of 16 cm at 500 nm (Males & Guyon, J. Astron. Telesc. Instrum.
         Syst. 4, 019001, 2018, after Prieto et al., Proc. SPIE 7733, 77334O, 2010).
