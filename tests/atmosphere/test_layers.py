@@ -45,7 +45,7 @@ def test_hv57_has_its_scales_whatever_the_number_of_layers(n_layers):
     assert layers.theta0(WAVELENGTH) == pytest.approx(theta0, rel=1e-4)
     assert layers.tau0(WAVELENGTH) == pytest.approx(tau0, rel=1e-4)
     assert layers.greenwood_frequency(WAVELENGTH) == pytest.approx(greenwood, rel=2e-4)
-    # In closed form: three integrals of exponentials, and the constant that makes the structure function 6.88 (r/r0)^5/3.
+    # In closed form: three integrals of exponentials, and the constant of D = 6.88 (r/r0)^(5/3).
     strength = 0.00594 * (21 / 27) ** 2 * 1e-17 * math.factorial(10) + 2.7e-16 * 1500 + 1.7e-14 * 100
     path = math.sqrt(math.pi) * math.gamma(-5 / 6) / math.gamma(-1 / 3)  # 2.914
     constant = path / (2 * (24 / 5 * math.gamma(6 / 5)) ** (5 / 6))
