@@ -21,7 +21,7 @@ class OTF(PSF):
     >>> from torchmask.optics.aperture import FullAperture
     >>> grid = Grid.nyquist(1.0, 550e-9, 64)
     >>> otf = OTF(FullAperture(1.0), grid, oversampling=4)()
-    >>> round(float(otf[0, 0].real), 12), round(float(otf[0, 16].real), 2)  # at half the cut-off the closed form is 0.391
+    >>> round(float(otf[0, 0].real), 12), round(float(otf[0, 16].real), 2)  # closed form: 0.391
     (1.0, 0.39)
     """
 
