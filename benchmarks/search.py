@@ -57,7 +57,7 @@ def main(config: Config) -> None:
         torch.set_num_threads(config.threads)
     clock = time.perf_counter if config.clock == "wall" else time.process_time
     criterion = AsymptoticMSE(Grid.nyquist(1.0, 550e-9, 256), PowerLawPSD(1.5, 1e7), NoisePSD(1e7), 20)
-    floor = float(criterion.floor(1.0) / criterion.object_psd.mean())
+    floor = criterion.relative_floor(1.0)
     print(f"{config.seconds:g} s ({config.clock}) a search, {config.seeds} seeds, {torch.get_num_threads()} threads")
     print(f"{'N':>3} {'method':<15} {'median':>8} {'best':>8} {'worst':>8} {'above floor':>11} {'budget':>8} {'s':>6}")
     for n in config.n_subapertures:

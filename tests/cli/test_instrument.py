@@ -13,7 +13,6 @@ from torchmask.cli.main import main
 from torchmask.cli.program import parse
 from torchmask.design.manufacture import load_mask, mask_wavelength, save_json
 from torchmask.design.observed import instrument_criterion
-from torchmask.design.turbulent import TurbulentMSE
 from torchmask.grid import ARCSEC
 from torchmask.instrument.instrument import Instrument
 from torchmask.instrument.parts import Camera, Site, Source, Telescope
@@ -92,19 +91,33 @@ def test_a_mask_is_designed_for_the_instrument(folder):
 
 
 @pytest.mark.parametrize("module", [design, rank])
-def test_the_criterion_of_an_instrument_is_that_of_its_whole_site(module, folder):
-    options = dataclasses.replace(module.Options.of_instrument(KNOWN), instrument=folder / "instrument.json")
-    area = math.pi / 4 * 0.15 * 1.2**2
-    known = instrument_criterion(KNOWN, area, 32)
-    psds = KNOWN.object_psd(area), KNOWN.noise_psd(area)
-    criterion = TurbulentMSE(known.grid, *psds, KNOWN.frames, **options.turbulence(700e-9, area))
-    for name in ("seeing", "pixel"):
+@pytest.mark.parametrize("pixel_scale", [None, 0.03])  # arcsec
+def test_the_criterion_of_an_instrument_is_the_same_in_every_command(module, pixel_scale, tmp_path):
+    instrument = dataclasses.replace(KNOWN, camera=dataclasses.replace(KNOWN.camera, pixel_scale=pixel_scale))
+    instrument.save(tmp_path / "instrument.json")
+    options = dataclasses.replace(module.Options.of_instrument(instrument), instrument=tmp_path / "instrument.json")
+    area = math.pi / 4 * 0.1 * 1.2**2
+    known, half = instrument_criterion(instrument, area, 32), instrument_criterion(instrument, area / 2, 32)
+    observed = options.observation(32, options.exponent, options.knee, fill_factor=0.1)
+    criterion = observed.criterion()
+    assert type(criterion) is type(known)
+    for name in ("seeing", "pixel", "n_frames"):
         assert getattr(criterion, name) == getattr(known, name), name
+    assert (criterion.grid.shape, criterion.grid.wavelength) == (known.grid.shape, known.grid.wavelength)
+    assert criterion.grid.pixel_scale == pytest.approx(known.grid.pixel_scale, rel=1e-14)
     assert criterion.band.wavelengths == known.band.wavelengths
     assert criterion.band.shares == pytest.approx(known.band.shares, rel=1e-14)
-    torch.testing.assert_close(criterion.noise_psd, known.noise_psd, rtol=1e-12, atol=0)
-    assert dataclasses.replace(options, sky=9.0).turbulence(700e-9, area)["sky"] == 9.0  # given beside it
-    assert dataclasses.replace(options, criterion="asymptotic").turbulence(700e-9, area) is None
+    for name in ("object_psd", "noise_psd"):
+        torch.testing.assert_close(getattr(criterion, name), getattr(known, name), rtol=1e-12, atol=0)
+        found = getattr(observed.through(area / 2).criterion(), name)
+        torch.testing.assert_close(found, getattr(half, name), rtol=1e-12, atol=0)
+
+
+def test_what_is_given_beside_an_instrument_wins(folder):
+    options = dataclasses.replace(design.Options.of_instrument(KNOWN), instrument=folder / "instrument.json")
+    assert dataclasses.replace(options, sky=9.0).turbulence(700e-9, 0.1)["sky"] == 9.0
+    assert dataclasses.replace(options, criterion="asymptotic").turbulence(700e-9, 0.1) is None
+    assert dataclasses.replace(options, n_photons=3e4).observation(32, 1.5, 1 / 64, 0.1).noise_psd.n_photons == 3e4
 
 
 def test_a_filter_stays_a_filter_with_the_light_of_the_source():

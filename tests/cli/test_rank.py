@@ -1,16 +1,22 @@
 """torchmask rank: masks of the catalogue and of files, on one telescope."""
 
 import json
+import math
 
 import pytest
 
 from torchmask.cli.main import main
-from torchmask.cli.rank import Options, make_criterion
+from torchmask.cli.rank import Options
 from torchmask.design.manufacture import load_mask, save_json
 from torchmask.design.turbulent import TurbulentMSE
+from torchmask.grid import ARCSEC, Grid
 from torchmask.optics.aperture import SparseAperture
 
 TINY = ["--n-frequencies", "32", "--budget", "60"]
+
+
+def observed(options):
+    return options.observation(options.n_frequencies, options.exponent, options.knee, options.fill_factor)
 
 
 def test_masks_of_catalogue_files_and_searches_are_ranked(tmp_path, capsys):
@@ -29,7 +35,7 @@ def test_masks_of_catalogue_files_and_searches_are_ranked(tmp_path, capsys):
     }
     assert rows["mine", "as built"]["area"] == pytest.approx(float(mine.area) / 4, rel=1e-12)
     own = load_mask(tmp_path / "run/torchmask_6.json")
-    criterion = make_criterion(Options(n_frequencies=32, fill_factor=0.1))(float(own.area))
+    criterion = observed(Options(n_frequencies=32, fill_factor=0.1)).criterion()
     assert rows["torchmask_6", "searched"]["relative_mse"] == pytest.approx(float(criterion.relative(own)), rel=1e-9)
     assert (tmp_path / "run/ranking.png").read_bytes().startswith(b"\x89PNG")
     said = capsys.readouterr().out
@@ -38,13 +44,20 @@ def test_masks_of_catalogue_files_and_searches_are_ranked(tmp_path, capsys):
 
 def test_light_and_sky_are_in_proportion_to_the_area():
     seen = {"criterion": "turbulent", "r0": 0.2, "outer_scale": 20.0, "sky": 3.0, "n_photons": 1e6}
-    criterion = make_criterion(Options(**seen, n_frequencies=32, readout_noise=2.0, n_pixels=64))
-    full, half = criterion(0.15 * 3.141592653589793 / 4), criterion(0.15 * 3.141592653589793 / 8)
+    whole = observed(Options(**seen, n_frequencies=32, readout_noise=2.0, n_pixels=64))
+    assert whole.area == pytest.approx(0.15 * math.pi / 4, rel=1e-12)
+    full, half = whole.criterion(), whole.through(whole.area / 2).criterion()
     assert isinstance(half, TurbulentMSE)
     assert half.seeing == full.seeing
     assert half.seeing.r0 == 0.2
     noise = [float(each.noise_psd[0, 0]) for each in (full, half)]
     assert noise == pytest.approx([1e6 + 64**2 * (4 + 3.0), 5e5 + 64**2 * (4 + 1.5)], rel=1e-12)
+    assert float(half.object_psd[0, 0]) == pytest.approx(5e5**2, rel=1e-12)
+
+
+def test_pixels_may_be_finer_than_needed():
+    grid = observed(Options(pixel_scale_arcsec=0.02, n_frequencies=32)).grid
+    assert grid == Grid(32, 0.02 * ARCSEC, 550e-9)
 
 
 @pytest.mark.parametrize(
@@ -53,6 +66,8 @@ def test_light_and_sky_are_in_proportion_to_the_area():
         (["golay"], "no mask is called 'golay'"),
         (["--fill-factor", "-0.15"], "--fill-factor is -0.15"),
         (["--wavelength", "550"], "550 nm are 550e-9"),
+        (["--pixel-scale-arcsec", "-1"], "--pixel-scale-arcsec is -1"),
+        (["--pixel-scale-arcsec", "0.5"], "undersamples"),
         (["--central-obstruction", "0.95"], "no mask is left to rank"),
         (["--wind", "3"], "--wind needs --criterion turbulent"),
     ],

@@ -75,7 +75,7 @@ def test_design_writes_a_mask_that_obeys_and_its_error(runs):
     criterion = AsymptoticMSE(Grid.nyquist(1.0, 1e-6, 32), PowerLawPSD(1.5, 1e7), NoisePSD(1e7), 20)
     metrics = json.loads((folder / "metrics.json").read_text())
     assert metrics["relative_mse"] == pytest.approx(float(criterion.relative(mask)), rel=1e-12)
-    floor = float(criterion.floor(1.0) / criterion.object_psd.mean())
+    floor = criterion.relative_floor(1.0)
     assert metrics["relative_mse_above_floor"] == pytest.approx(metrics["relative_mse"] - floor, rel=1e-12)
     assert metrics["redundancy"]["n_baselines"] == 6
     assert {"mask.svg", "design_mask.png", "design_uv_coverage.png", "design_history.png"} <= {

@@ -65,7 +65,7 @@ def test_points_have_the_light_of_their_area(plan):
         assert choice.photons == pytest.approx(photons, rel=1e-12)
         assert choice.frames == int(0.5 / (choice.exposure + 1e-3) + 1e-9)
         criterion = AsymptoticMSE(make().grid(32), PowerLawPSD(1.5, photons), NoisePSD(photons), choice.frames)
-        floor = float(criterion.floor(1.0) / criterion.object_psd.mean())
+        floor = criterion.relative_floor(1.0)
         assert choice.relative_mse - choice.above_floor == pytest.approx(floor, rel=1e-10)
 
 

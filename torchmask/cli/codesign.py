@@ -15,10 +15,11 @@ from rich.console import Console
 from rich.table import Table
 
 from torchmask.atmosphere.phase import TurbulencePhase
-from torchmask.cli.design import make_criterion, search
+from torchmask.cli.design import search
 from torchmask.cli.options import ExperimentOptions, SearchOptions, require_wavelength
 from torchmask.cli.report import log_design, log_observation
 from torchmask.cli.run import Run, new_run
+from torchmask.design.criterion import AsymptoticMSE
 from torchmask.design.search import SearchResult
 from torchmask.grid import Grid
 from torchmask.io import save_npz
@@ -35,7 +36,7 @@ from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.verdict import Verdict
 from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
-from torchmask.spectra import NoisePSD
+from torchmask.spectra import NoisePSD, PowerLawPSD
 from torchmask.viz import figures as viz
 from torchmask.viz.comparison import comparison_figure
 
@@ -161,9 +162,9 @@ def design_mask(options: Options, callback: Callback) -> SearchResult:
     imaging = options.imaging
     grid = Grid.nyquist(imaging.diameter, imaging.wavelength, options.design.n_frequencies)
     noise = NoisePSD(imaging.n_photons, imaging.readout_noise, imaging.n_pixels**2)
-    wanted = dataclasses.replace(options.design, knee=scene_knee(options))
-    criterion = make_criterion(wanted, grid, noise, imaging.n_frames)
-    return search(wanted, criterion, imaging.diameter, options.seed, callback)
+    spectrum = PowerLawPSD(options.design.exponent, imaging.n_photons, scene_knee(options))
+    criterion = AsymptoticMSE(grid, spectrum, noise, imaging.n_frames)
+    return search(options.design, criterion, imaging.diameter, options.seed, callback)
 
 
 def scene_knee(options: Options) -> float:

@@ -1,13 +1,18 @@
-"""Options of the criterion that a mask is judged by: with turbulence in the holes, or without."""
+"""Options of the criterion that a mask is judged by: with turbulence in the holes, or without; and the criterion."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Literal
+import math
+from dataclasses import dataclass, replace
+from typing import Any, Literal, Self
 
-from torchmask.cli.options import BandOptions, InstrumentOptions
+from torchmask.cli.options import DEFAULT_PHOTONS, BandOptions, InstrumentOptions, pixel_angle
 from torchmask.design.conditions import ExposureConditions
+from torchmask.design.criterion import AsymptoticMSE
+from torchmask.design.turbulent import TurbulentMSE
+from torchmask.grid import ARCSEC, Grid
 from torchmask.instrument.instrument import Instrument
+from torchmask.spectra import NoisePSD, PowerLawPSD
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,3 +107,99 @@ class CriterionOptions(ExposureOptions):
         if self.r0 is None:
             raise ValueError("--criterion turbulent needs --r0, in m at the wavelength")
         return conditions.keywords(self.r0, *([] if self.outer_scale is None else [self.outer_scale]))
+
+
+@dataclass(frozen=True)
+class Observed:
+    """An observation through holes of one open area, for which it makes the criterion."""
+
+    grid: Grid
+    """Frequencies of the criterion."""
+    object_psd: PowerLawPSD
+    noise_psd: NoisePSD
+    n_frames: int
+    area: float
+    """Open area of the mask [m^2], to which photons and sky belong."""
+    turbulence: dict[str, Any] | None
+    """Keywords of `TurbulentMSE`; None: independent pistons."""
+
+    def criterion(self) -> AsymptoticMSE:
+        """Return the criterion for all masks of this area."""
+        known = self.grid, self.object_psd, self.noise_psd, self.n_frames
+        return AsymptoticMSE(*known) if self.turbulence is None else TurbulentMSE(*known, **self.turbulence)
+
+    def through(self, area: float) -> Self:
+        """Return the same through another open area [m^2]: the light of target and sky is in proportion to it."""
+        factor = area / self.area
+        return replace(
+            self,
+            object_psd=replace(self.object_psd, n_photons=factor * self.object_psd.n_photons),
+            noise_psd=replace(self.noise_psd, n_photons=factor * self.noise_psd.n_photons),
+            area=area,
+            turbulence=self.turbulence and self.turbulence | {"sky": factor * self.turbulence["sky"]},
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObservationOptions(CriterionOptions):
+    """The telescope, its light and its detector."""
+
+    mask_diameter: float = 1.0
+    """Diameter of the pupil and of a mask that covers it, D [m]."""
+    wavelength: float = 550e-9
+    """Wavelength of the observation [m]."""
+    n_photons: float | None = None
+    """Electrons per frame through holes of --fill-factor; None: from --instrument, or else 1e7."""
+    n_frames: int = 20
+    """Number of short exposures for the restoration."""
+    readout_noise: float = 0.0
+    """Read-out noise [electrons rms per pixel and frame]."""
+    n_pixels: int = 128
+    """Pixels per side of the detector's field, which sets the total read-out noise; the criterion has its own grid."""
+    pixel_scale_arcsec: float | None = None
+    """Angle on the sky of one pixel [arcsec]; None: the largest without aliasing at the shortest wavelength."""
+
+    def observation(self, n_frequencies: int, exponent: float, knee: float, fill_factor: float) -> Observed:
+        """Return the observation through holes of a fill factor N d^2 / D^2.
+
+        Raises ValueError for a fill factor or a pixel scale that cannot be, and as `turbulence`.
+        """
+        if not (math.isfinite(fill_factor) and fill_factor > 0):
+            raise ValueError(f"--fill-factor is {fill_factor:g}: it must be finite and positive")
+        area = math.pi / 4 * fill_factor * self.mask_diameter**2
+        photons = self.n_photons
+        if photons is None:
+            photons = DEFAULT_PHOTONS if self.instrument is None else Instrument.load(self.instrument).photons(area)
+        turbulence = self.turbulence(self.wavelength, area)
+        return Observed(
+            self._grid(n_frequencies, turbulence),
+            PowerLawPSD(exponent, photons, knee),
+            NoisePSD(photons, self.readout_noise, self.n_pixels**2),
+            self.n_frames,
+            area,
+            turbulence,
+        )
+
+    def _grid(self, n_frequencies: int, turbulence: dict[str, Any] | None) -> Grid:
+        wavelengths = (turbulence or {}).get("wavelengths") or ()
+        shortest = min(self.wavelength, *wavelengths) if wavelengths else self.wavelength
+        finest = Grid.nyquist(self.mask_diameter, shortest, n_frequencies)
+        scale = pixel_angle(self.pixel_scale_arcsec)
+        if scale is not None:
+            finest = replace(finest, pixel_scale=scale)
+            finest.require_sampling(self.mask_diameter)
+        return replace(finest, wavelength=self.wavelength)
+
+
+def observation_options(known: Instrument) -> dict[str, Any]:
+    """Return the values of `ObservationOptions` that an instrument gives; light and sky depend on the open area."""
+    return exposure_options(known) | {
+        "r0": known.site.r0,
+        "outer_scale": known.site.outer_scale,
+        "mask_diameter": known.telescope.diameter,
+        "wavelength": known.mean_wavelength,
+        "n_frames": known.frames,
+        "readout_noise": known.camera.readout_noise,
+        "n_pixels": known.camera.n_pixels,
+        "pixel_scale_arcsec": known.pixel_scale / ARCSEC,
+    }

@@ -6,13 +6,13 @@ import math
 import time
 import warnings
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 
-from torchmask.cli.criterion_options import CriterionOptions, exposure_options
+from torchmask.cli.criterion_options import ObservationOptions, observation_options
 from torchmask.cli.options import RunOptions, SearchOptions, require_wavelength
 from torchmask.cli.report import log_design
 from torchmask.cli.run import new_run
@@ -26,38 +26,24 @@ from torchmask.design.rules import MaskRules
 from torchmask.design.search import SearchResult, search_mask
 from torchmask.design.tolerance import Kind, machining_tolerance
 from torchmask.design.turbulent import TurbulentMSE
-from torchmask.grid import Grid
 from torchmask.instrument.instrument import Instrument
 from torchmask.io import write_json
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.packing import hole_diameter
 from torchmask.record import Callback, Record, fan_out
-from torchmask.spectra import NoisePSD, PowerLawPSD
+from torchmask.spectra import PowerLawPSD
 
-_PHOTONS = 1e7  # per frame, if nothing is given
 _GROWTH, _SUCCESS = 0.01, 0.95  # tolerated growth of the MSE by machining errors, and fraction of masks below it
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(CriterionOptions, MaskRules, SearchOptions, RunOptions):
+class Options(ObservationOptions, MaskRules, SearchOptions, RunOptions):
     """Search the positions of the holes that minimise the error of the restored image.
 
     Writes mask.json (for `torchmask simulate` and `restore`), mask.fits (an image in metres), the drawings mask.dxf and
     mask.svg (in millimetres), figures, metrics.json, config.yaml and the log to a new folder.
     """
 
-    mask_diameter: float = 1.0
-    """Diameter of the mask, D [m]."""
-    wavelength: float = 550e-9
-    """Wavelength of the observation [m]."""
-    n_photons: float | None = None
-    """Electrons per frame through the mask; None: from --instrument for this collecting area, or else 1e7."""
-    n_frames: int = 20
-    """Number of short exposures for the restoration."""
-    readout_noise: float = 0.0
-    """Read-out noise [electrons rms per pixel and frame]."""
-    n_pixels: int = 128
-    """Pixels per side of the detector's field, which sets the total read-out noise; the criterion has its own grid."""
     method: Literal["hybrid", "cma"] = "hybrid"
     """Search method: descents and basin hopping on a coarse grid, which finds better masks, or CMA-ES, as published."""
     scale: float = LIFE_SIZE
@@ -69,43 +55,11 @@ class Options(CriterionOptions, MaskRules, SearchOptions, RunOptions):
     def of_instrument(cls, known: Instrument) -> Options:
         """What an instrument gives; its light and its sky depend on the collecting area."""
         return cls(
-            mask_diameter=known.telescope.diameter,
+            **observation_options(known),
             central_obstruction=known.telescope.central_obstruction,
-            wavelength=known.mean_wavelength,
-            n_frames=known.frames,
-            readout_noise=known.camera.readout_noise,
-            n_pixels=known.camera.n_pixels,
-            r0=known.site.r0,
-            outer_scale=known.site.outer_scale,
-            **exposure_options(known),
             exponent=known.source.exponent,
             knee=known.knee,
         )
-
-
-def light(options: Options) -> float:
-    """Electrons per frame: as given, or what the instrument collects with holes of this area."""
-    if options.n_photons is not None:
-        return options.n_photons
-    if options.instrument is None:
-        return _PHOTONS
-    return Instrument.load(options.instrument).photons(open_area(options))
-
-
-def open_area(options: Options) -> float:
-    """Return the area of all holes together [m^2]."""
-    return math.pi / 4 * options.fill_factor * options.mask_diameter**2
-
-
-def make_criterion(
-    search: SearchOptions, grid: Grid, noise: NoisePSD, n_frames: int, turbulence: dict[str, Any] | None = None
-) -> AsymptoticMSE:
-    """The criterion that the options ask for; `turbulence` are keywords of `TurbulentMSE`."""
-    knee = PowerLawPSD.knee if search.knee is None else search.knee
-    spectrum = PowerLawPSD(search.exponent, noise.n_photons, knee)
-    if turbulence is None:
-        return AsymptoticMSE(grid, spectrum, noise, n_frames)
-    return TurbulentMSE(grid, spectrum, noise, n_frames, **turbulence)
 
 
 def search(
@@ -135,18 +89,11 @@ def run(options: Options) -> None:
     """Search, and write the mask, or the best one so far if interrupted."""
     require_wavelength(options.wavelength)
     require_scale(options.scale)
-    turbulence = options.turbulence(options.wavelength, open_area(options))
-    shortest = min((turbulence or {}).get("wavelengths") or (options.wavelength,))
-    sampled = Grid.nyquist(options.mask_diameter, min(shortest, options.wavelength), options.n_frequencies)
-    criterion = make_criterion(
-        options,
-        replace(sampled, wavelength=options.wavelength),
-        NoisePSD(light(options), options.readout_noise, options.n_pixels**2),
-        options.n_frames,
-        turbulence,
-    )
+    knee = PowerLawPSD.knee if options.knee is None else options.knee
+    observed = options.observation(options.n_frequencies, options.exponent, knee, options.fill_factor)
+    criterion = observed.criterion()
     rules = options.constraints()
-    if options.r0 is not None and turbulence is None:
+    if options.r0 is not None and observed.turbulence is None:
         warn_of_wide_holes(options, options.r0)
     last: list[Record] = []
     with new_run("design", options, options.seed) as output:
@@ -211,11 +158,10 @@ def machining(criterion: AsymptoticMSE, aperture: SparseAperture, seed: int) -> 
 def metrics(result: SearchResult, criterion: AsymptoticMSE) -> dict[str, object]:
     """Return the properties of a mask for metrics.json: errors, hole size, baselines."""
     aperture = result.aperture
-    floor = float(criterion.floor(aperture.mask_diameter) / criterion.object_psd.mean())
     table: dict[str, object] = {
         "mse": result.mse,
         "relative_mse": result.relative_mse,
-        "relative_mse_above_floor": result.relative_mse - floor,
+        "relative_mse_above_floor": result.relative_mse - criterion.relative_floor(aperture.mask_diameter),
         "subaperture_diameter": aperture.subaperture_diameter,
         "fill_factor": aperture.fill_factor,
     }

@@ -17,6 +17,7 @@ from torchmask.optics.overlaps import check_overlaps
 from torchmask.optics.passband import Passband
 from torchmask.record import Callback
 
+DEFAULT_PHOTONS = 1e7  # per frame, if neither an option nor an instrument says it
 FULL = "full"  # name of a full pupil
 MASK_SUFFIXES = (".json", ".dxf", ".fits")
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
-from torchmask.cli.criterion_options import CriterionOptions, exposure_options
+from torchmask.cli.criterion_options import ObservationOptions, observation_options
 from torchmask.cli.options import RunOptions, is_mask_file, require_wavelength
 from torchmask.cli.run import Run, new_run
 from torchmask.design.criterion import AsymptoticMSE
@@ -19,22 +17,18 @@ from torchmask.design.pattern import Pattern
 from torchmask.design.ranking import Layout, Ranking, rank_masks
 from torchmask.design.rules import MaskRules
 from torchmask.design.search import search_mask
-from torchmask.design.turbulent import TurbulentMSE
-from torchmask.grid import Grid
 from torchmask.instrument.instrument import Instrument
 from torchmask.io import atomic_write
 from torchmask.optics import catalog
 from torchmask.optics.aperture import SparseAperture
 from torchmask.record import label_stage
-from torchmask.spectra import NoisePSD, PowerLawPSD
 from torchmask.viz.ranking import ranking_figure
 
-_PHOTONS = 1e7  # per frame, if nothing is given
 _SHOWN = 5  # masks named on the terminal
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(CriterionOptions, MaskRules, RunOptions):
+class Options(ObservationOptions, MaskRules, RunOptions):
     """Rank masks by the error of the restored image, on one telescope.
 
     Each mask is ranked twice: as built, with its own holes and the light that they pass, scaled to the pupil; and laid
@@ -47,20 +41,8 @@ class Options(CriterionOptions, MaskRules, RunOptions):
     """Masks, by their name in the catalogue or their file (.json, .dxf, .fits); none: the whole catalogue."""
     search: tuple[int, ...] = ()
     """Numbers of holes for which a mask is searched, to compare with."""
-    mask_diameter: float = 1.0
-    """Diameter of the pupil and of all masks, D [m]."""
     fill_factor: float = 0.15
     """Common collecting area N d^2 / D^2 of round holes for masks laid afresh and searched."""
-    wavelength: float = 550e-9
-    """Wavelength of the observation [m]."""
-    n_photons: float | None = None
-    """Electrons per frame at --fill-factor, others in proportion to their area; None: from --instrument, or 1e7."""
-    n_frames: int = 20
-    """Number of short exposures for the restoration."""
-    readout_noise: float = 0.0
-    """Read-out noise [electrons rms per pixel and frame]."""
-    n_pixels: int = 128
-    """Pixels per side of the detector's field, which sets the total read-out noise; the criterion has its own grid."""
     exponent: float = 1.5
     """Exponent of the object's power-law power spectrum."""
     knee: float = 1 / 64
@@ -78,51 +60,11 @@ class Options(CriterionOptions, MaskRules, RunOptions):
     def of_instrument(cls, known: Instrument) -> Options:
         """What an instrument gives; its light and its sky depend on the collecting area."""
         return cls(
-            mask_diameter=known.telescope.diameter,
+            **observation_options(known),
             central_obstruction=known.telescope.central_obstruction,
-            wavelength=known.mean_wavelength,
-            n_frames=known.frames,
-            readout_noise=known.camera.readout_noise,
-            n_pixels=known.camera.n_pixels,
-            r0=known.site.r0,
-            outer_scale=known.site.outer_scale,
-            **exposure_options(known),
             exponent=known.source.exponent,
             knee=known.knee,
         )
-
-
-def common_area(options: Options) -> float:
-    """Return the open area of masks laid afresh [m^2]. Raises ValueError for a fill factor that cannot be."""
-    if not (math.isfinite(options.fill_factor) and options.fill_factor > 0):
-        raise ValueError(f"--fill-factor is {options.fill_factor:g}: it must be finite and positive")
-    return math.pi / 4 * options.fill_factor * options.mask_diameter**2
-
-
-def make_criterion(options: Options) -> Callable[[float], AsymptoticMSE]:
-    """Return the criterion as a function of the open area [m^2], to which light and sky are in proportion."""
-    common = common_area(options)
-    light = options.n_photons
-    if light is None:
-        light = _PHOTONS if options.instrument is None else Instrument.load(options.instrument).photons(common)
-    turbulence = options.turbulence(options.wavelength, common)
-    shortest = min((turbulence or {}).get("wavelengths") or (options.wavelength,))
-    sampled = Grid.nyquist(options.mask_diameter, min(shortest, options.wavelength), options.n_frequencies)
-    grid = replace(sampled, wavelength=options.wavelength)
-
-    def criterion(area: float) -> AsymptoticMSE:
-        photons = light * area / common
-        known: tuple[Any, ...] = (
-            grid,
-            PowerLawPSD(options.exponent, photons, options.knee),
-            NoisePSD(photons, options.readout_noise, options.n_pixels**2),
-            options.n_frames,
-        )
-        if turbulence is None:
-            return AsymptoticMSE(*known)
-        return TurbulentMSE(*known, **(turbulence | {"sky": turbulence["sky"] * area / common}))
-
-    return criterion
 
 
 def patterns(options: Options) -> list[Pattern]:
@@ -155,13 +97,14 @@ def search_masks(options: Options, criterion: AsymptoticMSE, output: Run) -> dic
 
 def ranking(options: Options, output: Run) -> Ranking:
     """Rank, and write everything to the folder of the run."""
-    chosen, criterion = patterns(options), make_criterion(options)
+    chosen = patterns(options)
+    observed = options.observation(options.n_frequencies, options.exponent, options.knee, options.fill_factor)
     found = rank_masks(
         chosen,
-        criterion,
+        lambda area: observed.through(area).criterion(),
         options.mask_diameter,
         options.fill_factor,
-        searched=search_masks(options, criterion(common_area(options)), output) if options.search else None,
+        searched=search_masks(options, observed.criterion(), output) if options.search else None,
         rules=MaskRules(**{name: getattr(options, name) for name in asdict(MaskRules())}),
         allow_overlap=options.allow_overlap,
         callback=output.callback,

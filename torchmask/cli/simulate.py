@@ -11,6 +11,7 @@ from torchmask.atmosphere.layers import Layers
 from torchmask.atmosphere.phase import LayeredPhase, TurbulencePhase
 from torchmask.atmosphere.profiles import named_layers
 from torchmask.cli.options import (
+    DEFAULT_PHOTONS,
     FilterOptions,
     InstrumentOptions,
     MaskOptions,
@@ -35,8 +36,6 @@ from torchmask.simulation.conditions import Conditions
 from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
 from torchmask.simulation.wavefronts import Turbulence
-
-_PHOTONS = 1e7  # per frame, if nothing is given
 
 
 @dataclass(frozen=True)
@@ -207,9 +206,9 @@ def run(options: Options) -> None:
     aperture = true or told
     wavelength = observing_wavelength(options)
     known = None if options.instrument is None else Instrument.load(options.instrument)
-    told_photons, told_sky = (_PHOTONS, 0.0) if known is None else (known.photons(told.area), known.sky(told.area))
-    n_photons = told_photons if options.n_photons is None else options.n_photons
-    conditions = options.conditions.make(options.turbulence.exposure_time, wavelength, told_sky)
+    photons, sky = (DEFAULT_PHOTONS, 0.0) if known is None else (known.photons(told.area), known.sky(told.area))
+    n_photons = photons if options.n_photons is None else options.n_photons
+    conditions = options.conditions.make(options.turbulence.exposure_time, wavelength, sky)
     turbulence = options.turbulence.make(options.r0, wavelength, options.outer_scale)
     pixel_scale = pixel_angle(options.pixel_scale_arcsec)
     if pixel_scale is None:

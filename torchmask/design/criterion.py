@@ -129,6 +129,10 @@ class AsymptoticMSE(nn.Module):
         beyond = torch.hypot(nu_y, nu_x) >= self.grid.cutoff(mask_diameter)
         return (self.object_psd * beyond).mean()
 
+    def relative_floor(self, mask_diameter: float) -> float:
+        """Return `floor` over the mean of the object's PSD: no mask of `mask_diameter` [m] has a lower `relative`."""
+        return float(self.floor(mask_diameter) / self.object_psd.mean())
+
     def on_grid(self, n_pixels: int | tuple[int, int]) -> Self:
         """Return the same criterion with its integral sampled on another grid of the same pixel scale.
 

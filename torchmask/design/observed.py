@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
-from typing import Any
-
+from torchmask.design.conditions import ExposureConditions
 from torchmask.design.turbulent import TurbulentMSE
 from torchmask.instrument.instrument import Instrument
-from torchmask.optics.pixel import SquarePixel
 
 
 def instrument_criterion(
@@ -47,19 +44,12 @@ def instrument_criterion(
     >>> criterion.n_frames, float(criterion.noise_psd[0, 0])  # 1e9 photons / (s m^2), 0.05 m^2, 2 ms
     (20, 100000.0)
     """
-    air: dict[str, Any] = {}
-    if turbulence:
-        band = instrument.band
-        air = asdict(instrument.seeing) | {"wavelengths": band.wavelengths, "weights": band.shares}
-    fill = instrument.camera.pixel_fill
+    site = instrument.site
+    known = ExposureConditions.of_instrument(instrument, area).keywords(site.r0, site.outer_scale)
+    if not turbulence:
+        known = {name: known[name] for name in ("pixel", "sky")}
     return TurbulentMSE(
-        instrument.grid(n_pixels),
-        instrument.object_psd(area),
-        instrument.noise_psd(area),
-        instrument.frames,
-        **air,
-        pixel=None if fill is None else SquarePixel(fill),
-        sky=instrument.sky(area),
+        instrument.grid(n_pixels), instrument.object_psd(area), instrument.noise_psd(area), instrument.frames, **known
     )
 
 

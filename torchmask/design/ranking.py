@@ -192,7 +192,7 @@ def rank_masks(
         if callback is not None:
             callback(Record("design/rank", step, len(masks), {"relative_mse": error}))
     judge = next(iter(known.values()))  # the floor is relative, and the same for all
-    floor = float(judge.floor(mask_diameter) / judge.object_psd.mean())
+    floor = judge.relative_floor(mask_diameter)
     return Ranking(tuple(_rows(measured, floor)), left_out, floor)
 
 

@@ -206,11 +206,10 @@ def search(task: dict[str, Any]) -> dict[str, Any]:
         result = search_mask(criterion, **{name: task[name] for name in names}, constraints=rules)
     except Infeasible as error:
         return {"centers": [], "infeasible": str(error)}
-    floor = criterion.floor(task["mask_diameter"]) / criterion.object_psd.mean()
     return {
         "centers": result.aperture.centers,
         "relative_mse": result.relative_mse,
-        "above_floor": result.relative_mse - float(floor),
+        "above_floor": result.relative_mse - criterion.relative_floor(task["mask_diameter"]),
     }
 
 

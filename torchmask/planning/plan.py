@@ -204,7 +204,7 @@ def _measure(
             criterion = criterion or instrument_criterion(instrument, area, n_frequencies)
             change_light(criterion, instrument, area)
             error = float(criterion.relative(mask))
-            floor = float(criterion.floor(instrument.telescope.diameter) / criterion.object_psd.mean())
+            floor = criterion.relative_floor(instrument.telescope.diameter)
             photons, sky = instrument.photons(area), instrument.sky(area)
             light = instrument.exposure, instrument.width, instrument.frames, photons, sky
             choices.append(Choice(n, hole, *light, error, error - floor))
