@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -60,6 +60,25 @@ def niriss(shared: Path) -> Path:
 def seeded() -> Callable[[int], torch.Generator]:
     """A fresh generator from a seed."""
     return lambda seed: torch.Generator().manual_seed(seed)
+
+
+@pytest.fixture(scope="module")
+def coarse_figures() -> Iterator[None]:
+    """Figures are saved at a quarter of their size and without layout, for files that do not ask how they look.
+
+    Everything is drawn all the same; tests/viz looks at figures as they are.
+    """
+    from matplotlib.figure import Figure
+
+    save = Figure.savefig
+
+    def savefig(figure: Figure, file: Any, **options: Any) -> None:
+        figure.set_layout_engine("none")
+        save(figure, file, **options | {"dpi": 40})
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "savefig", savefig)
+        yield
 
 
 @pytest.fixture

@@ -1,6 +1,7 @@
 """Frames without light are left out, clouds are told, and neither is seen where there is none."""
 
 import warnings
+from functools import cache
 
 import numpy as np
 import pytest
@@ -19,8 +20,14 @@ MASK = SparseAperture.from_catalog("golay6", 1.0, 0.15)
 GRID = Grid.nyquist(1.0, 550e-9, 32)
 
 
+@cache
+def satellite(size):
+    """One electron of it; rendered once for all stacks."""
+    return make_scene(GRID.shape, 1.0, SceneOptions(size=size))
+
+
 def observe(n_photons=1e5, size=0.5, seed=0, **conditions):
-    scene = make_scene(GRID.shape, n_photons, SceneOptions(size=size))
+    scene = n_photons * satellite(size)
     generator = torch.Generator().manual_seed(seed)
     seen = simulate_observation(
         scene,
