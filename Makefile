@@ -31,14 +31,14 @@ demo: .venv/.experiments
 	OMP_NUM_THREADS=2 $(BIN)/python experiments/codesign.py
 
 test: lint docs
-	$(BIN)/pytest -n 2
+	$(BIN)/pytest -n 2 --dist worksteal
 
 quick: .venv/.test
-	$(BIN)/pytest -n 2 -m 'not slow'
+	$(BIN)/pytest -n 2 --dist worksteal -m 'not slow'
 
 # Old versions warn of what their own dependencies have since renamed.
 oldest: .venv-oldest/.done
-	.venv-oldest/bin/python -m pytest -n 2 -m 'not slow' -W ignore::DeprecationWarning
+	.venv-oldest/bin/python -m pytest -n 2 --dist worksteal -m 'not slow' -W ignore::DeprecationWarning
 
 lint: .venv/.test
 	$(BIN)/ruff check .

@@ -18,6 +18,8 @@ from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.result import RestorationResult
 from torchmask.simulation.exposures import simulate_observation
 
+pytestmark = pytest.mark.usefixtures("coarse_figures")
+
 TOLD = SparseAperture([[0.0, 0.35], [-0.35, -0.2], [0.3, -0.25]], 0.2, 1.0)
 TRUE = MaskGeometry(rotation=0.02, magnification_x=1.01, magnification_y=1.01)
 GRID = Grid.nyquist(1.1, 550e-9, 64)

@@ -21,6 +21,8 @@ from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.pixel import SquarePixel
 from torchmask.spectra import NoisePSD, PowerLawPSD
 
+pytestmark = pytest.mark.usefixtures("coarse_figures")
+
 SMALL = ["design", "--n-subapertures", "4", "--fill-factor", "0.1", "--budget", "60", "--n-frequencies", "32"]
 ZONES = ["--rim-margin", "0.03", "--keep-out", "0.2", "0.1", "0.15", "-0.2", "0.1", "0.1"]
 NOISE = ["--n-photons", "1e5", "--readout-noise", "5", "--n-pixels", "48"]

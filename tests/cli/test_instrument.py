@@ -19,6 +19,8 @@ from torchmask.instrument.parts import Camera, Site, Source, Telescope
 from torchmask.observation import Observation
 from torchmask.optics.aperture import SparseAperture
 
+pytestmark = pytest.mark.usefixtures("coarse_figures")
+
 MASK = SparseAperture.from_catalog("golay6", 1.2, 0.1)
 KNOWN = Instrument(
     telescope=Telescope(diameter=1.2, central_obstruction=0.2, throughput=0.5),

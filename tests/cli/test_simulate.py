@@ -13,6 +13,8 @@ from torchmask.grid import ARCSEC
 from torchmask.observation import Observation
 from torchmask.optics.aperture import SparseAperture
 
+pytestmark = pytest.mark.usefixtures("coarse_figures")
+
 MASK = ["simulate", "--mask", "golay6", "--mask-diameter", "1", "--fill-factor", "0.15"]
 MASK += ["--wavelength", "550e-9"]
 FINE_ENOUGH = 0.99 * 550e-9 / (2 * SparseAperture.from_catalog("golay6", 1.0, 0.15).extent) / ARCSEC  # at 550 nm alone
