@@ -1,6 +1,7 @@
 """The course of a restoration: why it ends, when it starts again, and what it reports."""
 
 import math
+import statistics
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -8,11 +9,9 @@ from itertools import pairwise
 import pytest
 import torch
 
-from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.grid import Grid
 from torchmask.metrics import relative_error
 from torchmask.optics.aperture import FullAperture
-from torchmask.optics.detector import Detector
 from torchmask.record import Record
 from torchmask.restoration.calibration import calibrate, fit_of_frames, recalibrate, sharpen_noise_inflation
 from torchmask.restoration.candidates import Candidates, play_stage, with_candidates
@@ -27,8 +26,6 @@ from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.solver import Solver
 from torchmask.restoration.starts import Known
 from torchmask.restoration.traits import Refinement, Traits
-from torchmask.simulation.exposures import simulate_observation
-from torchmask.simulation.scene import SceneOptions, make_scene
 
 ALL_MISSED = {"chance": -1e9}  # no fit is good enough
 NONE_MISSED = {"chance": math.inf}
@@ -450,10 +447,10 @@ def test_starts_that_end_alike_are_the_last(observation, restoring):
 @pytest.mark.slow
 def test_noise_alone_is_no_reason_for_another_start(observe, restoring):
     """In faint frames it is more than the share of the change from frame to frame that a good fit may leave."""
-    faint = observe(n_frames=4, n_photons=1e3, seed=2)
-    method = restoring(3, tolerance=0.01, schedule=Schedule(**PLAIN))
+    faint, brief = observe(n_frames=4, n_photons=1e3, seed=2), {"starts": 2, "faint": 0.0} | PLAIN
+    method = restoring(3, tolerance=0.01, schedule=Schedule(**brief))
     assert "starts" not in method.restore(faint.frames).message
-    method = restoring(3, tolerance=0.01, schedule=Schedule(chance=0.0, **PLAIN))
+    method = restoring(3, tolerance=0.01, schedule=Schedule(chance=0.0, **brief))
     assert "starts" in method.restore(faint.frames).message
 
 
@@ -469,17 +466,25 @@ def test_further_starts_that_are_worse_change_nothing(observation, restoring):
 
 
 @pytest.mark.slow
-def test_further_starts_find_what_the_first_has_missed(shared_stack):
-    stack = shared_stack("skylab_1e7_mask")
-    diameter = stack.aperture.mask_diameter
-    grid = Grid.nyquist(diameter, stack.grid.wavelength, 64)
-    turbulence = TurbulencePhase(diameter / 10, 20 * diameter)
-    generator = torch.Generator().manual_seed(2)
-    scene = make_scene(grid.shape, 1e7, SceneOptions(size=0.5))
-    seen = simulate_observation(scene, stack.aperture, grid, turbulence, Detector(1.5), 10, generator)
-    result = MyopicDeconvolution(stack.aperture, grid).restore(seen.frames)
-    assert relative_error(result.object, seen.object, 0.5) < 0.1
-    assert "starts" in result.message
+def test_further_starts_find_what_the_first_has_missed(observe, golay6):
+    """Over eight seeds their error is 0.51 times that of the first start alone, with a standard deviation of 0.15.
+
+    The mean of two may be off by three of its standard errors, that of the eight included.
+    """
+    brief, r0, seeds, ratios = {"start_iterations": 300, "sharp_after": 150, "escapes": 0}, 0.1, (1, 5), []
+    for seed in seeds:
+        seen = observe(golay6, n_frames=5, seed=seed, shape=(40, 40), r0=r0)
+        told = {"r0": r0, "readout_noise": seen.readout_noise, "refine_geometry": False}
+        alone, several = (
+            MyopicDeconvolution(golay6, seen.grid, 10, schedule=Schedule(starts=starts, **brief), **told).restore(
+                seen.frames
+            )
+            for starts in (1, 4)
+        )
+        assert "starts" in several.message
+        errors = [relative_error(one.object, seen.object, 0.5) for one in (several, alone)]
+        ratios.append(errors[0] / errors[1])
+    assert statistics.mean(ratios) < 0.51 + 3 * 0.15 * math.sqrt(1 / len(seeds) + 1 / 8)
 
 
 def test_records_hold_the_state(observation, restoring):
