@@ -29,6 +29,8 @@ from torchmask.spectra import NoisePSD, PowerLawPSD
 from torchmask.tracking import RunLogger, read_metrics
 from torchmask.viz.figures import mask_figure
 
+pytestmark = pytest.mark.usefixtures("coarse_figures")
+
 DESIGN = ["design", "--n-subapertures", "4", "--fill-factor", "0.1", "--budget", "60", "--n-frequencies", "32"]
 RULES = ["--min-gap", "0.05", "--central-obstruction", "0.3", "--spiders", "0", "0", "0", "0.5", "0.02"]
 ARCSEC = np.pi / 180 / 3600

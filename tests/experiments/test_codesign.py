@@ -20,6 +20,8 @@ from torchmask.simulation.scene import SceneOptions
 from torchmask.spectra import PowerLawPSD
 from torchmask.tracking import RunLogger, read_metrics
 
+pytestmark = pytest.mark.usefixtures("coarse_figures")
+
 FIGURES = [
     "comparison.png",
     "design_history.png",
