@@ -17,6 +17,7 @@ from torchmask.instrument.instrument import Instrument
 from torchmask.optics.packing import largest_fill_factor
 from torchmask.optics.pupil import Aperture
 from torchmask.planning.result import AXES, Choice, ObservationPlan
+from torchmask.planning.success import success_map
 from torchmask.record import Callback, Record
 
 _HOLES = (0.5, 0.8, 1.2)  # in r0: wider holes hold aberrations that a blind restoration has to find
@@ -40,8 +41,8 @@ def plan_observation(
     """The predicted error of an observation over the number of holes, their size and the exposure, and its least point.
 
     The error is `TurbulentMSE` with the photons, the sky, the frames and the read-out noise that follow from the
-    instrument at each point. It supposes that every transfer function is known: see the manual's page on planning for
-    what that leaves out. Each mask is searched for its number and size of holes by `AsymptoticMSE` (hybrid, `budget`
+    instrument at each point, for known transfer functions, times what blind restorations were measured to lose
+    (`torchmask.planning.success`). Each mask is searched for its number and size of holes by `AsymptoticMSE` (hybrid, `budget`
     evaluations) at the light of the instrument's own exposure, and kept for all exposures.
 
     Parameters
@@ -74,6 +75,11 @@ def plan_observation(
     ValueError
         For an axis that is empty or holds what cannot be, and if no point can be built: says why.
 
+    Warns
+    -----
+    UserWarning
+        If points lie outside what blind restorations were tried on.
+
     Examples
     --------
     >>> from torchmask.optics.aperture import SparseAperture
@@ -86,12 +92,12 @@ def plan_observation(
     ...     wavelength=550e-9,
     ...     width=10e-9,
     ...     exposure=2e-3,
-    ...     observing_time=1.0,
+    ...     observing_time=0.1,
     ... )
     >>> mask = SparseAperture.from_catalog("golay6", 1.0, 0.1)
     >>> plan = plan_observation(instrument, aperture=mask, exposures=(6e-3,), n_frequencies=32)
     >>> plan.best.frames
-    142
+    14
     """
     lengths = _positive("exposures", _default(exposures, _EXPOSURES, instrument.seeing.tau0), "s")
     left_out: list[str] = []
@@ -196,7 +202,7 @@ def _measure(
     callback: Callback | None,
 ) -> list[Choice]:
     """The predicted error at every point; masks with holes of one size share what is known of the turbulence."""
-    choices, n_steps = [], len(exposed) * len(masks)
+    choices, n_steps, measured = [], len(exposed) * len(masks), success_map()
     for instrument in exposed:
         criterion = None
         for (n, hole), mask in sorted(masks.items(), key=lambda item: item[0][1]):
@@ -207,7 +213,8 @@ def _measure(
             floor = criterion.relative_floor(instrument.telescope.diameter)
             photons, sky = instrument.photons(area), instrument.sky(area)
             light = instrument.exposure, instrument.width, instrument.frames, photons, sky
-            choices.append(Choice(n, hole, *light, error, error - floor))
+            blind = None if mask.is_full else measured.outlook(hole / instrument.site.r0, photons, instrument.frames)
+            choices.append(Choice(n, hole, *light, error, error - floor, blind))
             _tell(callback, "plan/map", len(choices), n_steps, error)
     return sorted(choices, key=lambda choice: tuple(getattr(choice, name) for name in AXES))
 

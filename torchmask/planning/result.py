@@ -9,6 +9,7 @@ import numpy as np
 
 from torchmask.instrument.instrument import Instrument
 from torchmask.optics.pupil import Aperture
+from torchmask.planning.success import SUCCESS, BlindOutlook
 
 AXES = ("n_subapertures", "hole_diameter", "exposure", "width")
 
@@ -19,6 +20,8 @@ class Choice:
 
     hole diameter in metres, exposure in seconds, width of the band in metres (None for a filter), photons and sky in
     electrons per frame (of the sky, per pixel)
+    relative_mse, above_floor : predicted for known PSFs, and that less what no mask of this diameter can avoid
+    blind : what to expect where the aberrations have to be found; None for a full pupil, of which no map is known
     """
 
     n_subapertures: int
@@ -30,6 +33,13 @@ class Choice:
     sky: float
     relative_mse: float
     above_floor: float
+    blind: BlindOutlook | None = None
+
+    @property
+    def blind_mse(self) -> float:
+        """The predicted error with what a blind restoration loses: what it can avoid grows by the cost squared."""
+        more = 1.0 if self.blind is None else self.blind.mse_factor
+        return self.relative_mse + (more - 1) * self.above_floor
 
 
 @dataclass(frozen=True)
@@ -68,7 +78,12 @@ class ObservationPlan:
 
     @property
     def best(self) -> Choice:
-        """Where the predicted error is least."""
+        """Where the predicted error of a blind restoration is least."""
+        return min(self.choices, key=lambda choice: choice.blind_mse)
+
+    @property
+    def best_known(self) -> Choice:
+        """Where the predicted error would be least if the PSFs were known."""
         return min(self.choices, key=lambda choice: choice.relative_mse)
 
     @property
@@ -104,7 +119,7 @@ class ObservationPlan:
         place = line.index(self.best)
         if place in (0, len(line) - 1):
             return self.best.exposure
-        x, y = np.log([[c.exposure, c.relative_mse] for c in line[place - 1 : place + 2]]).T
+        x, y = np.log([[c.exposure, c.blind_mse] for c in line[place - 1 : place + 2]]).T
         curvature, slope, _ = np.polyfit(x - x[1], y, 2)
         return self.best.exposure * math.exp(-slope / (2 * curvature))
 
@@ -112,10 +127,13 @@ class ObservationPlan:
         best, told = self.best, self.best_instrument
         band = "" if best.width is None else f", a band of {1e9 * best.width:.4g} nm"
         lines = [
-            f"Least predicted error: {best.relative_mse:.4g}, {best.above_floor:.4g} above what no mask of this "
-            f"diameter can avoid, with {best.n_subapertures} holes of {best.hole_diameter:.4g} m "
-            f"({best.hole_diameter / told.site.r0:.2g} r0), {best.frames} frames of {1e3 * best.exposure:.4g} ms "
-            f"({best.exposure / told.seeing.tau0:.2g} tau0){band} and {best.photons:.4g} photons in each.",
+            f"Least predicted error of a blind restoration: {best.blind_mse:.4g}, of which no mask of this diameter can "
+            f"avoid {best.relative_mse - best.above_floor:.4g}, with {_point(best)} "
+            f"({best.hole_diameter / told.site.r0:.2g} r0, {best.exposure / told.seeing.tau0:.2g} tau0){band} and "
+            f"{best.photons:.4g} photons in each.",
+            _blind_line(best.blind),
+            f"With known PSFs: {best.relative_mse:.4g}; the least would be {self.best_known.relative_mse:.4g}, with "
+            f"{_point(self.best_known)}.",
             f"Best exposure between those of the map: {1e3 * self.best_exposure:.4g} ms.",
             *(
                 f"The best {_WORDS[name]} is at the edge of the map: beyond may be better."
@@ -128,6 +146,23 @@ class ObservationPlan:
             *("| " + " | ".join(_cells(choice)) + " |" for choice in self.choices),
         ]
         return "\n".join([*lines, *(["", *(f"- {reason}" for reason in self.left_out)] if self.left_out else [])])
+
+
+def _point(choice: Choice) -> str:
+    return (
+        f"{choice.n_subapertures} holes of {choice.hole_diameter:.4g} m, {choice.frames} frames of "
+        f"{1e3 * choice.exposure:.4g} ms"
+    )
+
+
+def _blind_line(blind: BlindOutlook | None) -> str:
+    if blind is None:
+        return "What the unknown aberrations of a full pupil cost has not been measured: it is left out."
+    return (
+        f"There blind restorations score {blind.cost:.3g} times as high as with known PSFs (median), and "
+        f"{100 * blind.success:.0f} % of them ({100 * blind.low:.0f} to {100 * blind.high:.0f} %) stay within "
+        f"{SUCCESS:g} times."
+    )
 
 
 _WORDS = {
@@ -146,6 +181,8 @@ _HEADINGS = (
     "sky/pixel",
     "relative MSE",
     "above the floor",
+    "blind",
+    "success",
 )
 
 
@@ -160,4 +197,6 @@ def _cells(choice: Choice) -> list[str]:
         f"{choice.sky:.4g}",
         f"{choice.relative_mse:.4f}",
         f"{choice.above_floor:.4f}",
+        f"{choice.blind_mse:.4f}",
+        "-" if choice.blind is None else f"{100 * choice.blind.success:.0f} %",
     ]

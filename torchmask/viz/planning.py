@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @drawing.styled
 def plan_figure(plan: ObservationPlan) -> Figure:
-    """The predicted error over number and size of holes, over the exposure for each number, and over the width.
+    """The predicted error of blind restorations over number and size of holes, the exposure for each number, and width.
 
     Each panel is at the best of all else; those of one mask or one width are left out. A ring marks the best point.
     """
@@ -28,10 +28,10 @@ def plan_figure(plan: ObservationPlan) -> Figure:
     _draw_exposures(axes[int(several)], plan)
     if len(widths) > 1:
         ax, best = axes[-1], plan.best
-        points = [(1e9 * c.width, c.relative_mse) for c in (*widths, best) if c.width is not None]
+        points = [(1e9 * c.width, c.blind_mse) for c in (*widths, best) if c.width is not None]
         ax.plot(*zip(*points[:-1], strict=True), "o-", color=drawing.COLORS[0], markersize=4)
         ax.plot(*points[-1], "o", markersize=13, fillstyle="none", color=drawing.COLORS[1])
-        ax.set(xlabel="width of the band [nm]", ylabel="relative MSE", title=f"at {1e3 * best.exposure:.3g} ms")
+        ax.set(xlabel="width of the band [nm]", ylabel="relative MSE, blind", title=f"at {1e3 * best.exposure:.3g} ms")
     return figure
 
 
@@ -42,7 +42,7 @@ def _draw_map(figure: Figure, ax: Axes, plan: ObservationPlan) -> None:
     errors = np.full((len(numbers), len(holes)), np.nan)
     for choice in plan.choices:
         if (choice.exposure, choice.width) == (best.exposure, best.width):
-            errors[numbers.index(choice.n_subapertures), holes.index(choice.hole_diameter)] = choice.relative_mse
+            errors[numbers.index(choice.n_subapertures), holes.index(choice.hole_diameter)] = choice.blind_mse
     ax.imshow(errors, origin="lower", cmap="viridis", aspect="auto")
     middle = (np.nanmin(errors) + np.nanmax(errors)) / 2
     for (row, column), error in np.ndenumerate(errors):
@@ -53,7 +53,7 @@ def _draw_map(figure: Figure, ax: Axes, plan: ObservationPlan) -> None:
     ax.set_xticks(range(len(holes)), [f"{hole:.3g}\n{hole / r0:.2g} r0" for hole in holes])
     ax.set_yticks(range(len(numbers)), [str(n) for n in numbers])
     ax.set(xlabel="hole diameter [m]", ylabel="number of holes", title=f"at {1e3 * best.exposure:.3g} ms")
-    drawing.colorbar(figure, [ax], "relative MSE")
+    drawing.colorbar(figure, [ax], "relative MSE, blind")
 
 
 def _draw_exposures(ax: Axes, plan: ObservationPlan) -> None:
@@ -68,13 +68,13 @@ def _draw_exposures(ax: Axes, plan: ObservationPlan) -> None:
         if line:
             ax.plot(
                 [1e3 * c.exposure for c in line],
-                [c.relative_mse for c in line],
+                [c.blind_mse for c in line],
                 "o-",
                 color=color,
                 label=f"{n} holes",
                 markersize=4,
             )
-    ax.plot(1e3 * best.exposure, best.relative_mse, "o", markersize=13, fillstyle="none", color=drawing.COLORS[1])
+    ax.plot(1e3 * best.exposure, best.blind_mse, "o", markersize=13, fillstyle="none", color=drawing.COLORS[1])
     tau0 = plan.instrument.with_exposure(best.exposure).seeing.tau0
     ax.axvline(1e3 * tau0, color=drawing.FAINT, linestyle="--", linewidth=1)
     ax.annotate("tau0", (1e3 * tau0, 1), xycoords=("data", "axes fraction"), fontsize=8, ha="left", va="top")
@@ -82,5 +82,5 @@ def _draw_exposures(ax: Axes, plan: ObservationPlan) -> None:
     times = sorted({1e3 * choice.exposure for choice in plan.choices})
     ax.set_xticks(times, [f"{time:.3g}" for time in times])
     ax.minorticks_off()
-    ax.set(xlabel="exposure [ms]", ylabel="relative MSE", title=f"holes of {best.hole_diameter:.3g} m")
+    ax.set(xlabel="exposure [ms]", ylabel="relative MSE, blind", title=f"holes of {best.hole_diameter:.3g} m")
     ax.legend()

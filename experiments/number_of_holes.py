@@ -1,0 +1,167 @@
+"""How many holes: the N with the least error once the aberrations have to be found, over flux and turbulence.
+
+    python experiments/number_of_holes.py                      # N = 3 to 20: ten minutes of one core
+    python experiments/number_of_holes.py --strengths 5        # another D / r0
+    python experiments/number_of_holes.py --smoke              # everything, tiny, in seconds
+
+At constant collecting area fewer holes are larger ones, which hold more aberrations to be found. The error for known
+PSFs is that of TurbulentMSE at the best mask of a search; what a blind restoration loses is measured
+(torchmask.planning.success), at the size of the holes, the flux and the number of frames.
+
+Table and numbers go to a new folder; searches and errors are kept in --sweep, from which a run that was stopped goes on.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from searched_masks import SearchedMaskOptions, design_space
+
+from torchmask.cli.program import run_script
+from torchmask.cli.run import new_run
+from torchmask.design.sweep import run_tasks
+from torchmask.design.table import design_table
+from torchmask.design.turbulent import TurbulentMSE
+from torchmask.grid import Grid
+from torchmask.optics.aperture import SparseAperture
+from torchmask.planning.success import success_map
+from torchmask.record import Callback
+from torchmask.spectra import NoisePSD, PowerLawPSD
+
+DIAMETER, WAVELENGTH, OUTER_SCALE = 1.0, 550e-9, 20.0  # [m]; only ratios to them matter
+FLAT = 0.05  # errors within so much of the least count as equal
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(SearchedMaskOptions):
+    """What the errors depend on."""
+
+    photons: tuple[float, ...] = (1e5, 1e6, 1e7)
+    """Electrons per frame."""
+    strengths: tuple[float, ...] = (4.0, 7.0, 10.0)
+    """Strengths of the turbulence, D / r0."""
+    n_pixels: int = 128
+    """Number of samples per side of the frequency grid."""
+    seed: tuple[int, ...] = (0,)
+    """Seeds of the searches, of which the best result is used."""
+    budget: int = 1000
+    """Number of evaluations of each search."""
+
+
+def predict(task: Mapping[str, Any]) -> dict[str, Any]:
+    """The relative error for known PSFs and the floor, at each flux of a task, whose masks have holes of one size."""
+    grid = Grid.nyquist(DIAMETER, WAVELENGTH, task["n_pixels"])
+    kept, errors, floors = None, [], []
+    for photons, centers in zip(task["photons"], task["centers"], strict=True):
+        psds = PowerLawPSD(task["exponent"], photons), NoisePSD(photons)
+        criterion = TurbulentMSE(
+            grid, *psds, task["n_frames"], r0=DIAMETER / task["strength"], outer_scale=OUTER_SCALE
+        )
+        kept = kept or criterion  # whose tables of turbulence hold at any flux
+        kept.load_state_dict(criterion.state_dict())
+        errors.append(float(kept.relative(SparseAperture(centers, task["subaperture_diameter"], DIAMETER))))
+        floors.append(float(kept.floor(DIAMETER) / kept.object_psd.mean()))
+    return {"errors": errors, "floors": floors}
+
+
+def measure(options: Options, callback: Callback) -> list[dict[str, Any]]:
+    """A row for each strength, flux and N, with the error for known PSFs and for unknown ones."""
+    table = design_table(
+        design_space(options, n_photons=options.photons), options.sweep, **options.keywords(callback)
+    )
+    common = {name: getattr(options, name) for name in ("photons", "n_frames", "n_pixels", "exponent")}
+    keys, tasks = list(itertools.product(options.strengths, options.n_subapertures)), []
+    for strength, n in keys:
+        best = [
+            min(
+                (row for row in table.rows if (row.n_subapertures, row.n_photons) == (n, photons)),
+                key=lambda row: row.relative_mse or math.inf,
+            )
+            for photons in options.photons
+        ]
+        centers = [table.aperture(row).centers.tolist() for row in best]
+        tasks.append(
+            common
+            | {"strength": strength, "centers": centers, "subaperture_diameter": best[0].subaperture_diameter}
+        )
+    results = run_tasks(predict, tasks, options.sweep / "tasks", stage="holes", **options.keywords(callback))
+    rows = []
+    for (strength, n), task, result in zip(keys, tasks, results, strict=True):
+        size = task["subaperture_diameter"] / DIAMETER * strength
+        for photons, known, floor in zip(options.photons, result["errors"], result["floors"], strict=True):
+            blind = success_map().outlook(size, photons, options.n_frames)
+            row = {"d_over_r0_tried": "d_over_r0" not in blind.outside, "success": blind.success, "cost": blind.cost}
+            row |= {"strength": strength, "n_photons": photons, "n_subapertures": n, "d_over_r0": size, "known": known}
+            rows.append(row | {"blind": known + (blind.mse_factor - 1) * (known - floor)})
+    return rows
+
+
+def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """For each strength and flux: the best N, known and blind, which others are as good, and what 11 costs."""
+    cells = []
+    for strength, photons in dict.fromkeys((row["strength"], row["n_photons"]) for row in rows):
+        own = [row for row in rows if (row["strength"], row["n_photons"]) == (strength, photons)]
+        cell: dict[str, Any] = {"strength": strength, "n_photons": photons}
+        for kind in ("known", "blind"):
+            best = min(own, key=lambda row: row[kind])
+            equal = [row["n_subapertures"] for row in own if row[kind] <= (1 + FLAT) * best[kind]]
+            cell |= {kind: best["n_subapertures"], f"{kind}_error": best[kind], f"{kind}_equal": equal}
+            if kind == "blind":
+                cell |= {name: best[name] for name in ("d_over_r0", "cost", "success")}
+                cell["eleven"] = next((row[kind] / best[kind] for row in own if row["n_subapertures"] == 11), None)
+        cells.append(cell)
+    return cells
+
+
+def markdown(options: Options, cells: Sequence[Mapping[str, Any]]) -> str:
+    """The numbers, for readers."""
+    lines = [
+        "# The number of holes",
+        "",
+        f"Relative MSE at a fill factor of {options.fill_factor:g}, K = {options.n_frames}, p = {options.exponent:g}, "
+        f"{options.n_pixels} frequencies a side, searches of {options.budget} evaluations; in brackets all N within "
+        f"{100 * FLAT:.0f} % of the least.",
+        "",
+        "| D/r0 | photons | N, known PSFs | error | N, blind | error | d/r0 there | success there | N = 11 over least |",
+        "|---" * 9 + "|",
+    ]
+    for cell in cells:
+        eleven = "-" if cell["eleven"] is None else f"{cell['eleven']:.3f}"
+        lines.append(
+            f"| {cell['strength']:g} | {cell['n_photons']:.0e} | {cell['known']} ({ranges(cell['known_equal'])}) | "
+            f"{cell['known_error']:.4f} | {cell['blind']} ({ranges(cell['blind_equal'])}) | {cell['blind_error']:.4f} "
+            f"| {cell['d_over_r0']:.2f} | {100 * cell['success']:.0f} % | {eleven} |".replace("e+0", "e")
+        )
+    return "\n".join(lines) + "\n"
+
+
+def ranges(numbers: Sequence[int]) -> str:
+    """Whole numbers in rising order as text, runs of them shortened: 3, 5-8."""
+    runs = [list(group) for _, group in itertools.groupby(numbers, key=lambda n, count=itertools.count(): n - next(count))]
+    return ", ".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs)
+
+
+def run(options: Options) -> None:
+    """Search, predict and compare in a new folder."""
+    if options.smoke:
+        options = replace(options, n_subapertures=(5, 8), photons=(1e6,), strengths=(5.0,), n_pixels=32, budget=64)
+    with new_run("number_of_holes", options) as output:
+        rows = measure(options, output.callback)
+        cells = summarise(rows)
+        text = markdown(options, cells)
+        output.report("number_of_holes", {"cells": cells, "rows": rows}, text)
+        output.summary.append(text)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The exit status."""
+    return run_script("number_of_holes", run, Options, __doc__, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,319 @@
+"""Where a blind restoration succeeds, over the size of the holes, the light and the number of frames.
+
+    python experiments/success_map.py                    # 208 restorations: an hour of one core
+    python experiments/success_map.py --draws 1 2 2      # fewer of each
+    python experiments/success_map.py --smoke            # everything, tiny, in seconds
+
+Each draw is another mask, scene, turbulence and noise, and goes through every combination of d/r0, photons and frames.
+The frames are made end to end with the full von Karman phase. They are restored by the library's defaults, which are
+told the read-out noise alone. The reference is the positive object of least total variation for the true PSFs: a
+restoration succeeds where its score is within 1.3 of that. The Cramer-Rao bound of the first draw stands beside them.
+
+The figure, the table and the numbers go to a new folder, and with them success.json, the counts that `torchmask plan`
+interpolates (torchmask/planning/success.json). Every restoration is kept in --sweep, from which a run that was stopped
+goes on.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import statistics
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from scipy.optimize import minimize
+from torch import Tensor
+
+import torchmask
+from torchmask.atmosphere.phase import TurbulencePhase
+from torchmask.cli.options import SweepOptions
+from torchmask.cli.program import run_script
+from torchmask.cli.run import new_run
+from torchmask.design.criterion import AsymptoticMSE
+from torchmask.design.space import DesignSpace
+from torchmask.design.sweep import run_tasks
+from torchmask.design.table import design_table
+from torchmask.grid import Grid
+from torchmask.io import write_json
+from torchmask.metrics import relative_error
+from torchmask.observation import Observation
+from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.detector import Detector
+from torchmask.planning.bounds import myopic_bound
+from torchmask.planning.success import SUCCESS
+from torchmask.record import Callback
+from torchmask.restoration.myopic import MyopicDeconvolution
+from torchmask.restoration.priors import TotalVariation
+from torchmask.simulation.exposures import simulate_observation
+from torchmask.simulation.scene import SceneOptions, make_scene
+from torchmask.spectra import NoisePSD, PowerLawPSD
+from torchmask.viz.style import COLORS, INK, new_figure, styled
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+DIAMETER, WAVELENGTH = 1.0, 550e-9  # [m]; only ratios to them matter
+FILL_FACTOR, OUTER_SCALE, READOUT_NOISE = 0.15, 20.0, 1.5  # the second in m, the third in electrons per pixel
+SIZE = 0.5  # of the scene over the field
+KEYS = ("n_frames", "n_photons", "d_over_r0")
+HOLES = (10, 6, 14, 8, 12)  # of the masks, draw by draw
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(SweepOptions):
+    """What is restored."""
+
+    d_over_r0: tuple[float, ...] = (0.5, 0.8, 1.1, 1.5)
+    """Diameter of a hole over r0."""
+    photons: tuple[float, ...] = (1e5, 3e5, 1e6, 1e7)
+    """Electrons per frame through the mask."""
+    frames: tuple[int, ...] = (1, 5, 20)
+    """Numbers of short exposures."""
+    draws: tuple[int, ...] = (3, 5, 5)
+    """Draws of mask, scene, turbulence and noise for each of the numbers of frames."""
+    n_pixels: int = 64
+    """Number of pixels per side of the image."""
+    iterations: int = 4000
+    """Maximum number of iterations of a restoration, as in the library."""
+
+
+def of_mask(mask: SparseAperture) -> dict[str, Any]:
+    """What a task says of its mask."""
+    return {"centers": mask.centers.tolist(), "subaperture_diameter": mask.subaperture_diameter}
+
+
+def scene_of(draw: int, shape: tuple[int, int], n_photons: float) -> Tensor:
+    """The packaged satellite in a random attitude (even draws), or a spotted ball (odd draws)."""
+    generator = torch.Generator().manual_seed(1000 + draw)
+    if draw % 2 == 0:
+        pitch, yaw, roll = (360 * torch.rand(3, generator=generator) - 180).tolist()
+        return make_scene(shape, n_photons, SceneOptions(attitude=(pitch, yaw, roll), size=SIZE))
+    rows, columns = shape
+    y, x = torch.meshgrid(torch.arange(rows) - rows / 2, torch.arange(columns) - columns / 2, indexing="ij")
+    radius = SIZE * min(shape) / 2
+    height = (1 - (x / (0.8 * radius)) ** 2 - (y / radius) ** 2).clamp(min=0).sqrt().double()  # limb darkening
+    ball = height.clone()
+    for _ in range(12):
+        place, width, depth = torch.rand(2, generator=generator), torch.rand(1, generator=generator), 0.9
+        spot = (x - radius * (2 * place[0] - 1)) ** 2 + (y - radius * (2 * place[1] - 1)) ** 2
+        ball *= 1 - depth * torch.exp(-spot / (2 * (1 + 2 * width) ** 2))
+    return ball * (n_photons / ball.sum())
+
+
+def measure(task: Mapping[str, Any]) -> dict[str, Any]:
+    """Simulate, restore with aberrations known and unknown, and score both."""
+    mask = SparseAperture(task["centers"], task["subaperture_diameter"], DIAMETER)
+    grid = Grid.nyquist(DIAMETER, WAVELENGTH, task["n_pixels"])
+    scene = scene_of(task["draw"], grid.shape, task["n_photons"])
+    observation = simulate_observation(
+        *(scene, mask, grid, TurbulencePhase(mask.subaperture_diameter / task["d_over_r0"], OUTER_SCALE)),
+        *(Detector(READOUT_NOISE), task["n_frames"], torch.Generator().manual_seed(task["draw"])),
+    )
+    method = MyopicDeconvolution(
+        mask, grid, readout_noise=READOUT_NOISE, max_iterations=task["iterations"], dtype=torch.float32
+    )
+    blind = method.restore(observation.frames)
+    cutoff = grid.cutoff(DIAMETER)
+    return {
+        "score": relative_error(blind.object, scene, cutoff),
+        "known": relative_error(restore_known(observation), scene, cutoff),
+        "chi_square": float(blind.chi_square.mean()),
+        "iterations": len(blind.cost),
+        "seconds": blind.seconds,
+    }
+
+
+def restore_known(observation: Observation) -> Tensor:
+    """The object (H, W) where the true PSFs are known: what the library minimises over it, with circular convolution.
+
+    The frames enter by two sums over them, so that the time does not depend on their number.
+    """
+    assert observation.psfs is not None
+    mean = float(observation.frames.mean())
+    frames, variance = observation.frames.double() / mean, (mean + READOUT_NOISE**2) / mean**2
+    shape = observation.grid.shape
+    otfs = torch.fft.rfft2(observation.psfs.double().roll([-(side // 2) for side in shape], dims=(-2, -1)))
+    power = (otfs.abs() ** 2).sum(0) / variance
+    matched = torch.fft.irfft2((otfs.conj() * torch.fft.rfft2(frames)).sum(0) / variance, s=shape)
+    prior = TotalVariation()
+
+    def value_and_gradient(pixels: np.ndarray) -> tuple[float, np.ndarray]:
+        image = torch.from_numpy(pixels).reshape(shape)
+        blurred = torch.fft.irfft2(power * torch.fft.rfft2(image), s=shape)
+        penalty, slope = prior.value_and_gradient(image)
+        value = (image * (blurred / 2 - matched)).sum() + penalty
+        return float(value), (blurred - matched + slope).flatten().numpy()
+
+    start = frames.mean(0).clamp(min=0).flatten().numpy()
+    bounds, options = [(0.0, None)] * start.size, {"maxiter": 1000, "maxcor": 20}
+    found = minimize(value_and_gradient, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+    return torch.from_numpy(found.x).reshape(shape)
+
+
+def choose_masks(options: Options, callback: Callback) -> list[SparseAperture]:
+    """A searched mask for each draw."""
+    space = DesignSpace(
+        n_subapertures=tuple(sorted(HOLES)),
+        fill_factor=(FILL_FACTOR,),
+        reference_fill_factor=FILL_FACTOR,
+        diameter_over_r0=(),
+        n_pixels=64 if options.smoke else 128,
+        budget=100 if options.smoke else 2000,
+    )
+    table = design_table(space, options.sweep, **options.keywords(callback))
+    masks = {row.n_subapertures: table.aperture(row) for row in table.rows}
+    return [masks[HOLES[draw % len(HOLES)]] for draw in range(max(options.draws))]
+
+
+def restore(options: Options, masks: Sequence[SparseAperture], callback: Callback) -> list[dict[str, Any]]:
+    """A row for each restoration; all combinations of one draw come before the next draw."""
+    draws = [
+        {"draw": draw} | dict(zip(KEYS, key, strict=True))
+        for draw in range(max(options.draws))
+        for key in itertools.product(options.frames, options.photons, options.d_over_r0)
+        if draw < options.draws[options.frames.index(key[0])]
+    ]
+    common = {"n_pixels": options.n_pixels, "iterations": options.iterations, "torchmask": torchmask.__version__}
+    tasks = [common | draw | of_mask(masks[draw["draw"]]) for draw in draws]
+    results = run_tasks(measure, tasks, options.sweep / "tasks", stage="success", **options.keywords(callback))
+    return [draw | dict(result) for draw, result in zip(draws, results, strict=True)]
+
+
+def bound(task: Mapping[str, Any]) -> dict[str, Any]:
+    """By what unknown aberrations raise the score of the first draw at least, by the local Cramer-Rao bound."""
+    mask = SparseAperture(task["centers"], task["subaperture_diameter"], DIAMETER)
+    grid = Grid.nyquist(DIAMETER, WAVELENGTH, task["n_pixels"])
+    photons, r0 = task["n_photons"], mask.subaperture_diameter / task["d_over_r0"]
+    signal, noise = PowerLawPSD(1.5, photons, 1 / (SIZE * task["n_pixels"])), NoisePSD(photons, READOUT_NOISE)
+    found = myopic_bound(
+        *(scene_of(0, grid.shape, photons), mask, grid, signal, noise, task["n_frames"]),
+        r0=r0,
+        outer_scale=OUTER_SCALE,
+        generator=torch.Generator().manual_seed(0),
+    )
+    floor = float(AsymptoticMSE(grid, signal, noise, 1).floor(DIAMETER) / signal(grid).mean())  # no score counts it
+    return {"factor": math.sqrt((found.unknown - floor) / (found.known - floor))}
+
+
+def bounds(options: Options, mask: SparseAperture, callback: Callback) -> dict[tuple[Any, ...], float]:
+    """The factor of `bound` by frames, photons and d/r0, for the sizes that the figure shows."""
+    keys = list(itertools.product(options.frames, options.photons, shown(options)))
+    tasks = [dict(zip(KEYS, key, strict=True)) | {"n_pixels": options.n_pixels} | of_mask(mask) for key in keys]
+    found = run_tasks(bound, tasks, options.sweep / "tasks", stage="bound", **options.keywords(callback))
+    return {key: row["factor"] for key, row in zip(keys, found, strict=True)}
+
+
+def shown(options: Options) -> list[float]:
+    """The d/r0 of the figure's rows."""
+    return sorted({options.d_over_r0[len(options.d_over_r0) // 3], options.d_over_r0[-1]})
+
+
+def summarise(rows: Sequence[Mapping[str, Any]], factors: Mapping[tuple[Any, ...], float]) -> list[dict[str, Any]]:
+    """A cell for each combination of frames, photons and d/r0."""
+    cells = []
+    for key in sorted({tuple(row[name] for name in KEYS) for row in rows}):
+        own = [row for row in rows if tuple(row[name] for name in KEYS) == key]
+        ratios = [row["score"] / row["known"] for row in own]
+        cells.append(
+            dict(zip(KEYS, key, strict=True))
+            | {"tried": len(own), "succeeded": sum(ratio <= SUCCESS for ratio in ratios)}
+            | {"cost": statistics.median(ratios), "bound": factors.get(key)}
+            | {name: statistics.geometric_mean(row[name] for row in own) for name in ("known", "score")}
+        )
+    return cells
+
+
+def table_of(options: Options, cells: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """What `torchmask.planning.success` reads."""
+    axes = dict(zip(KEYS, map(sorted, (options.frames, options.photons, options.d_over_r0)), strict=True))
+    shape = tuple(map(len, axes.values()))
+    tables = {
+        name: np.reshape([cell[name] for cell in cells], shape).tolist() for name in ("tried", "succeeded", "cost")
+    }
+    return axes | tables | {"conditions": setting(options, cells)}
+
+
+def setting(options: Options, cells: Sequence[Mapping[str, Any]]) -> str:
+    """What all restorations share."""
+    holes = sorted(set(itertools.islice(itertools.cycle(HOLES), max(options.draws))))
+    return (
+        f"{sum(cell['tried'] for cell in cells)} restorations of {options.n_pixels} x {options.n_pixels} pixels, each "
+        f"combination with {min(options.draws)} to {max(options.draws)} draws of mask, scene, turbulence and noise: searched masks of "
+        f"{', '.join(map(str, holes))} holes with a fill factor of {FILL_FACTOR:g}, a satellite and spotted balls half "
+        f"as wide as the field, full von Karman phase with an outer scale of {OUTER_SCALE / DIAMETER:g} D, independent "
+        f"snapshots, {READOUT_NOISE:g} electrons of read-out noise, no sky. The library's defaults, told the read-out "
+        f"noise, in float32, beside the true PSFs. torchmask {torchmask.__version__}."
+    )
+
+
+def markdown(options: Options, cells: Sequence[Mapping[str, Any]]) -> str:
+    """The numbers, for readers."""
+    strengths = sorted(options.d_over_r0)
+    lines = ["# Where blind restorations succeed", "", setting(options, cells), ""]
+    lines += [
+        f"Successes of those tried (score within {SUCCESS:g} of that for the true PSFs), and the median ratio.",
+        "",
+    ]
+    lines += ["| frames | photons | " + " | ".join(f"d/r0 = {size:g}" for size in strengths) + " |"]
+    lines += ["|---" * (2 + len(strengths)) + "|"]
+    for (frames, photons), own in itertools.groupby(cells, key=lambda cell: (cell["n_frames"], cell["n_photons"])):
+        texts = [f"{cell['succeeded']} of {cell['tried']}, {cell['cost']:.2f}" for cell in own]
+        lines.append(f"| {frames} | {photons:.0e} | {' | '.join(texts)} |".replace("e+0", "e"))
+    return "\n".join(lines) + "\n"
+
+
+@styled
+def figure(options: Options, rows: Sequence[Mapping[str, Any]], cells: Sequence[Mapping[str, Any]]) -> Figure:
+    """Known, bound and blind over the photons: a column for each number of frames, a row for each d/r0 shown."""
+    sizes, numbers = shown(options), sorted(options.frames)
+    sheet = new_figure(5.2, 0.9 + 1.8 * len(sizes))
+    axes = sheet.subplots(len(sizes), len(numbers), sharex=True, sharey=True, squeeze=False)
+    for (i, size), (j, n_frames) in itertools.product(enumerate(sizes), enumerate(numbers)):
+        ax, place = axes[i][j], (n_frames, size)
+        own = [cell for cell in cells if (cell["n_frames"], cell["d_over_r0"]) == place]
+        every = [row for row in rows if (row["n_frames"], row["d_over_r0"]) == place]
+        photons = [cell["n_photons"] for cell in own]
+        known = [cell["known"] for cell in own]
+        least = [cell["known"] * cell["bound"] for cell in own]
+        ax.plot(
+            [row["n_photons"] for row in every], [row["score"] for row in every], ".", color=COLORS[1], alpha=0.35, ms=4
+        )
+        ax.plot(photons, [cell["score"] for cell in own], "o-", color=COLORS[1], ms=4, label="blind")
+        ax.plot(photons, least, "-", color=COLORS[0], label="bound")
+        ax.plot(photons, known, "--", color=INK, lw=1.1, label="known PSFs")
+        ax.set(xscale="log", yscale="log")
+        ax.set_title(f"{n_frames} frame{'s' * (n_frames > 1)}, {size:g} r$_0$")
+        ax.set_yticks([0.05, 0.1, 0.2, 0.5], ["0.05", "0.1", "0.2", "0.5"])
+        ax.minorticks_off()
+    sheet.supxlabel("photons per frame", fontsize=9)
+    sheet.supylabel("score (0 is perfect)", fontsize=9)
+    sheet.legend(*axes[0][0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
+    return sheet
+
+
+def run(options: Options) -> None:
+    """Search, restore and compare in a new folder."""
+    if options.smoke:
+        options = replace(options, d_over_r0=(0.5, 1.0), photons=(1e5, 1e6), frames=(1, 2), draws=(1, 2), n_pixels=32)
+        options = replace(options, iterations=4)
+    with new_run("success_map", options) as output:
+        masks = choose_masks(options, output.callback)
+        rows = restore(options, masks, output.callback)
+        cells = summarise(rows, bounds(options, masks[0], output.callback))
+        numbers = {"setting": setting(options, cells), "cells": cells, "rows": rows}
+        output.report("success_map", numbers, markdown(options, cells), figure(options, rows, cells))
+        write_json(output.directory / "success.json", table_of(options, cells))
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The exit status."""
+    return run_script("success_map", run, Options, __doc__, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

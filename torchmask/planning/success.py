@@ -1,0 +1,156 @@
+"""How often a restoration with unknown aberrations succeeds, and what it loses: a measured map, interpolated.
+
+The map is `success.json` beside this file, written by `experiments/success_map.py`; it holds its own conditions.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+
+import numpy as np
+
+SUCCESS = 1.3  # a restoration succeeds if its score is within this factor of that for known PSFs
+_ROUNDING = 1e-9
+_SCALES = {"n_frames": np.log, "n_photons": np.log, "d_over_r0": np.asarray}  # axes, and what is even along them
+_WORDS = {"n_frames": "numbers of frames", "n_photons": "photons per frame", "d_over_r0": "d/r0"}
+
+
+@dataclass(frozen=True)
+class BlindOutlook:
+    """What to expect of a restoration that has to find the aberrations.
+
+    cost : its score over that for known PSFs, median; below 1 where both are drowned in noise
+    success : chance that this ratio is within 1.3
+    low, high : Wilson's interval of that chance at one standard error, from the number of restorations
+    outside : names of what lies outside the map, for which its nearest edge was taken
+
+    Examples
+    --------
+    >>> BlindOutlook(cost=1.2, success=0.75, low=0.5, high=0.9).mse_factor
+    1.44
+    """
+
+    cost: float
+    success: float
+    low: float
+    high: float
+    outside: tuple[str, ...] = ()
+
+    @property
+    def mse_factor(self) -> float:
+        """By what the mean squared error grows: the cost squared, and at least 1."""
+        return max(1.0, self.cost**2)
+
+
+@dataclass(frozen=True, eq=False)
+class SuccessMap:
+    """Restorations on a lattice of frames, photons per frame and hole diameter over r0.
+
+    n_frames, n_photons, d_over_r0 : the values measured, in rising order, at least two each
+    tried, succeeded : numbers of restorations, indexed [frames, photons, d_over_r0]
+    cost : median over them of the score over that for known PSFs
+    conditions : what all of them share, in a sentence
+
+    Raises ValueError if a shape or an order is wrong, or a number of restorations cannot be.
+
+    Examples
+    --------
+    >>> measured = success_map()
+    >>> int(measured.tried.sum()) >= 200
+    True
+    >>> outlook = measured.outlook(d_over_r0=0.6, n_photons=2e6, n_frames=10)
+    >>> outlook.low <= outlook.success <= outlook.high
+    True
+    """
+
+    n_frames: Sequence[float]
+    n_photons: Sequence[float]
+    d_over_r0: Sequence[float]
+    tried: np.ndarray
+    succeeded: np.ndarray
+    cost: np.ndarray
+    conditions: str = ""
+
+    def __post_init__(self) -> None:
+        for name in _SCALES:
+            axis = getattr(self, name)
+            if len(axis) < 2 or not (np.diff(axis) > 0).all() or not axis[0] > 0:
+                raise ValueError(f"{name} is {list(axis)}: at least two positive values are needed, in rising order")
+        shape = tuple(len(getattr(self, name)) for name in _SCALES)
+        for name in ("tried", "succeeded", "cost"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), float))
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"{name} has shape {getattr(self, name).shape}: {shape} is needed, as by the axes")
+        if not ((self.succeeded >= 0) & (self.succeeded <= self.tried) & (self.tried >= 1) & (self.cost > 0)).all():
+            raise ValueError("each cell needs at least one restoration, no more successes than those, a positive cost")
+
+    def outlook(self, d_over_r0: float, n_photons: float, n_frames: float) -> BlindOutlook:
+        """Chance and cost at one point.
+
+        Between the lattice's points the chance is linear and the cost geometric, in the logarithms of photons and
+        frames and in d / r0, so that at its points they are what was measured and between two of them they lie between
+        the two. Of frames that show the same turbulence more than once, count those that differ.
+
+        Parameters
+        ----------
+        d_over_r0 : float
+            Diameter of a hole over Fried's parameter.
+        n_photons : float
+            Electrons per frame through the mask.
+        n_frames : float
+
+        Raises
+        ------
+        ValueError
+            If a number is not finite and positive.
+
+        Warns
+        -----
+        UserWarning
+            If the point lies outside the map, whose nearest edge is taken.
+        """
+        point = {"n_frames": n_frames, "n_photons": n_photons, "d_over_r0": d_over_r0}
+        for name, value in point.items():
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"{name} is {value}: it must be finite and positive")
+        places, outside = [], []
+        for name, scale in _SCALES.items():
+            axis = getattr(self, name)
+            if not axis[0] * (1 - _ROUNDING) <= point[name] <= axis[-1] * (1 + _ROUNDING):
+                outside.append(name)
+                warnings.warn(
+                    f"blind restorations were tried for {_WORDS[name]} from {axis[0]:g} to {axis[-1]:g}: beyond, their "
+                    "success is taken to be that of the nearest tried",
+                    stacklevel=2,
+                )
+            places.append(float(np.interp(scale(point[name]), scale(np.array(axis)), np.arange(len(axis)))))
+        chance = self.succeeded / self.tried
+        middle, half = chance + 0.5 / self.tried, np.sqrt(chance * (1 - chance) / self.tried + 0.25 / self.tried**2)
+        low, high = ((middle + side * half) / (1 + 1 / self.tried) for side in (-1, 1))
+        return BlindOutlook(
+            cost=math.exp(_interpolate(np.log(self.cost), places)),
+            success=_interpolate(chance, places),
+            low=_interpolate(low, places),
+            high=_interpolate(high, places),
+            outside=tuple(outside),
+        )
+
+
+@functools.cache
+def success_map() -> SuccessMap:
+    """The map that comes with the library."""
+    return SuccessMap(**json.loads(files("torchmask.planning").joinpath("success.json").read_text(encoding="utf-8")))
+
+
+def _interpolate(table: np.ndarray, places: Sequence[float]) -> float:
+    """The multilinear interpolation of a table at fractional indices inside it."""
+    for place in places:
+        first = min(int(place), len(table) - 2)
+        table = table[first] + (place - first) * (table[first + 1] - table[first])
+    return float(table)
