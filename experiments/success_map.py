@@ -299,7 +299,7 @@ def figure(options: Options, rows: Sequence[Mapping[str, Any]], cells: Sequence[
 def run(options: Options) -> None:
     """Search, restore and compare in a new folder."""
     if options.smoke:
-        options = replace(options, d_over_r0=(0.5, 1.0), photons=(1e5, 1e6), frames=(1, 2), draws=(1, 2), n_pixels=32)
+        options = replace(options, d_over_r0=(0.5, 1.0), photons=(1e5, 1e6), frames=(1, 2), draws=(1, 1), n_pixels=32)
         options = replace(options, iterations=4)
     with new_run("success_map", options) as output:
         masks = choose_masks(options, output.callback)
