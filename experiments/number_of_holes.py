@@ -8,7 +8,8 @@ At constant collecting area fewer holes are larger ones, which hold more aberrat
 PSFs is that of TurbulentMSE at the best mask of a search; what a blind restoration loses is measured
 (torchmask.planning.success), at the size of the holes, the flux and the number of frames.
 
-Table and numbers go to a new folder; searches and errors are kept in --sweep, from which a run that was stopped goes on.
+Table and numbers go to a new folder; searches and errors are kept in --sweep, from which a run that was stopped goes
+on.
 """
 
 from __future__ import annotations
@@ -45,6 +46,8 @@ class Options(SearchedMaskOptions):
     """Electrons per frame."""
     strengths: tuple[float, ...] = (4.0, 7.0, 10.0)
     """Strengths of the turbulence, D / r0."""
+    n_frames: int = 10
+    """Number K of exposures."""
     n_pixels: int = 128
     """Number of samples per side of the frequency grid."""
     seed: tuple[int, ...] = (0,)
@@ -59,9 +62,7 @@ def predict(task: Mapping[str, Any]) -> dict[str, Any]:
     kept, errors, floors = None, [], []
     for photons, centers in zip(task["photons"], task["centers"], strict=True):
         psds = PowerLawPSD(task["exponent"], photons), NoisePSD(photons)
-        criterion = TurbulentMSE(
-            grid, *psds, task["n_frames"], r0=DIAMETER / task["strength"], outer_scale=OUTER_SCALE
-        )
+        criterion = TurbulentMSE(grid, *psds, task["n_frames"], r0=DIAMETER / task["strength"], outer_scale=OUTER_SCALE)
         kept = kept or criterion  # whose tables of turbulence hold at any flux
         kept.load_state_dict(criterion.state_dict())
         errors.append(float(kept.relative(SparseAperture(centers, task["subaperture_diameter"], DIAMETER))))
@@ -71,9 +72,7 @@ def predict(task: Mapping[str, Any]) -> dict[str, Any]:
 
 def measure(options: Options, callback: Callback) -> list[dict[str, Any]]:
     """A row for each strength, flux and N, with the error for known PSFs and for unknown ones."""
-    table = design_table(
-        design_space(options, n_photons=options.photons), options.sweep, **options.keywords(callback)
-    )
+    table = design_table(design_space(options, n_photons=options.photons), options.sweep, **options.keywords(callback))
     common = {name: getattr(options, name) for name in ("photons", "n_frames", "n_pixels", "exponent")}
     keys, tasks = list(itertools.product(options.strengths, options.n_subapertures)), []
     for strength, n in keys:
@@ -86,8 +85,7 @@ def measure(options: Options, callback: Callback) -> list[dict[str, Any]]:
         ]
         centers = [table.aperture(row).centers.tolist() for row in best]
         tasks.append(
-            common
-            | {"strength": strength, "centers": centers, "subaperture_diameter": best[0].subaperture_diameter}
+            common | {"strength": strength, "centers": centers, "subaperture_diameter": best[0].subaperture_diameter}
         )
     results = run_tasks(predict, tasks, options.sweep / "tasks", stage="holes", **options.keywords(callback))
     rows = []
@@ -127,7 +125,7 @@ def markdown(options: Options, cells: Sequence[Mapping[str, Any]]) -> str:
         f"{options.n_pixels} frequencies a side, searches of {options.budget} evaluations; in brackets all N within "
         f"{100 * FLAT:.0f} % of the least.",
         "",
-        "| D/r0 | photons | N, known PSFs | error | N, blind | error | d/r0 there | success there | N = 11 over least |",
+        "| D/r0 | photons | N, known PSFs | error | N, blind | error | d/r0 there | success | N = 11 over least |",
         "|---" * 9 + "|",
     ]
     for cell in cells:
@@ -142,7 +140,12 @@ def markdown(options: Options, cells: Sequence[Mapping[str, Any]]) -> str:
 
 def ranges(numbers: Sequence[int]) -> str:
     """Whole numbers in rising order as text, runs of them shortened: 3, 5-8."""
-    runs = [list(group) for _, group in itertools.groupby(numbers, key=lambda n, count=itertools.count(): n - next(count))]
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1].append(number)
+        else:
+            runs.append([number])
     return ", ".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs)
 
 

@@ -36,6 +36,7 @@ from torchmask.optics.zernike import ZernikePhase
 from torchmask.planning.bounds import MyopicBound, myopic_bound
 from torchmask.planning.plan import plan_observation
 from torchmask.planning.result import ObservationPlan
+from torchmask.planning.success import BlindOutlook, SuccessMap, success_map
 from torchmask.restoration.baselines import average_psf, shift_and_add
 from torchmask.restoration.many import restore_many
 from torchmask.restoration.myopic import MyopicDeconvolution
@@ -55,6 +56,7 @@ __all__ = [
     "OTF",
     "PSF",
     "AsymptoticMSE",
+    "BlindOutlook",
     "Camera",
     "Conditions",
     "Detector",
@@ -84,6 +86,7 @@ __all__ = [
     "SparseAperture",
     "StackDataset",
     "StackRanges",
+    "SuccessMap",
     "Telescope",
     "TotalVariation",
     "TurbulencePhase",
@@ -112,5 +115,6 @@ __all__ = [
     "search_mask",
     "shift_and_add",
     "simulate_observation",
+    "success_map",
     "wiener_mse",
 ]

@@ -83,8 +83,7 @@ def test_losses_do_not_count_as_gains():
 
 def test_the_map_of_the_library_is_as_large_as_it_says():
     measured = success_map()
-    assert measured.tried.sum() >= 200
-    assert str(int(measured.tried.sum())) in measured.conditions
+    assert measured.conditions.startswith(f"{int(measured.tried.sum())} restorations of 64 x 64 pixels")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         measured.outlook(measured.d_over_r0[0], measured.n_photons[-1], measured.n_frames[-1])

@@ -27,10 +27,10 @@ class Options(Instrument, CatalogOptions, InstrumentOptions, RunOptions):
     """Plan an observation: how many holes, of what size, and what exposure restore the best image.
 
     For every number of holes and hole diameter a mask is searched, quickly; for each of them and every exposure the
-    error of the restored image is predicted from magnitude, band, telescope, site, camera and time, with what blind
-    restorations were measured to lose. Writes the map and
-    its least point (plan.md, plan.json, plan.png), that mask (mask.json) and the observation as one file for other
-    commands (instrument.json) to a new folder. Takes minutes.
+    error of the restored image is predicted from magnitude, band, telescope, site, camera and time, with what
+    restorations that had to find the aberrations were measured to lose. Writes the map and its least point (plan.md,
+    plan.json, plan.png), that mask (mask.json) and the observation as one file for other commands (instrument.json) to
+    a new folder. Takes minutes.
     """
 
     mask: Annotated[Path | None, tyro.conf.arg(metavar="FILE|NAME|full")] = None
@@ -111,17 +111,17 @@ def run(options: Options) -> None:
         output.summary.extend([*str(plan).split("\n\n", 1)[0].splitlines(), table])
 
 
-def _of(choice: Choice) -> dict[str, Any]:
+def _with_blind_mse(choice: Choice) -> dict[str, Any]:
     return dataclasses.asdict(choice) | {"blind_mse": choice.blind_mse}
 
 
 def numbers(plan: ObservationPlan) -> dict[str, object]:
     """What plan.json says: the best point, the whole map, what is missing from it."""
     return {
-        "best": _of(plan.best),
-        "best_known": _of(plan.best_known),
+        "best": _with_blind_mse(plan.best),
+        "best_known": _with_blind_mse(plan.best_known),
         "best_exposure": plan.best_exposure,
         "at_edge": {name: plan.at_edge(name) for name in AXES},
-        "map": [_of(choice) for choice in plan.choices],
+        "map": [_with_blind_mse(choice) for choice in plan.choices],
         "left_out": plan.left_out,
     }

@@ -41,9 +41,10 @@ def plan_observation(
     """The predicted error of an observation over the number of holes, their size and the exposure, and its least point.
 
     The error is `TurbulentMSE` with the photons, the sky, the frames and the read-out noise that follow from the
-    instrument at each point, for known transfer functions, times what blind restorations were measured to lose
-    (`torchmask.planning.success`). Each mask is searched for its number and size of holes by `AsymptoticMSE` (hybrid, `budget`
-    evaluations) at the light of the instrument's own exposure, and kept for all exposures.
+    instrument at each point. It supposes that every transfer function is known; what restorations that had to find the
+    aberrations were measured to lose, `success_map`, raises what of it a mask can avoid. Each mask is searched for its
+    number and size of holes by `AsymptoticMSE` (hybrid, `budget` evaluations) at the light of the instrument's own
+    exposure, and kept for all exposures.
 
     Parameters
     ----------

@@ -37,9 +37,10 @@ class Choice:
 
     @property
     def blind_mse(self) -> float:
-        """The predicted error with what a blind restoration loses: what it can avoid grows by the cost squared."""
+        """The predicted error with what a blind restoration loses: what a mask can avoid grows by the cost squared,
+        up to 1 in all, the error of who knows nothing."""
         more = 1.0 if self.blind is None else self.blind.mse_factor
-        return self.relative_mse + (more - 1) * self.above_floor
+        return min(1.0, self.relative_mse + (more - 1) * self.above_floor)
 
 
 @dataclass(frozen=True)
@@ -127,8 +128,8 @@ class ObservationPlan:
         best, told = self.best, self.best_instrument
         band = "" if best.width is None else f", a band of {1e9 * best.width:.4g} nm"
         lines = [
-            f"Least predicted error of a blind restoration: {best.blind_mse:.4g}, of which no mask of this diameter can "
-            f"avoid {best.relative_mse - best.above_floor:.4g}, with {_point(best)} "
+            f"Least predicted error of a blind restoration: {best.blind_mse:.4g}, of which no mask of this diameter "
+            f"can avoid {best.relative_mse - best.above_floor:.4g}, with {_point(best)} "
             f"({best.hole_diameter / told.site.r0:.2g} r0, {best.exposure / told.seeing.tau0:.2g} tau0){band} and "
             f"{best.photons:.4g} photons in each.",
             _blind_line(best.blind),
