@@ -18,15 +18,15 @@ from __future__ import annotations
 
 import itertools
 import math
-import statistics
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from scipy.optimize import minimize
+from success_map_report import KEYS, figure, markdown, summarise
 from torch import Tensor
 
 import torchmask
@@ -45,22 +45,16 @@ from torchmask.observation import Observation
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.detector import Detector
 from torchmask.planning.bounds import myopic_bound
-from torchmask.planning.success import SUCCESS
 from torchmask.record import Callback
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.priors import TotalVariation
 from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
 from torchmask.spectra import NoisePSD, PowerLawPSD
-from torchmask.viz.style import COLORS, INK, new_figure, styled
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 DIAMETER, WAVELENGTH = 1.0, 550e-9  # [m]; only ratios to them matter
 FILL_FACTOR, OUTER_SCALE, READOUT_NOISE = 0.15, 20.0, 1.5  # the second in m, the third in electrons per pixel
 SIZE = 0.5  # of the scene over the field
-KEYS = ("n_frames", "n_photons", "d_over_r0")
 HOLES = (10, 6, 14, 8, 12)  # of the masks, draw by draw
 
 
@@ -175,10 +169,11 @@ def choose_masks(options: Options, callback: Callback) -> list[SparseAperture]:
 def restore(options: Options, masks: Sequence[SparseAperture], callback: Callback) -> list[dict[str, Any]]:
     """A row for each restoration; all combinations of one draw come before the next draw."""
     draws = [
-        {"draw": draw} | dict(zip(KEYS, key, strict=True))
+        {"draw": draw, "n_frames": n_frames, "n_photons": photons, "d_over_r0": size}
         for draw in range(max(options.draws))
-        for key in itertools.product(options.frames, options.photons, options.d_over_r0)
-        if draw < options.draws[options.frames.index(key[0])]
+        for n_frames, most in zip(options.frames, options.draws, strict=True)
+        for photons, size in itertools.product(options.photons, options.d_over_r0)
+        if draw < most
     ]
     common = {"n_pixels": options.n_pixels, "iterations": options.iterations, "torchmask": torchmask.__version__}
     tasks = [common | draw | of_mask(masks[draw["draw"]]) for draw in draws]
@@ -215,21 +210,6 @@ def shown(options: Options) -> list[float]:
     return sorted({options.d_over_r0[len(options.d_over_r0) // 3], options.d_over_r0[-1]})
 
 
-def summarise(rows: Sequence[Mapping[str, Any]], factors: Mapping[tuple[Any, ...], float]) -> list[dict[str, Any]]:
-    """A cell for each combination of frames, photons and d/r0."""
-    cells = []
-    for key in sorted({tuple(row[name] for name in KEYS) for row in rows}):
-        own = [row for row in rows if tuple(row[name] for name in KEYS) == key]
-        ratios = [row["score"] / row["known"] for row in own]
-        cells.append(
-            dict(zip(KEYS, key, strict=True))
-            | {"tried": len(own), "succeeded": sum(ratio <= SUCCESS for ratio in ratios)}
-            | {"cost": statistics.median(ratios), "bound": factors.get(key)}
-            | {name: statistics.geometric_mean(row[name] for row in own) for name in ("known", "score")}
-        )
-    return cells
-
-
 def table_of(options: Options, cells: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """What `torchmask.planning.success` reads."""
     axes = dict(zip(KEYS, map(sorted, (options.frames, options.photons, options.d_over_r0)), strict=True))
@@ -254,62 +234,17 @@ def setting(options: Options, cells: Sequence[Mapping[str, Any]]) -> str:
     )
 
 
-def markdown(options: Options, cells: Sequence[Mapping[str, Any]]) -> str:
-    """The numbers, for readers."""
-    strengths = sorted(options.d_over_r0)
-    lines = ["# Where blind restorations succeed", "", setting(options, cells), ""]
-    lines += [
-        f"Successes of those tried (score within {SUCCESS:g} of that for the true PSFs), and the median ratio.",
-        "",
-    ]
-    lines += ["| frames | photons | " + " | ".join(f"d/r0 = {size:g}" for size in strengths) + " |"]
-    lines += ["|---" * (2 + len(strengths)) + "|"]
-    for (frames, photons), own in itertools.groupby(cells, key=lambda cell: (cell["n_frames"], cell["n_photons"])):
-        texts = [f"{cell['succeeded']} of {cell['tried']}, {cell['cost']:.2f}" for cell in own]
-        lines.append(f"| {frames} | {photons:.0e} | {' | '.join(texts)} |".replace("e+0", "e"))
-    return "\n".join(lines) + "\n"
-
-
-@styled
-def figure(options: Options, rows: Sequence[Mapping[str, Any]], cells: Sequence[Mapping[str, Any]]) -> Figure:
-    """Known, bound and blind over the photons: a column for each number of frames, a row for each d/r0 shown."""
-    sizes, numbers = shown(options), sorted(options.frames)
-    sheet = new_figure(5.2, 0.9 + 1.8 * len(sizes))
-    axes = sheet.subplots(len(sizes), len(numbers), sharex=True, sharey=True, squeeze=False)
-    for (i, size), (j, n_frames) in itertools.product(enumerate(sizes), enumerate(numbers)):
-        ax, place = axes[i][j], (n_frames, size)
-        own = [cell for cell in cells if (cell["n_frames"], cell["d_over_r0"]) == place]
-        every = [row for row in rows if (row["n_frames"], row["d_over_r0"]) == place]
-        photons = [cell["n_photons"] for cell in own]
-        known = [cell["known"] for cell in own]
-        least = [cell["known"] * cell["bound"] for cell in own]
-        ax.plot(
-            [row["n_photons"] for row in every], [row["score"] for row in every], ".", color=COLORS[1], alpha=0.35, ms=4
-        )
-        ax.plot(photons, [cell["score"] for cell in own], "o-", color=COLORS[1], ms=4, label="blind")
-        ax.plot(photons, least, "-", color=COLORS[0], label="bound")
-        ax.plot(photons, known, "--", color=INK, lw=1.1, label="known PSFs")
-        ax.set(xscale="log", yscale="log")
-        ax.set_title(f"{n_frames} frame{'s' * (n_frames > 1)}, {size:g} r$_0$")
-        ax.set_yticks([0.05, 0.1, 0.2, 0.5], ["0.05", "0.1", "0.2", "0.5"])
-        ax.minorticks_off()
-    sheet.supxlabel("photons per frame", fontsize=9)
-    sheet.supylabel("score (0 is perfect)", fontsize=9)
-    sheet.legend(*axes[0][0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
-    return sheet
-
-
 def run(options: Options) -> None:
     """Search, restore and compare in a new folder."""
     if options.smoke:
-        options = replace(options, d_over_r0=(0.5, 1.0), photons=(1e6, 1e7), frames=(1, 2), draws=(1, 1), n_pixels=32)
+        options = replace(options, d_over_r0=(0.5, 1.0), photons=(1e6, 1e7), frames=(1, 2), draws=(1, 1), n_pixels=36)
         options = replace(options, iterations=4)
     with new_run("success_map", options) as output:
         masks = choose_masks(options, output.callback)
         rows = restore(options, masks, output.callback)
         cells = summarise(rows, bounds(options, masks[0], output.callback))
         numbers = {"setting": setting(options, cells), "cells": cells, "rows": rows}
-        output.report("success_map", numbers, markdown(options, cells), figure(options, rows, cells))
+        output.report("success_map", numbers, markdown(setting(options, cells), cells), figure(rows, cells))
         write_json(output.directory / "success.json", table_of(options, cells))
 
 

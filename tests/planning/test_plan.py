@@ -5,6 +5,7 @@ import functools
 import json
 
 import matplotlib.figure
+import numpy as np
 import pytest
 import torch
 
@@ -21,13 +22,18 @@ from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.pixel import SquarePixel
 from torchmask.planning.plan import plan_observation
 from torchmask.planning.result import Choice, ObservationPlan
+from torchmask.planning.success import BlindOutlook, SuccessMap
 from torchmask.spectra import NoisePSD, PowerLawPSD
 from torchmask.viz.planning import plan_figure
 
-pytestmark = pytest.mark.filterwarnings("ignore:blind restorations were tried")  # here light and frames are others
-
 MASK = SparseAperture.from_catalog("golay6", 1.0, 0.05)
 TINY = {"n_frequencies": 32, "budget": 64}
+EVERYWHERE = {"n_frames": (1, 1e6), "n_photons": (1, 1e12), "d_over_r0": (0.1, 10)}
+
+
+def lossless():
+    """A map on which blind restorations always succeed and lose nothing."""
+    return SuccessMap(**EVERYWHERE, tried=np.ones((2, 2, 2)), succeeded=np.ones((2, 2, 2)), cost=np.ones((2, 2, 2)))
 
 
 def make(**changes):
@@ -49,6 +55,7 @@ def quick(monkeypatch):
     """Without the tables of turbulence, which take seconds each."""
     still = functools.partial(instrument_criterion, turbulence=False)
     monkeypatch.setattr(torchmask.planning.plan, "instrument_criterion", still)
+    monkeypatch.setattr(torchmask.planning.plan, "success_map", lossless)
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +63,7 @@ def plan():
     with pytest.MonkeyPatch.context() as patch:
         still = functools.partial(instrument_criterion, turbulence=False)
         patch.setattr(torchmask.planning.plan, "instrument_criterion", still)
+        patch.setattr(torchmask.planning.plan, "success_map", lossless)
         axes = {"n_subapertures": (3, 7), "hole_diameters": (0.09, 0.15, 0.35), "exposures": (2e-3, 6e-3)}
         return plan_observation(make(), **axes, **TINY)
 
@@ -84,6 +92,7 @@ def exposures():
     lengths = [factor * bright.seeing.tau0 for factor in (0.1, 1.5, 6.0)]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(torchmask.planning.plan, "instrument_criterion", keep)
+        patch.setattr(torchmask.planning.plan, "success_map", lossless)
         return built, plan_observation(bright, aperture=MASK, exposures=lengths, n_frequencies=24)
 
 
@@ -153,6 +162,39 @@ def test_the_best_point_and_the_edges_of_the_map(plan):
     assert "The best hole diameter is at the edge of the map" in text
     assert text.count("\n| 3 |") == 6
     assert "do not fit" in text
+
+
+def test_what_blind_restorations_lose_moves_the_best_point(plan):
+    """Holes of more than 0.8 r0 lose a factor of 2 or more: the smaller ones win, though known PSFs favour the wide."""
+    cost = np.broadcast_to([1.0, 4.0], (2, 2, 2))
+    steep = SuccessMap((1, 1e6), (1, 1e12), (0.6, 1.0), np.full((2, 2, 2), 4), np.full((2, 2, 2), 3), cost)
+    with pytest.warns(UserWarning, match="for d/r0 from 0.6 to 1"):
+        choices = [
+            dataclasses.replace(c, blind=steep.outlook(c.hole_diameter / 0.15, c.photons, c.frames))
+            for c in plan.choices
+        ]
+    found = dataclasses.replace(plan, choices=tuple(choices))
+    assert found.best_known.hole_diameter == plan.best.hole_diameter == 0.35
+    assert found.best.hole_diameter == 0.09
+    for choice in choices:
+        grown = choice.relative_mse + (choice.blind.cost**2 - 1) * choice.above_floor
+        assert choice.blind_mse == pytest.approx(min(1, grown), rel=1e-12)
+    text = str(found)
+    assert "75 % of them (50 to 90 %) stay within 1.3 times" in text
+    assert f"the least would be {plan.best.relative_mse:.4g}, with 3 holes of 0.35 m" in text
+
+
+def test_the_map_is_asked_at_the_size_light_and_frames_of_each_point(monkeypatch, quick):
+    asked = []
+
+    def outlook(self, *point):
+        asked.append(point)
+        return BlindOutlook(1.0, 1.0, 1.0, 1.0)
+
+    monkeypatch.setattr(SuccessMap, "outlook", outlook)
+    found = plan_observation(make(), aperture=MASK, exposures=(2e-3, 6e-3), n_frequencies=32)
+    expected = [(MASK.subaperture_diameter / 0.15, choice.photons, choice.frames) for choice in found.choices]
+    assert sorted(asked) == sorted(expected)
 
 
 @pytest.mark.slow
@@ -240,6 +282,7 @@ def test_the_command_writes_plan_mask_and_instrument(quick, tmp_path, capsys):
     assert main(["plan", *known.split(), "--out", str(tmp_path / "plan")]) == 0
     numbers = json.loads((tmp_path / "plan/plan.json").read_text())
     assert numbers["best"] in numbers["map"]
+    assert numbers["best"]["blind_mse"] >= numbers["best"]["relative_mse"] >= numbers["best_known"]["relative_mse"]
     assert len(numbers["map"]) == 2
     mask = load_mask(tmp_path / "plan/mask.json")
     assert mask.n_subapertures == 3
@@ -260,6 +303,8 @@ def test_a_full_pupil_is_planned_without_a_mask(tmp_path, monkeypatch):
     known += " --width 2e-8 --exposure 4e-3 --n-frames 20 --mask full --exposures 0.004 --n-frequencies 24"
     assert main(["plan", *known.split(), "--out", str(tmp_path / "plan")]) == 0
     numbers = json.loads((tmp_path / "plan/plan.json").read_text())
-    assert numbers["best"]["relative_mse"] == pytest.approx(0.3)
+    assert numbers["best"]["relative_mse"] == numbers["best"]["blind_mse"] == pytest.approx(0.3)
+    assert numbers["best"]["blind"] is None
+    assert "of a full pupil cost has not been measured" in (tmp_path / "plan/plan.md").read_text()
     assert numbers["best"]["photons"] == pytest.approx(3e8 * 4e-3 * float(FullAperture(1.0).area))
     assert not (tmp_path / "plan/mask.json").exists()

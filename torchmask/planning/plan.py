@@ -93,12 +93,12 @@ def plan_observation(
     ...     wavelength=550e-9,
     ...     width=10e-9,
     ...     exposure=2e-3,
-    ...     observing_time=0.1,
+    ...     observing_time=0.05,
     ... )
     >>> mask = SparseAperture.from_catalog("golay6", 1.0, 0.1)
     >>> plan = plan_observation(instrument, aperture=mask, exposures=(6e-3,), n_frequencies=32)
     >>> plan.best.frames
-    14
+    7
     """
     lengths = _positive("exposures", _default(exposures, _EXPOSURES, instrument.seeing.tau0), "s")
     left_out: list[str] = []

@@ -64,7 +64,7 @@ class ObservationPlan:
     ...     wavelength=550e-9,
     ...     width=10e-9,
     ...     exposure=2e-3,
-    ...     n_frames=20,
+    ...     n_frames=10,
     ... )
     >>> mask = SparseAperture.from_catalog("golay6", 1.0, 0.1)
     >>> plan = plan_observation(instrument, aperture=mask, exposures=(2e-3,), n_frequencies=32)
