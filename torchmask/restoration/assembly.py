@@ -25,10 +25,16 @@ def assemble_result(
     progress: Progress,
     r0: float | None,
     verdict: Verdict | None = None,
+    *,
+    n_modes: int | None = None,
 ) -> RestorationResult:
-    """Return the result of a finished restoration; `r0` [m] is the initial one of the prior, None if it has none."""
+    """Return the result of a finished restoration, with the first `n_modes` modes of the coefficients; None: all.
+
+    `r0` [m] is the initial one of the prior, None if it has none.
+    """
     model, state = objective.model, progress.state
     refined = progress.refinement is Refinement.ON
+    change = model.aberrations.change(state.z)
     transmission, weight = state.calibration.transmission, state.calibration.aberration_weight
     made = torch.cat([model(state.image, state.z[part]) for part in model.chunks(len(state.z))])
     frames = made * transmission[:, None, None].to(made)
@@ -38,7 +44,7 @@ def assemble_result(
     return RestorationResult(
         object=(model.window.crop(state.image) * stack.unit).clone(),
         extended_object=state.image * stack.unit,
-        coefficients=model.aberrations.coefficients(state.z),
+        coefficients=model.aberrations.coefficients(state.z)[..., :n_modes],
         transmission=transmission,
         background=(background * stack.unit + stack.known).mean((1, 2)).to(transmission),
         model=frames * stack.unit + stack.known,
@@ -56,7 +62,7 @@ def assemble_result(
         magnification=state.geometry.magnification,
         geometry_std=_geometry_deviations(objective, state) if refined else None,
         verdict=verdict,
-        motion=model.aberrations.change(state.z),
+        motion=None if change is None else change[..., :n_modes],
     )
 
 
@@ -77,6 +83,7 @@ def add_deviations(
     model = objective.model
     image, z = standard_deviations(objective, progress.state, model.cutoff, stack.photon_share, n_samples)
     spread = torch.stack([model.aberrations.coefficients(sample) for sample in z]).square().mean((0, 1)).sqrt()
+    spread = spread[:, : result.coefficients.shape[-1]]
     return replace(result, object_std=model.window.crop(image) * stack.unit, coefficients_std=spread)
 
 

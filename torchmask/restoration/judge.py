@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import NamedTuple
 
 from torchmask.restoration.calibration import fit_of_frames
@@ -30,6 +29,7 @@ class Judge:
     def __init__(self, setting: Setting, stack: FrameStack, traits: Traits, schedule: Schedule) -> None:
         least = schedule.missed * stack.change if traits.many_minima else 0.0  # allows for its usual minima
         self.setting: Setting = setting
+        self._beyond: dict[int, LeftOut] = {}  # by the number of modes of the basis
         self.traits: Traits = traits
         self.alike: float = schedule.alike
         self.contrast: float = stack.contrast
@@ -43,7 +43,9 @@ class Judge:
         chi_square = fit_of_frames(objective, state)[1]
         at_rest = ending.status is not Status.ITERATION_LIMIT
         # For a full pupil poor minima, not modes left out, dominate the residual; `tolerance` allows for them.
-        error = NO_MODEL_ERROR if self.traits.many_minima else expected_error(objective, state, self._left_out)
+        error = NO_MODEL_ERROR
+        if not self.traits.many_minima:
+            error = expected_error(objective, state, self._left_out(objective.model.aberrations.n_modes))
         return judge(chi_square, pixels, self.contrast, error, self.tolerance, at_rest=at_rest)
 
     def compare(self, objective: MyopicObjective, now: Ending, rival: Ending | None) -> Comparison:
@@ -56,6 +58,7 @@ class Judge:
         scale = max(verdict.excess, verdict.limit - 1)
         return Comparison(best, verdict, abs(before.excess - after.excess) < self.alike * scale)
 
-    @cached_property
-    def _left_out(self) -> LeftOut:
-        return LeftOut.of(self.setting.told, self.setting.still.n_modes, self.traits.r0, self.traits.outer_scale)
+    def _left_out(self, n_modes: int) -> LeftOut:
+        if n_modes not in self._beyond:
+            self._beyond[n_modes] = LeftOut.of(self.setting.told, n_modes, self.traits.r0, self.traits.outer_scale)
+        return self._beyond[n_modes]

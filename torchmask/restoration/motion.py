@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchmask.optics.aperture import Aperture
 from torchmask.restoration.aberrations import AberrationBasis
@@ -25,22 +26,26 @@ _FIRST = 0.1  # rms of the first changes, relative to their prior
 
 @dataclass(frozen=True)
 class Setting:
-    """What an objective is made for and a state may change: how the mask lies, and whether aberrations move.
+    """What an objective is made for and a state may change: how the mask lies, and which aberrations there are.
 
     told : the mask as the user describes it
     still : basis of the aberrations of snapshots
     moving : the same basis with changes during the exposure; None: frames are snapshots
+    finer : basis with more modes, and with the same changes, for the last descent; None: there are no more
     """
 
     told: Aperture
     still: AberrationBasis
     moving: AberrationBasis | None = None
+    finer: AberrationBasis | None = None
 
     @classmethod
-    def of(cls, objective: MyopicObjective, moving: AberrationBasis | None = None) -> Setting:
-        """Return the setting of an objective of snapshots; known aberrations do not move."""
+    def of(
+        cls, objective: MyopicObjective, moving: AberrationBasis | None = None, finer: AberrationBasis | None = None
+    ) -> Setting:
+        """Return the setting of an objective of snapshots; known aberrations do not move and have no more modes."""
         model, is_free = objective.model, Free.ABERRATIONS in objective.free
-        return cls(model.pupil.aperture, model.aberrations, moving if is_free else None)
+        return cls(model.pupil.aperture, model.aberrations, moving if is_free else None, finer if is_free else None)
 
     def awaits_motion(self, state: State) -> bool:
         """Whether the aberrations change during the exposure, and the state does not have the change yet."""
@@ -61,18 +66,31 @@ class Setting:
             first[: len(change)] = known[:, self.still.n_own : self.moving.n_own]
         return replace(state, z=self._widened(state.z, first))
 
+    def in_finer_modes(self, state: State) -> State:
+        """Return the state in the basis `finer`, with the same aberrations; the state itself if there is none."""
+        still, finer = self.still, self.finer
+        if finer is None or self.awaits_motion(state):
+            return state
+        own, change, common = state.z.tensor_split([still.n_own, state.z.shape[1] - still.n_common], dim=1)
+        now = (own @ still.mixing[:, : still.n_own].to(own).T).unflatten(1, (still.n_subapertures, still.n_modes))
+        now = pad(now, (0, finer.n_modes - still.n_modes)).flatten(1)
+        mixing = finer.mixing[:, : finer.n_own - change.shape[1]].to(own)
+        return replace(state, z=torch.cat([now @ torch.linalg.pinv(mixing).T, change, common], dim=1))
+
     def objective_at(self, objective: MyopicObjective, state: State) -> MyopicObjective:
         """Return the objective with its mask and its aberrations as `state` has them."""
         objective = placed_as(objective, self.told, state.geometry)
         n_parameters, model, centre = state.z.shape[1], objective.model, objective.centre
-        if self.moving is None or n_parameters == model.aberrations.n_parameters:
+        if n_parameters == model.aberrations.n_parameters:
             return objective
-        if n_parameters == self.moving.n_parameters:
+        if self.finer is not None and n_parameters == self.finer.n_parameters:
+            basis, centre = self.finer, torch.zeros_like(state.z)
+        elif self.moving is not None and n_parameters == self.moving.n_parameters:
             basis = self.moving
             centre = self._widened(centre, centre.new_zeros(len(centre), n_parameters - self.still.n_parameters))
         else:
             basis = self.still
-            centre = torch.cat([centre[:, : basis.n_own], centre[:, self.moving.n_own :]], dim=1)
+            centre = torch.cat([centre[:, : basis.n_own], centre[:, centre.shape[1] - basis.n_common :]], dim=1)
         model = model.through(model.pupil.aperture, basis.to(model.device))
         return objective.with_changes(model=model, centre=centre)
 

@@ -44,9 +44,8 @@ class MyopicDeconvolution:
         1/2 sum_t || (g_t window(h_t(a_t) * o) + b_t - y_t) / sigma ||^2  +  prior(o)  +  1/2 ||z||^2
 
     starting from the clipped mean frame, with the best-fitting background b_t. `torchmask.restoration.solver` describes
-    the algorithm: how it updates the noise sigma and the transmissions g_t, and how it escapes from local minima. For
-    faint frames through a mask, where this joint estimate of the object is biased, the aberrations are integrated out
-    at the end (`torchmask.restoration.marginal`).
+    the algorithm: how it updates the noise sigma and the transmissions g_t, and how it escapes from local minima.
+    `torchmask.restoration.finish` describes the end for a mask, which depends on how faint the frames are.
 
     Parameters
     ----------
@@ -55,7 +54,8 @@ class MyopicDeconvolution:
     grid : Grid
         Grid of the frames.
     n_modes : int, optional
-        Number of Zernike modes per sub-aperture, from Noll index 1. None: 6, or 231 for a full pupil.
+        Number of Zernike modes per sub-aperture, from Noll index 1. None: 231 for a full pupil, 6 for a mask; unless
+        frames are faint, its last descent then has `Schedule.last_modes`, of which the result holds the first 6.
     r0 : float, optional
         Fried parameter of the turbulence [m]. None: it is estimated from the restored aberrations.
     outer_scale : float, optional
@@ -75,8 +75,7 @@ class MyopicDeconvolution:
         Uniform light that does not come from the object, see `Background`; or the known background [electrons per
         pixel], a number or a tensor that broadcasts to the frames. Its photon noise is taken into account.
     pixel : PixelResponse, optional
-        Blur by the detector's pixels: `SquarePixel(fill_factor)`, or `MappedPixel` with a map of their sensitivity. The
-        restored object is free of it. None: pixels are points.
+        Blur by the detector's pixels: `SquarePixel(fill_factor)`, or `MappedPixel` by a map. None: pixels are points.
     exposure_tau0 : float
         Exposure time of a frame in units of tau0 = 0.314 r0 / wind. Piston, tip and tilt of every hole then change
         linearly during a frame; coefficients are those at mid-exposure. 0: frames are snapshots.
@@ -152,11 +151,13 @@ class MyopicDeconvolution:
             raise ValueError("weights are given without wavelengths: give both")
         self.many_minima: bool = aperture.n_subapertures == 1
         self.known_r0: bool = r0 is not None
+        self.schedule: Schedule = schedule or Schedule()
         self.recipe: ModelRecipe = ModelRecipe(
             aperture,
             grid,
             Band.of([grid.wavelength] if wavelengths is None else wavelengths, weights),
             frame_modes=(231 if self.many_minima else 6) if n_modes is None else n_modes,
+            last_modes=self.schedule.last_modes if n_modes is None and not self.many_minima else 0,
             static_modes=static_modes,
             # The holes of a mask are usually about r0 wide; a full pupil that needs a restoration spans several r0.
             r0=aperture.subaperture_diameter / (7 if self.many_minima else 1) if r0 is None else r0,
@@ -173,7 +174,6 @@ class MyopicDeconvolution:
         self.max_iterations, self.tolerance = max_iterations, tolerance
         self.prior: ObjectPrior = as_prior(TotalVariation() if prior is None else prior)
         self.minimizer: Minimizer = minimizer or ProjectedLBFGS()
-        self.schedule: Schedule = schedule or Schedule()
         self._model: ExposureModel = self.recipe.turbulent_model()
 
     @property
@@ -269,13 +269,13 @@ class MyopicDeconvolution:
             objective = MyopicObjective(
                 model, stack.frames, stack.precision, self.prior, free=known.free, parallel=parallel
             )
-            traits, moving = self._traits(known, seed), self.recipe.moving_basis(model.aberrations)
-            solver = Solver(objective, stack, traits, self.schedule, self.minimizer, callback, moving)
+            traits, later = self._traits(known, seed), self.recipe.later_bases(model.aberrations, blind=known.nothing)
+            solver = Solver(objective, stack, traits, self.schedule, self.minimizer, callback, *later)
             settings = (replace(traits, max_iterations=0, tolerance=0.0), self.minimizer, self.schedule)
             check_prior(self.prior, model.window.embed(stack.frames.mean(0).clamp(min=0)).double())
             progress = solver.solve(known, start, Checkpoint.of(checkpoint, objective, settings, known.tensors))
             found = (progress, solver.prior_r0, solver.verdict(progress.ending))
-            result = assemble_result(solver.objective, stack, *found)
+            result = assemble_result(solver.objective, stack, *found, n_modes=self.n_modes)
             if n_samples:
                 result = add_deviations(result, solver.objective, stack, progress, n_samples)
         return replace(result, seconds=time.perf_counter() - started)

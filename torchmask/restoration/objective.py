@@ -122,14 +122,19 @@ class MyopicObjective(nn.Module):
         self.parallel: Map = parallel
 
     def with_changes(
-        self, *, model: ExposureModel | None = None, centre: Tensor | None = None, free: Free | None = None
+        self,
+        *,
+        model: ExposureModel | None = None,
+        centre: Tensor | None = None,
+        free: Free | None = None,
+        prior: ObjectPrior | None = None,
     ) -> MyopicObjective:
-        """Return the objective with another model, other expected aberrations or other unknowns free."""
+        """Return the objective with another model, other expected aberrations, other unknowns free or another prior."""
         return MyopicObjective(
             model or self.model,
             self.frames,
             self.precision,
-            self.prior,
+            prior or self.prior,
             centre=self.centre if centre is None else centre,
             free=self.free if free is None else free,
             prior_copies=self.prior_copies,

@@ -32,6 +32,7 @@ class ModelRecipe:
     device : device of the model
     pixel : response of the detector's pixels; None: they sample the image at their centres
     exposure_tau0 : exposure time of a frame [tau0]; 0: frames are snapshots
+    last_modes : number of Zernike modes per sub-aperture of each frame in the last descent, if it is larger
 
     Raises
     ------
@@ -51,6 +52,7 @@ class ModelRecipe:
     device: torch.device | str | None
     pixel: PixelResponse | None = None
     exposure_tau0: float = 0.0
+    last_modes: int = 0
 
     def __post_init__(self) -> None:
         shape = tuple(self.aperture.centers.shape)
@@ -100,11 +102,28 @@ class ModelRecipe:
         aperture = self.aperture if follows_aperture else self.aperture.still()
         return self._build(aperture, basis)
 
+    def later_bases(
+        self, still: AberrationBasis, *, blind: bool
+    ) -> tuple[AberrationBasis | None, AberrationBasis | None]:
+        """Return the moving and the finer basis that follow upon `still`; only a blind restoration has the latter."""
+        return self.moving_basis(still), self.finer_basis() if blind else None
+
     def moving_basis(self, still: AberrationBasis) -> AberrationBasis | None:
         """Return the basis `still` extended by changes during an exposure; None for snapshots."""
         if self.exposure_tau0 == 0:
             return None
         return moving_basis(still, self.aperture.still(), self.exposure_tau0, self.r0, self.outer_scale)
+
+    def finer_basis(self) -> AberrationBasis | None:
+        """Return the basis of the last descent, with changes during an exposure if there are any; None for no more modes.
+
+        Parameters are white under the prior.
+        """
+        if self.last_modes <= self.frame_modes or not self.whitened:
+            return None
+        with torch.no_grad():
+            finer = turbulent_basis(self.aperture, self.last_modes, self.static_modes, self.r0, self.outer_scale)
+        return self.moving_basis(finer) or finer
 
     def estimated_model(self, covariance: Tensor) -> ExposureModel:
         """Return the model whose parameters are errors of estimated coefficients, with `covariance` (N J, N J) [rad^2].

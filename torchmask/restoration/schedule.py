@@ -47,6 +47,8 @@ class Schedule:
     memory : weight of the earlier rounds in the running averages
     settling : maximum number of iterations that fit the object in a round
     last_settling : maximum number of iterations that fit it at the end, under a prior of its own scale
+    last_modes : number of modes of each sub-aperture of a mask in the last descent of frames that are not faint
+    last_iterations : maximum number of iterations of that descent; 0: there is none
     """
 
     segment: int = 100
@@ -81,6 +83,8 @@ class Schedule:
     memory: float = 0.7
     settling: int = 30
     last_settling: int = 80
+    last_modes: int = 15
+    last_iterations: int = 100
 
     def __post_init__(self) -> None:
         stages = [number for number, _ in self.candidates] + [1]
@@ -107,6 +111,7 @@ class Schedule:
             candidates=(),
             starts=1,
             faint=0.0,
+            last_iterations=0,
         )
 
     @property

@@ -6,7 +6,7 @@ turbulence and the noise are updated; the assumed noise falls from the residual 
 to the residual of the model, if that is larger. Once the object is sharp, frames and object escape from local minima;
 when nothing changes any more, each frame is weighted by how well it fits. A start ends when a segment gains nothing or
 its iterations are used up. If its verdict is that it missed the object, another one starts from random aberrations, and
-the best is kept. For faint frames, the aberrations are integrated out at the end.
+the best is kept. At the end, the aberrations of faint frames are integrated out, those of others gain modes.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from torchmask.restoration.calibration import recalibrate
 from torchmask.restoration.candidates import Candidates, play_stage
 from torchmask.restoration.checkpoint import Checkpoint, Ending, Progress, Status
 from torchmask.restoration.descent import Variables, descend
+from torchmask.restoration.finish import finish
 from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.judge import Judge
-from torchmask.restoration.marginal import integrate_aberrations
 from torchmask.restoration.motion import Setting
 from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.placement import distance, is_misplaced
@@ -61,6 +61,8 @@ class Solver:
         Called with a `Record` after every iteration.
     moving : AberrationBasis, optional
         Aberrations that change during a frame. None: frames are snapshots.
+    finer : AberrationBasis, optional
+        Aberrations with more modes for the last descent. None: there are no more.
     """
 
     def __init__(
@@ -72,9 +74,10 @@ class Solver:
         minimizer: Minimizer,
         callback: Callback | None = None,
         moving: AberrationBasis | None = None,
+        finer: AberrationBasis | None = None,
     ) -> None:
         self.objective: MyopicObjective = objective
-        self.setting: Setting = Setting.of(objective, moving)
+        self.setting: Setting = Setting.of(objective, moving, finer)
         self.unit: float = stack.unit
         self.traits: Traits = traits
         self.schedule: Schedule = schedule
@@ -83,7 +86,8 @@ class Solver:
         change = stack.change
         self.first_inflation: float = max(1.0, change / schedule.first_inflation)
         held = traits.prior_on_aberrations and not traits.many_minima  # not tried for a full pupil
-        self.is_faint: bool = held and Free.OBJECT | Free.ABERRATIONS in objective.free and change < schedule.faint
+        self.is_open: bool = held and Free.OBJECT | Free.ABERRATIONS in objective.free
+        self.is_faint: bool = self.is_open and change < schedule.faint
         self.judge: Judge = Judge(self.setting, stack, traits, schedule)
 
     def solve(self, known: Known, start: RestorationResult | None = None, file: Checkpoint | None = None) -> Progress:
@@ -97,13 +101,9 @@ class Solver:
         # Without a prior on the aberrations a poor fit is to be expected, and more starts would not help.
         may_start_again = blind and self.traits.prior_on_aberrations and len(self.objective.frames) > 1
         ended = self.run(begun, may_start_again, file.save if file is not None else lambda progress: None)
-        if self.is_faint and ended.status is not Status.ITERATION_LIMIT:
-            how = {"seed": self.traits.seed, "follow_r0": self.traits.r0_is_open}
-            ended.state, evaluations = integrate_aberrations(
-                self.objective, ended.state, self.schedule, self.minimizer, self.callback, **how
-            )
-            ended.n_evaluations += evaluations
-            ended.integrated = True
+        if self.is_open and ended.status is not Status.ITERATION_LIMIT:
+            how = (self.schedule, self.minimizer, self.callback)
+            self.objective = finish(self.objective, self.setting, ended, *how, self.traits, is_faint=self.is_faint)
         return ended
 
     def begin(self, known: Known, start: RestorationResult | None) -> Progress:

@@ -1,0 +1,55 @@
+"""The end of a restoration through a mask: faint frames are integrated over, others get a finer model.
+
+A few modes per sub-aperture lead to the object from far away, where more would lead to poor minima as well. Close to the
+solution, more of them only take away what the model leaves unexplained. So once all has come to rest, the aberrations
+gain modes, and the object, which the better model determines better, a smoother prior (`ObjectPrior.smoother`).
+"""
+
+from __future__ import annotations
+
+from torchmask.record import Callback, Record
+from torchmask.restoration.calibration import recalibrate
+from torchmask.restoration.checkpoint import Progress
+from torchmask.restoration.descent import Variables, descend
+from torchmask.restoration.marginal import integrate_aberrations
+from torchmask.restoration.motion import Setting
+from torchmask.restoration.objective import MyopicObjective
+from torchmask.restoration.projected_lbfgs import Minimizer
+from torchmask.restoration.schedule import Schedule
+from torchmask.restoration.traits import Traits
+
+
+def finish(
+    objective: MyopicObjective,
+    setting: Setting,
+    ended: Progress,
+    schedule: Schedule,
+    minimizer: Minimizer,
+    callback: Callback | None,
+    traits: Traits,
+    *,
+    is_faint: bool,
+) -> MyopicObjective:
+    """Finish a restoration that has come to rest: update `ended`, and return the objective of its state."""
+    if is_faint:
+        how = {"seed": traits.seed, "follow_r0": traits.r0_is_open}
+        ended.state, spent = integrate_aberrations(objective, ended.state, schedule, minimizer, callback, **how)
+        ended.n_evaluations += spent
+        ended.integrated = True
+        return objective
+    if not schedule.last_iterations:
+        return objective
+    state, steps = setting.in_finer_modes(ended.state), 0
+    objective = setting.objective_at(objective, state).with_changes(prior=objective.prior.smoother())
+    if schedule.recalibrates:
+        state = recalibrate(objective, state, power=1, follow_r0=traits.r0_is_open)
+
+    def listen(cost: float, evaluations: int, variables: Variables) -> None:
+        nonlocal steps
+        steps += 1
+        ended.n_evaluations += evaluations
+        if callback is not None:
+            callback(Record("last descent", steps, schedule.last_iterations, {"cost": cost}, {}))
+
+    ended.state = descend(objective, state, schedule.last_iterations, minimizer, listen)
+    return objective
