@@ -117,6 +117,14 @@ def settle_object(
     return found.value, found.x.view_as(centre) * scale
 
 
+@torch.no_grad()
+def settle(objective: MyopicObjective, state: State, n_iterations: int) -> State:
+    """Return the state with the object that suits its aberrations best; the misfit is approximated as quadratic."""
+    slope, power = objective.object_quadratic(state.image, state.z, state.calibration)
+    slope = slope + objective.model.background.price
+    return replace(state, image=settle_object(state.image, slope, power, objective.prior, n_iterations)[1])
+
+
 def tilt(model: ExposureModel, offset: tuple[float, float]) -> Tensor:
     """Return the parameters (K,) that shift every image by `offset` (dy, dx) pixels, as closely as the modes allow."""
     samples = model.pupil.samples()

@@ -1,8 +1,8 @@
 """The end of a restoration through a mask: faint frames are integrated over, others get a finer model.
 
-A few modes per sub-aperture lead to the object from far away, where more would lead to poor minima as well. Close to the
-solution, more of them only take away what the model leaves unexplained. So once all has come to rest, the aberrations
-gain modes, and the object, which the better model determines better, a smoother prior (`ObjectPrior.smoother`).
+A descent from far away takes few modes per sub-aperture. Close to the solution, more of them take away much of what the
+model leaves unexplained. So once all has come to rest, the aberrations gain modes, and the object a smoother prior
+(`ObjectPrior.smoother`).
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from torchmask.record import Callback, Record
 from torchmask.restoration.calibration import recalibrate
 from torchmask.restoration.checkpoint import Progress
 from torchmask.restoration.descent import Variables, descend
+from torchmask.restoration.escapes import settle
 from torchmask.restoration.marginal import integrate_aberrations
 from torchmask.restoration.motion import Setting
 from torchmask.restoration.objective import MyopicObjective
@@ -51,5 +52,6 @@ def finish(
         if callback is not None:
             callback(Record("last descent", steps, schedule.last_iterations, {"cost": cost}, {}))
 
-    ended.state = descend(objective, state, schedule.last_iterations, minimizer, listen)
+    state = descend(objective, state, schedule.last_iterations, minimizer, listen)
+    ended.state = settle(objective, state, schedule.last_settling)  # a descent moves flat parts of the object slowly
     return objective

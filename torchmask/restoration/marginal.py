@@ -20,7 +20,7 @@ from torchmask.record import Callback, Record
 from torchmask.restoration.adjoint import data_fidelity
 from torchmask.restoration.calibration import follow_turbulence, unwrap_pistons
 from torchmask.restoration.descent import Variables, descend
-from torchmask.restoration.escapes import settle_object
+from torchmask.restoration.escapes import settle, settle_object
 from torchmask.restoration.linearization import Linearization
 from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.projected_lbfgs import Minimizer
@@ -170,9 +170,7 @@ def settle_at_own_scale(objective: MyopicObjective, state: State, n_iterations: 
     prior = objective.prior.suited_to(state.image)
     if prior is objective.prior:
         return state
-    slope, power = objective.object_quadratic(state.image, state.z, state.calibration)
-    slope = slope + objective.model.background.price
-    return replace(state, image=settle_object(state.image, slope, power, prior, n_iterations)[1])
+    return settle(objective.with_changes(prior=prior), state, n_iterations)
 
 
 def _filter(image: Tensor, response: Tensor) -> Tensor:

@@ -115,10 +115,7 @@ class ModelRecipe:
         return moving_basis(still, self.aperture.still(), self.exposure_tau0, self.r0, self.outer_scale)
 
     def finer_basis(self) -> AberrationBasis | None:
-        """Return the basis of the last descent, with changes during an exposure if there are any; None for no more modes.
-
-        Parameters are white under the prior.
-        """
+        """Return the basis of the last descent, with changes during an exposure; None if it has no more modes."""
         if self.last_modes <= self.frame_modes or not self.whitened:
             return None
         with torch.no_grad():

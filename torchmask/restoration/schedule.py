@@ -46,7 +46,7 @@ class Schedule:
     renewal : number of rounds after which that approximation is recomputed
     memory : weight of the earlier rounds in the running averages
     settling : maximum number of iterations that fit the object in a round
-    last_settling : maximum number of iterations that fit it at the end, under a prior of its own scale
+    last_settling : maximum number of iterations that fit it at the end, under a prior that suits it better
     last_modes : number of modes of each sub-aperture of a mask in the last descent of frames that are not faint
     last_iterations : maximum number of iterations of that descent; 0: there is none
     """
