@@ -1,0 +1,132 @@
+"""The end of a restoration: more modes, a smoother object, and when there is neither."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchmask.grid import Grid
+from torchmask.optics.band import Band
+from torchmask.restoration.aberrations import moving_basis, turbulent_basis
+from torchmask.restoration.calibration import fit_of_frames
+from torchmask.restoration.candidates import Candidates
+from torchmask.restoration.checkpoint import Progress
+from torchmask.restoration.finish import finish
+from torchmask.restoration.forward import ExposureModel
+from torchmask.restoration.motion import Setting
+from torchmask.restoration.myopic import MyopicDeconvolution
+from torchmask.restoration.priors import EdgePreserving, SmoothVariation, TotalVariation
+from torchmask.restoration.projected_lbfgs import ProjectedLBFGS
+from torchmask.restoration.recipe import ModelRecipe
+from torchmask.restoration.schedule import Schedule
+from torchmask.restoration.traits import Refinement, Traits
+
+R0, OUTER_SCALE = 0.25, 20.0
+GRID = Grid.nyquist(1.0, 550e-9, 32, oversampling=1.2)
+TRAITS = Traits(False, False, True, False, R0, OUTER_SCALE, 1000, 0.0, 0, Refinement.OFF)
+
+
+def basis_of(mask, n_modes, n_common=0, exposure=0.0):
+    still = turbulent_basis(mask, n_modes, n_common, R0, OUTER_SCALE)
+    return moving_basis(still, mask, exposure, R0, OUTER_SCALE) if exposure else still
+
+
+@pytest.mark.parametrize(("n_common", "exposure"), [(0, 0.0), (2, 0.0), (8, 1.0)])
+def test_finer_modes_begin_at_the_same_aberrations(n_common, exposure, five_holes, explain):
+    still, fine = (basis_of(five_holes, n_modes, n_common) for n_modes in (3, 6))
+    finer = basis_of(five_holes, 6, n_common, exposure)
+    moving = basis_of(five_holes, 3, n_common, exposure) if exposure else None
+    objective, state = explain(ExposureModel(five_holes, GRID, still))
+    setting = Setting.of(objective, moving, finer)
+    state = setting.in_motion(state, seed=0)
+    there = setting.in_finer_modes(state)
+    before, after = setting.objective_at(objective, state), setting.objective_at(objective, there)
+    assert after.model.aberrations.n_modes == fine.n_modes
+    assert there.z.shape == after.centre.shape == (4, finer.n_parameters)
+    assert torch.allclose(after.model(state.image, there.z), before.model(state.image, state.z), rtol=1e-9)
+    common = slice(finer.n_own, None)
+    assert torch.equal(there.z[:, common], state.z[:, state.z.shape[1] - finer.n_common :])
+    back = setting.objective_at(after, state)
+    assert torch.equal(back.model(state.image, state.z), before.model(state.image, state.z))
+
+
+def test_aberrations_stay_as_they_are_without_finer_modes(five_holes, explained):
+    objective, state = explained
+    assert Setting.of(objective).in_finer_modes(state) is state
+    waiting = Setting.of(objective, basis_of(five_holes, 3, 0, 1.0), basis_of(five_holes, 6, 0, 1.0))
+    assert waiting.in_finer_modes(state) is state  # it has not begun to move
+
+
+@pytest.mark.parametrize(
+    ("options", "n_modes"),
+    [({}, 6), ({"last_modes": 3}, None), ({"last_modes": 2}, None), ({"whitened": False}, None)],
+)
+def test_a_recipe_has_a_finer_basis_if_it_has_more_modes(options, n_modes, five_holes):
+    given = {"frame_modes": 3, "static_modes": 0, "r0": R0, "outer_scale": OUTER_SCALE, "whitened": True}
+    given |= {"dtype": torch.float64, "device": None, "last_modes": 6} | options
+    finer = ModelRecipe(five_holes, GRID, Band.of([550e-9]), **given).finer_basis()
+    assert (finer and finer.n_modes) == n_modes
+    if finer is not None:  # white under the same turbulence
+        assert torch.allclose(finer.mixing, basis_of(five_holes, 6).mixing)
+
+
+def ended(objective, state, setting, schedule, records=None):
+    progress = Progress(Candidates(state, 1))
+    listen = None if records is None else records.append
+    found = finish(objective, setting, progress, schedule, ProjectedLBFGS(), listen, TRAITS, is_faint=False)
+    return found, progress
+
+
+def test_more_modes_explain_what_few_leave(five_holes, explain):
+    """Frames of six modes: from the three that are fitted to them, to the noise."""
+    truth, state = explain(ExposureModel(five_holes, GRID, basis_of(five_holes, 6)), noise=0.015)
+    few = truth.with_changes(
+        model=ExposureModel(five_holes, GRID, basis := basis_of(five_holes, 3)),
+        centre=torch.zeros(4, basis.n_parameters, dtype=torch.float64),
+    )
+    start = truth.model.aberrations.coefficients(state.z)[..., :3]
+    begun = replace(state, z=basis.parameters_of(start))
+    setting = Setting.of(few, finer=truth.model.aberrations)
+    records = []
+    objective, progress = ended(few, begun, setting, Schedule(last_iterations=100), records)
+    chi_square = [float(fit_of_frames(*pair)[1].mean()) for pair in ((few, begun), (objective, progress.state))]
+    assert chi_square[0] > 2
+    pixels = truth.frames.numel()
+    freedom = 1 - state.z.numel() / pixels  # and the object, which is fitted too
+    assert freedom - 0.3 < chi_square[1] < 1 + 4 * math.sqrt(2 / pixels)
+    assert isinstance(objective.prior, SmoothVariation)
+    assert progress.state.geometry == begun.geometry
+    assert len(records) <= progress.n_evaluations <= 2 * len(records) + 5
+    assert [record.step for record in records] == list(range(1, len(records) + 1))
+
+
+def test_a_schedule_without_last_iterations_leaves_all_as_it_is(explained):
+    objective, state = explained
+    found, progress = ended(objective, state, Setting.of(objective), Schedule.plain())
+    assert found is objective
+    assert progress.state is state
+    assert progress.n_evaluations == 0
+
+
+def test_the_prior_of_the_last_descent_is_smoother():
+    smooth = TotalVariation(2.0, 0.3).smoother()
+    assert isinstance(smooth, SmoothVariation)
+    assert (smooth.weight, smooth.bending, smooth.epsilon) == (2.0, 0.1, 0.3)
+    assert smooth.smoother() is smooth
+    assert (own := EdgePreserving()).smoother() is own
+
+
+def test_a_result_holds_the_modes_of_the_search(observe, five_holes):
+    """By default, and it can be continued."""
+    seen = observe(n_frames=2, shape=(32, 32))
+    schedule = Schedule(start_iterations=20, last_iterations=3, last_modes=8, chance=math.inf, faint=0.0)
+    method = MyopicDeconvolution(five_holes, seen.grid, readout_noise=1.5, schedule=schedule)
+    stages = []
+    result = method.restore(seen.frames, callback=lambda record: stages.append(record.stage))
+    assert stages == 20 * ["restoration"] + 3 * ["last descent"]
+    assert result.coefficients.shape == (2, 5, method.n_modes) == (2, 5, 6)
+    assert "SmoothVariation" in result.prior
+    assert method.restore(seen.frames, start=result).coefficients.shape == (2, 5, 6)
+    known = method.restore(seen.frames, coefficients=result.coefficients)
+    assert "TotalVariation" in known.prior
