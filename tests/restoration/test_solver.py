@@ -109,7 +109,7 @@ def test_a_plain_course_is_one_cost_lowered_and_nothing_else(many_minima, segmen
 @pytest.mark.parametrize("max_iterations", [1, 3, 6, 7, 13, 18, 40])
 def test_iterations_are_those_of_all_starts(max_iterations, explained):
     """Four starts of six at most; the third and fourth are cut short, or do not begin."""
-    schedule = Schedule(start_iterations=6, alike=-1.0, **ALL_MISSED, **BRISK)
+    schedule = Schedule(start_iterations=6, alike=-1.0, last_iterations=0, **ALL_MISSED, **BRISK)
     records: list[Record] = []
     solver = solver_of(explained[0], records.append, schedule=schedule, max_iterations=max_iterations)
     progress = solver.solve(Known())
