@@ -111,6 +111,7 @@ class Schedule:
             candidates=(),
             starts=1,
             faint=0.0,
+            last_modes=0,
             last_iterations=0,
         )
 
