@@ -93,11 +93,17 @@ def strength_of(scale: Tensor | float) -> Tensor:
 
 
 def lens_coherence(
-    shape: Shape, diameter: float, seeing: Seeing, longest: float, scales: tuple[float, ...] = (1.0,)
+    shape: Shape,
+    diameter: float,
+    seeing: Seeing,
+    longest: float,
+    scales: tuple[float, ...] = (1.0,),
+    steady: bool = False,
 ) -> PolarTable:
     """Tabulate the factors of c against the baseline, up to `longest` [m], for holes of one shape.
 
-    `scales` are those of the phases, relative to the seeing.
+    `scales` are those of the phases, relative to the seeing. With `steady` it is exp(-<Q>) instead, the square of the
+    fraction of |OTF|^2 that an amplitude keeps which does not fluctuate.
     """
     reach = shape.outer_diameter(diameter)
     nodes = PolarTable.nodes(_PLACES, reach, 1.0)
@@ -116,8 +122,9 @@ def lens_coherence(
         def coherence(baselines: Tensor, scale: float = scale) -> Tensor:
             total = torch.zeros(len(baselines), len(separations), dtype=torch.float64)
             for step, share in zip(drift, shares, strict=True):
-                total += share * _kernel(structure, baselines[:, None], separations + step) ** scale**2
-            return total @ densities.T
+                exponent = scale**2 * _exponent(structure, baselines[:, None], separations + step)
+                total += share * (exponent if steady else exponent.exp())
+            return (2 * total @ densities.T).exp() if steady else total @ densities.T
 
         functions = torch.stack(lens_functions(root * strength_of(scale), *(places / reach).unbind(-1)), -1)
         rows.append(functions * weight[:, None])
@@ -145,7 +152,7 @@ def shared_coherence(shape: Shape, diameter: float, seeing: Seeing, longest: flo
             for points in (between + step + separations, between + step - separations):
                 own = structure(points)
                 for row, (baseline, density) in enumerate(zip(baselines, densities, strict=True)):
-                    total[row] += share / 2 * (_kernel(structure, baseline, points, own) @ density)
+                    total[row] += share / 2 * (_exponent(structure, baseline, points, own).exp() @ density)
         return total
 
     baselines = PolarTable.nodes(_SHARED_BASELINES, reach, 1.5)
@@ -175,11 +182,11 @@ def lens_drift(seeing: Seeing) -> tuple[Tensor, list[float]]:
     return torch.cat([steps, -steps]), (shares / 2).repeat(2).tolist()
 
 
-def _kernel(structure: StructureFunction, baseline: Tensor, separation: Tensor, own: Tensor | None = None) -> Tensor:
-    """Return exp(-Q / 2) (...); `own` is the structure function of the separation, if it is known already."""
+def _exponent(structure: StructureFunction, baseline: Tensor, separation: Tensor, own: Tensor | None = None) -> Tensor:
+    """Return -Q / 2 (...); `own` is the structure function of the separation, if it is known already."""
     own = structure(separation) if own is None else own
     crossed = structure(separation + baseline) + structure(separation - baseline)
-    return torch.exp(crossed / 2 - own - structure(baseline))
+    return crossed / 2 - own - structure(baseline)
 
 
 def _factors(table: Tensor) -> tuple[Tensor, Tensor]:

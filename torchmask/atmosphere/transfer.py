@@ -70,6 +70,22 @@ def mean_square_otf(
     >>> round(float(value) / (0.4353 * 0.1**2 * 0.391), 1)
     1.5
     """
+    return _square_otf(aperture, grid, frequencies, seeing, band, steady=False)
+
+
+def steady_square_otf(
+    aperture: Aperture, grid: Grid, frequencies: Tensor, seeing: Seeing, band: Band | None = None
+) -> Tensor:
+    """Return what of |OTF|^2 (F,) does not fluctuate, T(b)^2 exp(-<Q(b, s)> / 2), as `mean_square_otf` does E|OTF|^2.
+
+    <Q> / 2 is the variance, over the overlap and the exposure, of the phase difference that the baseline joins.
+    """
+    return _square_otf(aperture, grid, frequencies, seeing, band, steady=True)
+
+
+def _square_otf(
+    aperture: Aperture, grid: Grid, frequencies: Tensor, seeing: Seeing, band: Band | None, steady: bool
+) -> Tensor:
     if aperture.centers.ndim != 2:
         raise ValueError(f"centers has shape {tuple(aperture.centers.shape)}: one mask is needed, (n_subapertures, 2)")
     band = Band.of([grid.wavelength]) if band is None else band
@@ -87,8 +103,12 @@ def mean_square_otf(
                 continue
             density = raster.density(first, second)
             inside = density > _NOTHING
-            kernel = raster.kernel(raster.lattice[inside], baselines[i], baselines[j], scales[i], scales[j])
-            total[row] += (1 + (i != j)) * shares[i] * shares[j] * one * other * (density[inside] @ kernel)
+            pairs = raster.lattice[inside], baselines[i], baselines[j], scales[i], scales[j]
+            if steady:
+                kept = torch.exp(-(density[inside] @ raster.variance(*pairs)) / 2)
+            else:
+                kept = density[inside] @ raster.kernel(*pairs)
+            total[row] += (1 + (i != j)) * shares[i] * shares[j] * one * other * kept
     return total.to(frequencies.device)
 
 
@@ -169,6 +189,13 @@ class OverlapRaster:
     def density(self, one: Tensor, other: Tensor) -> Tensor:
         """Return the density (S,) of separations between points of two overlaps, on the lattice, of unit sum."""
         return torch.fft.irfft2(one.conj() * other, s=self.padded).flatten()
+
+    def variance(self, points: Tensor, baseline: Tensor, other: Tensor, scale: float, other_scale: float) -> Tensor:
+        """Return Q (S,) at separations (S, 2) of the middles, averaged over the exposure."""
+        total = torch.zeros(len(points), dtype=torch.float64)
+        for step, weight in zip(self.drift[0], self.drift[1].tolist(), strict=True):
+            total += weight * difference_variance(self.structure, points + step, baseline, other, scale, other_scale)
+        return total
 
     def kernel(self, points: Tensor, baseline: Tensor, other: Tensor, scale: float, other_scale: float) -> Tensor:
         """Return exp(-Q / 2) (S,) at separations (S, 2) of the middles, averaged over the exposure."""

@@ -14,6 +14,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
+from torchmask.design.fluctuation import mean_inverse, piston_powers
 from torchmask.design.overlap import Geometry, baseline_mse
 from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture
@@ -109,10 +110,8 @@ class AsymptoticMSE(nn.Module):
         self.register_buffer("_ratio", torch.stack(ratios), persistent=False)
 
     def forward(self, aperture: Aperture) -> Tensor:
-        if not isinstance(aperture, Aperture):
-            raise TypeError(f"aperture is a {type(aperture).__name__}: make a SparseAperture from the centres")
-        centers = aperture.centers
         geometry = self._geometry(aperture)
+        centers = aperture.centers
         flat = centers.reshape(math.prod(centers.shape[:-2]), *centers.shape[-2:])
         weight, ratio = self._weight.to(centers.dtype), self._ratio.to(centers.dtype)
         return baseline_mse(flat, weight, ratio, geometry).reshape(centers.shape[:-2])
@@ -120,6 +119,31 @@ class AsymptoticMSE(nn.Module):
     def relative(self, aperture: Aperture) -> Tensor:
         """Return MSE_a over the mean of the object's PSD, (...): 0 is a perfect restoration, 1 none at all."""
         return self(aperture) / self.object_psd.mean().to(aperture.centers.dtype)
+
+    def jensen_term(self, aperture: Aperture) -> Tensor:
+        """Return by how much the mean error of K exposures exceeds MSE_a, (...), not differentiable.
+
+        `criterion(aperture) + criterion.jensen_term(aperture)` predicts the mean of `wiener_mse` over random exposures.
+        The term is that of a Gamma distribution of the mean of |OTF|^2 over K exposures, with the variance that
+        `torchmask.design.fluctuation` derives; to second order it is Jensen's. For K below 5 it is too small. Raises
+        ValueError and TypeError as `forward` does.
+        """
+        with torch.no_grad():
+            mean, steady = self._powers(aperture)
+            weight, ratio = self._weight.to(mean.dtype), self._ratio.to(mean.dtype)
+            mean, steady = mean[..., None, :, :], steady[..., None, :, :]
+            variance = (mean**2 - steady).clamp(min=0) / self.n_frames
+            excess = mean_inverse(mean, variance, ratio) - 1 / (mean + ratio)
+            return (weight * excess).sum((-3, -2, -1))
+
+    def _powers(self, aperture: Aperture) -> tuple[Tensor, Tensor]:
+        """E|OTF|^2 and the sum over lenses of the square of what does not fluctuate of it, (..., H // 2 + 1, W)."""
+        geometry, centers = self._geometry(aperture), aperture.centers
+        flat = centers.reshape(math.prod(centers.shape[:-2]), *centers.shape[-2:])
+        mean, steady = piston_powers(flat, geometry, self.grid.wavelength)
+        return mean.reshape(*centers.shape[:-2], *mean.shape[-2:]), steady.reshape(
+            *centers.shape[:-2], *mean.shape[-2:]
+        )
 
     def floor(self, mask_diameter: float) -> Tensor:
         """Return the part of MSE_a () that no mask of `mask_diameter` [m] can change: S_o beyond its cut-off."""
@@ -149,6 +173,8 @@ class AsymptoticMSE(nn.Module):
         return type(self)(grid, object_psd, noise_psd, self.n_frames)
 
     def _geometry(self, aperture: Aperture) -> Geometry:
+        if not isinstance(aperture, Aperture):
+            raise TypeError(f"aperture is a {type(aperture).__name__}: make a SparseAperture from the centres")
         if isinstance(aperture, FullAperture):
             raise ValueError(
                 "MSE_a is defined for masks (SparseAperture): a full pupil has aberrations that a piston per "

@@ -8,6 +8,8 @@ pairs of holes whose baselines nearly agree (`torchmask.design.lens_pairs`, `tor
 
 from __future__ import annotations
 
+from functools import cached_property, partial
+
 import torch
 from torch import Tensor
 
@@ -15,6 +17,7 @@ from torchmask.atmosphere.colour_coherence import ColourCoherence
 from torchmask.atmosphere.lens_coherence import lens_coherence, lens_functions
 from torchmask.atmosphere.seeing import Seeing
 from torchmask.design.central_lenses import CentralLenses
+from torchmask.design.fluctuation import add_lenses, steady_lenses
 from torchmask.design.frequency_plane import FrequencyPlane, half_plane
 from torchmask.design.lens_pairs import LensPairs
 from torchmask.design.lens_patches import Lenses, LensPatches
@@ -53,8 +56,8 @@ class MaskTransfer:
         self.pixel = self.pixel.to(device)
         self.reach: float = geometry.reach
         spread = tuple(sorted({min(scales), sum(scales) / len(scales), max(scales)}))
-        coherence = lens_coherence(geometry.shape, geometry.diameter, seeing, furthest, spread)
-        self.factors: Tensor = coherence(self.plane.baselines).to(device, dtype)
+        self._coherence = partial(lens_coherence, geometry.shape, geometry.diameter, seeing, furthest, spread)
+        self.factors: Tensor = self._coherence()(self.plane.baselines).to(device, dtype)
         self.central: CentralLenses = CentralLenses(
             geometry, seeing, band, reference, longest, half_plane(geometry), dtype, device
         )
@@ -70,27 +73,36 @@ class MaskTransfer:
 
     def _transfer(self, centers: Tensor) -> Tensor:
         lenses = self.patches(centers)
-        alone = self._alone(lenses, centers.shape[1])
-        index = self.plane.index(lenses.corner, *lenses.root.shape[-2:]).flatten(1)
-        planes = centers.new_zeros(*alone.shape[:2], self.plane.n_pixels)
-        planes = planes.scatter_add(2, index[:, None].expand_as(alone), alone)
-        plane = (planes * self.factors).sum(1)
+        count = torch.ones_like(lenses.root[:1, :, :1, :1])
+        count[:, 0] = centers.shape[1] / 2  # every patch counts twice in the end, at nu and at -nu
+        alone = self._parts(lenses, (lenses.values**2).sum(2) * count)
+        total = add_lenses(self.patches, lenses, alone, self.factors) + self.central(centers)
         shared = self.pairs(lenses, centers)
         if shared:
-            together = torch.zeros_like(plane).flatten()
+            together = centers.new_zeros(len(centers) * self.plane.n_pixels)
             for mask, corner, values in shared:
                 index = self.plane.index(corner, *values.shape[-2:]) + mask[:, None, None] * self.plane.n_pixels
                 together = together.scatter_add(0, index.flatten(), values.flatten())
-            plane = plane + together.view_as(plane) * self.far
-        return self.plane.folded(plane) + self.central(centers)
+            total = total + self.plane.folded(together.view(len(centers), -1) * self.far)
+        return total
 
-    def _alone(self, lenses: Lenses, n: int) -> Tensor:
-        """What lenses give with themselves, in parts of which each has a factor (B, parts, L rows columns)."""
-        count = torch.ones_like(lenses.root[:1, :, :1, :1])
-        count[:, 0] = n / 2  # every patch counts twice in the end, at nu and at -nu
-        power = (lenses.values**2).sum(2) * count
+    def steady(self, centers: Tensor) -> Tensor:
+        """N^4 times the sum over lenses of the square of what of |OTF|^2 does not fluctuate (B, H // 2 + 1, W)."""
+        found = []
+        for mask in centers.split(1):
+            lenses = self.patches(mask)
+            parts = self._parts(lenses, steady_lenses(lenses, centers.shape[1]))
+            found.append(add_lenses(self.patches, lenses, parts, self._steady_factors))
+        return torch.cat(found).clamp(min=0).unflatten(1, (-1, self.plane.n_columns))
+
+    @cached_property
+    def _steady_factors(self) -> Tensor:
+        return self._coherence(steady=True)(self.plane.baselines).to(self.factors)
+
+    def _parts(self, lenses: Lenses, power: Tensor) -> Tensor:
+        """What lenses give with themselves, in parts of which each has a factor (B, parts, L, rows, columns)."""
         places = self._places(lenses, *lenses.root.shape[-2:])
-        return torch.stack([power * function for function in lens_functions(lenses.root, *places)], 1).flatten(2)
+        return torch.stack([power * function for function in lens_functions(lenses.root, *places)], 1)
 
     def _places(self, lenses: Lenses, rows: int, columns: int) -> tuple[Tensor, Tensor]:
         """How far the light at the pixels is from the lenses' baselines, x and y, over the holes' outer diameter."""

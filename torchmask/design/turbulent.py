@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchmask.atmosphere.lens_coherence import PolarTable
 from torchmask.atmosphere.seeing import Seeing
-from torchmask.atmosphere.transfer import mean_square_otf
+from torchmask.atmosphere.transfer import mean_square_otf, steady_square_otf
 from torchmask.design.criterion import AsymptoticMSE
 from torchmask.design.frequency_plane import half_plane
 from torchmask.design.mask_transfer import MaskTransfer
@@ -33,7 +33,7 @@ class TurbulentMSE(AsymptoticMSE):
 
     As `AsymptoticMSE`, with E|OTF|^2 under von Karman turbulence and a finite exposure (Korff's integral, see
     `torchmask.atmosphere.transfer`) in place of independent pistons on holes that turbulence leaves in peace. The
-    error of K exposures, on average, is above it by what a finite number of them fluctuates.
+    error of K exposures, on average, is above it by `jensen_term`.
 
     Parameters
     ----------
@@ -163,6 +163,17 @@ class TurbulentMSE(AsymptoticMSE):
         opposite = half[..., 1 : rows - rows // 2, :].flip(-2, -1).roll(1, -1)
         return torch.cat([half, opposite], -2)
 
+    def _powers(self, aperture: Aperture) -> tuple[Tensor, Tensor]:
+        if self.seeing is None:
+            return super()._powers(aperture)
+        mean = self._half_power(aperture)
+        centers = aperture.centers
+        if aperture.is_full:
+            return mean, self._table(aperture, self._pupil_steady).to(mean).expand_as(mean)
+        flat = centers.reshape(math.prod(centers.shape[:-2]), *centers.shape[-2:])
+        steady = self._table(aperture, self._mask_transfer).steady(flat) / aperture.n_subapertures**4
+        return mean, steady.reshape(mean.shape)
+
     def _half_power(self, aperture: Aperture) -> Tensor:
         """E|OTF|^2 (..., H // 2 + 1, W) at nu_y >= 0."""
         if not isinstance(aperture, Aperture):
@@ -195,8 +206,15 @@ class TurbulentMSE(AsymptoticMSE):
         return MaskTransfer(self._geometry(aperture), self.seeing, band, self.grid.wavelength, longest, dtype, device)
 
     def _pupil_power(self, aperture: Aperture) -> Tensor:
-        """E|OTF|^2 of a full pupil (H // 2 + 1, W), by the general integral at some frequencies; what turbulence takes
-        from T is smooth in between."""
+        """E|OTF|^2 of a full pupil (H // 2 + 1, W)."""
+        return self._between(aperture, mean_square_otf)
+
+    def _pupil_steady(self, aperture: Aperture) -> Tensor:
+        """The square of what of |OTF|^2 of a full pupil does not fluctuate (H // 2 + 1, W)."""
+        return self._between(aperture, lambda *known: steady_square_otf(*known) ** 2)
+
+    def _between(self, aperture: Aperture, function: Callable[..., Tensor]) -> Tensor:
+        """A function of a full pupil, by its integral at some frequencies; over T it is smooth in between."""
         assert self.seeing is not None
         band = Band.of([self.grid.wavelength]) if self.band is None else self.band
         lengths = [wavelength / self.grid.wavelength for wavelength in band.wavelengths]
@@ -213,8 +231,8 @@ class TurbulentMSE(AsymptoticMSE):
         kept = torch.zeros_like(transfer).flatten()
         known = transfer.flatten() > 1e-4
         frequencies = nodes.flatten(0, 1)[known] / self.grid.period
-        power = mean_square_otf(aperture.still(), self.grid, frequencies, self.seeing, band)
-        kept[known] = power / transfer.flatten()[known]
+        found = function(aperture.still(), self.grid, frequencies, self.seeing, band)
+        kept[known] = found / transfer.flatten()[known]
         kept = kept.unflatten(0, transfer.shape)
         if round_:
             kept = kept.expand(-1, _PUPIL[1]).contiguous()
