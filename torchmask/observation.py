@@ -230,8 +230,10 @@ def check_frames(frames: Tensor | np.ndarray, valid: Tensor | np.ndarray | None,
 
 def _read_aperture(stored: Mapping[str, Any], prefix: str) -> Aperture:
     own = {name.removeprefix(prefix): array for name, array in stored.items() if name.startswith(prefix)}
-    numbers = {name: array.item() for name, array in own.items() if array.size == 1}
-    return read_aperture(numbers | {"centers": torch.from_numpy(own["centers"])})
+    values = {
+        name: array.item() if array.size == 1 else array.tolist() for name, array in own.items() if array.ndim < 2
+    }
+    return read_aperture(values | {"centers": torch.from_numpy(own["centers"])})
 
 
 def pixel_matrix(header: Any) -> np.ndarray | None:

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -80,11 +81,14 @@ def save_fits(path: str | Path, aperture: SparseAperture, n_pixels: int = 512) -
         image.header[f"CDELT{axis}"] = step
     image.header["BUNIT"] = ("", "open fraction of the pixel")
     record = aperture_record(aperture)
-    numbers = {key: [value] * len(centers) for key, value in record.items() if isinstance(value, float)}
+    numbers = {key: [value] * len(centers) for key, value in record.items() if isinstance(value, float | tuple)}
     columns = {"X": centers[:, 0].tolist(), "Y": centers[:, 1].tolist()} | numbers
     units = dict.fromkeys(("X", "Y", "subaperture_diameter", "mask_diameter"), "m") | {"orientation": "rad"}
     table = fits.BinTableHDU.from_columns(
-        [fits.Column(key.upper(), "D", unit=units.get(key), array=values) for key, values in columns.items()],
+        [
+            fits.Column(key.upper(), f"{np.size(values[0])}D", unit=units.get(key), array=values)
+            for key, values in columns.items()
+        ],
         name="HOLES",
     )
     table.header["SHAPE"] = record["shape"]

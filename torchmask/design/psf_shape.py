@@ -31,7 +31,7 @@ def mask_psf(frequency: Array, centers: Array, aperture: Aperture) -> Array:
 
 def _hole_power(frequency: Array, aperture: Aperture) -> Array:
     """Return the PSF of a single hole relative to its peak."""
-    return aperture.shape.amplitude(frequency, aperture.subaperture_diameter) ** 2
+    return np.abs(aperture.shape.amplitude(frequency, aperture.subaperture_diameter)) ** 2
 
 
 def psf_widths(centers: Array, aperture: Aperture) -> Array:

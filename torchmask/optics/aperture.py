@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
@@ -10,7 +11,7 @@ from torch import Tensor, nn
 from torchmask.optics import catalog
 from torchmask.optics.packing import hole_diameter, random_packing
 from torchmask.optics.pupil import Aperture, can_be_read
-from torchmask.optics.shapes import Annulus, Disc, Shape, named_shape
+from torchmask.optics.shapes import Annulus, Disc, Shape, TelescopePupil, named_shape
 
 
 class SparseAperture(Aperture):
@@ -209,7 +210,7 @@ class SparseAperture(Aperture):
 
 
 class FullAperture(Aperture):
-    """A full circular pupil without a mask.
+    """A full circular pupil without a mask, with or without a central obstruction and the vanes of a spider.
 
     Parameters
     ----------
@@ -217,23 +218,34 @@ class FullAperture(Aperture):
         Diameter of the pupil [m].
     central_obstruction : float
         Diameter of the obstruction as a fraction of `diameter`, in [0, 1).
+    vane_width : float
+        Width of the vanes that hold the secondary mirror [m].
+    vane_angles : sequence of float
+        Direction of each vane, which runs straight from the obstruction, or from the centre, to the rim [rad],
+        counterclockwise from +x.
 
     Raises
     ------
     ValueError
-        If `diameter` is not finite and positive, or `central_obstruction` lies outside [0, 1).
+        If `diameter` is not finite and positive, `central_obstruction` lies outside [0, 1), only one of `vane_width`
+        and `vane_angles` is given, or a pupil cannot have such vanes (see `torchmask.optics.telescope_pupil`).
 
     Examples
     --------
     >>> telescope = FullAperture(2.0, central_obstruction=0.25)
     >>> round(telescope.area, 4), telescope.extent, telescope.n_subapertures
     (2.9452, 2.0, 1)
+    >>> cross = [0, math.pi / 2, math.pi, 3 * math.pi / 2]
+    >>> round(FullAperture(2.0, 0.25, vane_width=0.02, vane_angles=cross).area, 4)
+    2.8852
     """
 
     def __init__(
         self,
         diameter: float,
         central_obstruction: float = 0.0,
+        vane_width: float = 0.0,
+        vane_angles: Sequence[float] = (),
         *,
         dtype: torch.dtype | None = None,
         device: torch.device | str | None = None,
@@ -246,11 +258,24 @@ class FullAperture(Aperture):
                 f"central_obstruction is {central_obstruction}: it must be a fraction of the diameter, at least 0 and "
                 "below 1"
             )
+        if bool(vane_width) != (len(vane_angles) > 0):
+            raise ValueError(
+                f"vane_width is {vane_width} m and vane_angles are {list(vane_angles)}: vanes need both, a width and "
+                "angles in rad"
+            )
         self.register_buffer("centers", torch.zeros(1, 2, dtype=dtype or torch.float64, device=device))
         self.subaperture_diameter: float = float(diameter)
         self.mask_diameter: float = float(diameter)
         self.central_obstruction: float = float(central_obstruction)
+        self.vane_width: float = float(vane_width)
+        self.vane_angles: tuple[float, ...] = tuple(float(angle) for angle in vane_angles)
         self.shape: Shape = Annulus(self.central_obstruction) if central_obstruction > 0 else Disc()
+        if self.vane_angles:
+            self.shape = TelescopePupil(self.central_obstruction, self.vane_width / diameter, self.vane_angles)
 
     def extra_repr(self) -> str:
-        return f"diameter={self.mask_diameter:.6g}, central_obstruction={self.central_obstruction:.4g}"
+        text = f"diameter={self.mask_diameter:.6g}, central_obstruction={self.central_obstruction:.4g}"
+        if self.vane_angles:
+            angles = ", ".join(f"{angle:.4g}" for angle in self.vane_angles)
+            text += f", vane_width={self.vane_width:.4g}, vane_angles=({angles})"
+        return text

@@ -7,7 +7,7 @@ from typing import Any
 
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.pupil import Aperture
-from torchmask.optics.shapes import named_shape
+from torchmask.optics.shapes import TelescopePupil, named_shape
 
 
 def aperture_record(aperture: Aperture) -> dict[str, Any]:
@@ -37,8 +37,8 @@ def read_mask(record: Mapping[str, Any]) -> SparseAperture:
 def read_aperture(record: Mapping[str, Any]) -> Aperture:
     """Return the mask or full pupil that an `aperture_record` describes.
 
-    A single round hole at the origin is a full pupil of its own diameter, whatever mask_diameter says. In files of
-    version 0.1 the obstruction is not part of the shape.
+    A single hole at the origin that is round, or a telescope's pupil with vanes, is a full pupil of its own diameter,
+    whatever mask_diameter says. In files of version 0.1 the obstruction is not part of the shape.
 
     Raises
     ------
@@ -46,7 +46,13 @@ def read_aperture(record: Mapping[str, Any]) -> Aperture:
         If the record does not describe an aperture.
     """
     mask = read_mask(record)
-    if not (mask.is_full and mask.shape.is_round) or bool(mask.centers.any()):
+    shape, diameter, dtype = mask.shape, mask.subaperture_diameter, mask.centers.dtype
+    if not mask.is_full or bool(mask.centers.any()):
         return mask
-    obstruction = mask.shape.parameters.get("obstruction", float(record.get("central_obstruction", 0.0)))
-    return FullAperture(mask.subaperture_diameter, obstruction, dtype=mask.centers.dtype)
+    if isinstance(shape, TelescopePupil):
+        width = shape.vane_width * diameter
+        return FullAperture(diameter, shape.obstruction, width, shape.vane_angles, dtype=dtype)
+    if not shape.is_round:
+        return mask
+    obstruction = shape.parameters.get("obstruction", float(record.get("central_obstruction", 0.0)))
+    return FullAperture(diameter, obstruction, dtype=dtype)

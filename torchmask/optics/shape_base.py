@@ -53,9 +53,9 @@ class Patches(Protocol):
 class Shape(ABC):
     """The shape of a hole about its centre. Lengths are in metres, and `diameter` is the size of the hole.
 
-    To add a shape, write a frozen dataclass whose fields are numbers, with a `name` (used in files) and the abstract
-    methods; a subclass of `torchmask.optics.polygons.Polygon` needs only one of them. Methods that take tensors accept
-    any leading axes, keep dtype and device, and are differentiable.
+    To add a shape, write a frozen dataclass whose fields are numbers or tuples of them, with a `name` (used in files)
+    and the abstract methods; a subclass of `torchmask.optics.polygons.Polygon` needs only one of them. Methods that
+    take tensors accept any leading axes, keep dtype and device, and are differentiable.
     """
 
     name: ClassVar[str]
@@ -80,7 +80,7 @@ class Shape(ABC):
         return f"{self.name}s"
 
     @property
-    def parameters(self) -> dict[str, float]:
+    def parameters(self) -> dict[str, Any]:
         """Fields of the dataclass, which files hold besides the name."""
         return asdict(self)
 
@@ -144,7 +144,8 @@ class Shape(ABC):
     def amplitude(self, frequency: Array, diameter: float) -> Array:
         """Return the Fourier transform of the open area, 1 at 0, at `frequency` (..., 2) [1/m].
 
-        A frequency is an angle on the sky divided by the wavelength.
+        A frequency is an angle on the sky divided by the wavelength. The result is complex for shapes that differ from
+        themselves turned by 180 degrees.
         """
 
     @abstractmethod

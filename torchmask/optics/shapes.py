@@ -9,9 +9,12 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
+import numpy as np
+
 from torchmask.optics.polygons import Hexagon, Polygon, Square
 from torchmask.optics.round import Annulus, Disc
 from torchmask.optics.shape_base import Circle, Contour, Corners, Shape
+from torchmask.optics.telescope_pupil import TelescopePupil
 
 __all__ = [
     "Annulus",
@@ -23,6 +26,7 @@ __all__ = [
     "Polygon",
     "Shape",
     "Square",
+    "TelescopePupil",
     "named_shape",
     "outlined_shape",
 ]
@@ -45,11 +49,16 @@ def named_shape(name: str, parameters: Mapping[str, Any]) -> Shape:
         raise ValueError(f"shape is {name!r}: known shapes are {', '.join(Shape.known)}")
     kind = Shape.known[name]
     needed = [field.name for field in fields(kind)]
-    given = {key: float(parameters[key]) for key in needed if key in parameters}
+    given = {key: _as_parameter(parameters[key]) for key in needed if key in parameters}
     try:
         return kind(**given)
     except TypeError as error:
         raise ValueError(f"shape {name!r} needs {', '.join(needed)}: {error}") from error
+
+
+def _as_parameter(value: Any) -> float | tuple[float, ...]:
+    """Return a number, or several as a tuple, from whatever a file holds."""
+    return tuple(float(one) for one in value) if np.ndim(value) and not isinstance(value, str) else float(value)
 
 
 def outlined_shape(outline: tuple[Contour, ...], tolerance: float) -> tuple[Shape, float]:
