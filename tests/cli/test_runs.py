@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import re
 
 import numpy as np
@@ -23,6 +24,7 @@ from torchmask.grid import Grid
 from torchmask.io import load_npz
 from torchmask.observation import Observation
 from torchmask.optics.aperture import FullAperture
+from torchmask.optics.shapes import TelescopePupil
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.result import RestorationResult
 from torchmask.spectra import NoisePSD, PowerLawPSD
@@ -124,10 +126,12 @@ def test_simulate_takes_its_units_as_they_are_called(runs, tmp_path):
     assert observation.grid == Grid.nyquist(1.0, 1e-6, 32)
     assert (observation.r0, observation.outer_scale, observation.readout_noise) == (0.3, 20.0, 1.5)
     telescope = ["--mask", "full", "--mask-diameter", "2.0", "--central-obstruction", "0.5"]
+    telescope += ["--vane-width", "0.02", "--vane-angles", "45", "225"]
     sky = ["--pixel-scale-arcsec", "0.02", "--n-pixels", "16", "--n-frames", "1", "--r0", "None"]
     run("simulate", *telescope, "--wavelength", "550e-9", *sky, "--out", tmp_path / "full")
     observation = Observation.load(tmp_path / "full/stack.npz")
     assert isinstance(observation.aperture, FullAperture)
+    assert observation.aperture.shape == TelescopePupil(0.25, 0.01, (math.radians(45), math.radians(225)))
     assert (observation.aperture.mask_diameter, observation.aperture.central_obstruction) == (2.0, 0.25)
     assert observation.grid.pixel_scale == pytest.approx(0.02 * ARCSEC, rel=1e-12)
     assert observation.r0 is None
@@ -230,6 +234,11 @@ def test_errors_of_a_cube_and_the_sky_are_those_of_the_library_call(runs, cube, 
         (["--mask", "MASK", "--wavelength", "-1e-6", "--pixel-scale-arcsec", "0.1"], "--wavelength is -1e-06"),
         (["--mask", "MASK", "--mask-diameter", "2"], "--mask-diameter"),
         (["--mask", "MASK", "--central-obstruction", "0.1"], "--central-obstruction is for a full pupil"),
+        (["--mask", "MASK", "--vane-angles", "0"], "--vane-angles is for a full pupil"),
+        (
+            ["--mask", "full", "--mask-diameter", "2", "--vane-width", "0.1"],
+            r"vane_width is 0.1 m and vane_angles are \[\] degrees",
+        ),
     ],
 )
 def test_what_a_cube_lacks_is_named(runs, cube, tmp_path, capsys, given, message):

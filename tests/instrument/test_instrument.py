@@ -10,12 +10,15 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
+from torchmask.design.rules import MaskRules
 from torchmask.grid import ARCSEC
 from torchmask.instrument.instrument import VEGA_IN_AB, Instrument
 from torchmask.instrument.parts import Camera, Site, Source, Telescope
 from torchmask.io import to_json
+from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.band import Band
 from torchmask.optics.passband import Passband
+from torchmask.optics.shapes import TelescopePupil
 
 BAND = {"wavelength": 550e-9, "width": 50e-9}
 
@@ -171,6 +174,9 @@ def test_observations_that_cannot_be_are_refused(changes, said):
         (Telescope, {"diameter": 0.0}, r"telescope.diameter is 0.0: .*in m"),
         (Telescope, {"diameter": 1.0, "central_obstruction": 1.0}, "less than the diameter, 1 m"),
         (Telescope, {"diameter": 1.0, "throughput": 1.5}, "at most 1"),
+        (Telescope, {"diameter": 1.0, "vane_width": 0.1}, r"vane_angles are \[\] degrees"),
+        (Telescope, {"diameter": 1.0, "vane_width": -0.1, "vane_angles": (0.0,)}, r"vane_width is -0.1: .*in m"),
+        (Telescope, {"diameter": 1.0, "vane_width": 0.1, "vane_angles": (0.0, 5.0)}, "vanes 5 degrees apart"),
         (Source, {}, "and not both"),
         (Source, {"magnitude": 1.0, "photon_rate": 1.0}, "and not both"),
         (Source, {"magnitude": math.nan}, "magnitude is nan"),
@@ -189,6 +195,18 @@ def test_observations_that_cannot_be_are_refused(changes, said):
 def test_parts_that_cannot_be_are_refused(part, numbers, said):
     with pytest.raises(ValueError, match=said):
         part(**numbers)
+
+
+def test_vanes_go_from_a_file_to_the_pupil_and_to_the_rules_of_masks(tmp_path):
+    telescope = Telescope(diameter=2.0, central_obstruction=0.3, vane_width=0.02, vane_angles=(0.0, 120.0, 240.0))
+    make(telescope=telescope).save(tmp_path / "a.json")
+    back = Instrument.load(tmp_path / "a.json").telescope
+    assert back == telescope
+    assert back.pupil().shape == TelescopePupil(0.15, 0.01, tuple(math.radians(angle) for angle in (0, 120, 240)))
+    zones = MaskRules(spiders=back.spiders).constraints()
+    on, beside = SparseAperture([[-0.3, 0.3 * math.sqrt(3)]], 0.1, 2.0), SparseAperture([[-0.5, 0.3]], 0.1, 2.0)
+    assert [float(zone.margins(on)) < 0 for zone in zones] == [False, True, False]
+    assert all(float(zone.margins(beside)) > 0 for zone in zones)
 
 
 def test_the_table_says_what_follows():

@@ -11,7 +11,7 @@ import torch
 
 import torchmask.planning.plan
 from torchmask.cli.main import main
-from torchmask.design.constraints import KeepOutDisc, check_mask
+from torchmask.design.constraints import KeepOutDisc, KeepOutSegment, check_mask
 from torchmask.design.criterion import AsymptoticMSE
 from torchmask.design.manufacture import load_mask
 from torchmask.design.observed import change_light, instrument_criterion
@@ -145,10 +145,11 @@ def test_masks_are_those_of_the_axes_and_what_does_not_fit_is_told(plan):
     assert len(plan.choices) == 10
 
 
-def test_masks_keep_clear_of_the_obstruction(quick):
-    blocked = make(telescope=Telescope(diameter=1.0, central_obstruction=0.3))
+def test_masks_keep_clear_of_the_obstruction_and_its_vanes(quick):
+    spider = {"vane_width": 0.05, "vane_angles": (0.0, 180.0)}
+    blocked = make(telescope=Telescope(diameter=1.0, central_obstruction=0.3, **spider))
     found = plan_observation(blocked, n_subapertures=(3,), hole_diameters=(0.15,), exposures=(2e-3,), **TINY)
-    check_mask(found.mask, 1e-9, [KeepOutDisc(0.3)])
+    check_mask(found.mask, 1e-9, [KeepOutDisc(0.3), KeepOutSegment((-0.5, 0.0), (0.5, 0.0), 0.05)])
 
 
 def test_the_best_point_and_the_edges_of_the_map(plan):

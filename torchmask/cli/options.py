@@ -11,6 +11,7 @@ import tyro
 
 from torchmask.design.manufacture import load_mask, mask_wavelength
 from torchmask.grid import ARCSEC
+from torchmask.instrument.parts import Telescope
 from torchmask.optics.aperture import Aperture, FullAperture, SparseAperture
 from torchmask.optics.band import Band
 from torchmask.optics.overlaps import check_overlaps
@@ -198,6 +199,10 @@ class MaskOptions(CatalogOptions):
     """Diameter D of a mask from the catalogue or of a full pupil [m]; None: as built."""
     central_obstruction: float = 0.0
     """Diameter of the central obstruction of a full pupil [m]."""
+    vane_width: float = 0.0
+    """Width of the vanes of a full pupil, which hold its secondary mirror [m]."""
+    vane_angles: tuple[float, ...] = ()
+    """Direction of each vane of a full pupil from its centre to its rim, counterclockwise from +x [degrees]."""
 
 
 def load_aperture(options: MaskOptions) -> Aperture:
@@ -217,9 +222,17 @@ def load_aperture(options: MaskOptions) -> Aperture:
                 f"--central-obstruction is {options.central_obstruction:g} m: it must be at least 0 and less than "
                 f"--mask-diameter, {options.mask_diameter:g} m"
             )
-        return FullAperture(options.mask_diameter, options.central_obstruction / options.mask_diameter)
-    if options.central_obstruction:
-        raise ValueError("--central-obstruction is for a full pupil (--mask full): leave it out for a mask")
+        telescope = Telescope(
+            diameter=options.mask_diameter,
+            central_obstruction=options.central_obstruction,
+            vane_width=options.vane_width,
+            vane_angles=options.vane_angles,
+        )
+        return telescope.pupil()
+    for option in ("central_obstruction", "vane_width", "vane_angles"):
+        if getattr(options, option):
+            name = option.replace("_", "-")
+            raise ValueError(f"--{name} is for a full pupil (--mask full): leave it out for a mask")
     if is_mask_file(options.mask):
         return require_apart(name, load_mask_file(options.mask, options), options.allow_overlap)
     try:

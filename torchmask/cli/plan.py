@@ -81,6 +81,8 @@ def existing_mask(options: Options) -> Aperture | None:
             mirrored=options.mirrored,
             allow_overlap=options.allow_overlap,
             central_obstruction=telescope.central_obstruction if name == FULL else 0.0,
+            vane_width=telescope.vane_width if name == FULL else 0.0,
+            vane_angles=telescope.vane_angles if name == FULL else (),
         )
     )
 

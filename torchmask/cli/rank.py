@@ -62,6 +62,7 @@ class Options(ObservationOptions, MaskRules, RunOptions):
         return cls(
             **observation_options(known),
             central_obstruction=known.telescope.central_obstruction,
+            spiders=known.telescope.spiders,
             exponent=known.source.exponent,
             knee=known.knee,
         )

@@ -37,6 +37,7 @@ class Options(ExposureOptions, DesignSpace, WorkerOptions, DebugOptions):
             folder=Path("runs/table"),
             mask_diameter=known.telescope.diameter,
             central_obstruction=known.telescope.central_obstruction,
+            spiders=known.telescope.spiders,
             wavelength=known.mean_wavelength,
             n_pixels=known.camera.n_pixels,
             pixel_scale=known.pixel_scale,

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+from torchmask.optics.aperture import FullAperture
 from torchmask.optics.pixel import SquarePixel
 
 
@@ -35,6 +36,10 @@ class Telescope:
     """Diameter of the pupil, and of a mask that covers it [m]."""
     central_obstruction: float = 0.0
     """Diameter of the central obstruction [m]."""
+    vane_width: float = 0.0
+    """Width of the vanes that hold the secondary mirror [m]."""
+    vane_angles: tuple[float, ...] = ()
+    """Direction of each vane from the centre to the rim, counterclockwise from +x [degrees]."""
     throughput: float = 1.0
     """Electrons for each photon that enters the open pupil inside the band: efficiency of mirrors, lenses and detector,
     as far as the curve of the filter does not include it."""
@@ -47,6 +52,25 @@ class Telescope:
                 f"telescope.central_obstruction is {self.central_obstruction}: it must be at least 0 and less than the "
                 f"diameter, {self.diameter:g} m"
             )
+        require("vane_width", self.vane_width, ", in m", zero=True, most=self.diameter)
+        if bool(self.vane_width) != bool(self.vane_angles):
+            raise ValueError(
+                f"vane_width is {self.vane_width:g} m and vane_angles are {list(self.vane_angles)} degrees: vanes need "
+                "both, a width and angles"
+            )
+        self.pupil()  # raises for vanes that leave no opening
+
+    def pupil(self) -> FullAperture:
+        """Return the open pupil, with its obstruction and vanes."""
+        angles = [math.radians(angle) for angle in self.vane_angles]
+        return FullAperture(self.diameter, self.central_obstruction / self.diameter, self.vane_width, angles)
+
+    @property
+    def spiders(self) -> tuple[tuple[float, float, float, float, float], ...]:
+        """Vanes as bars for `MaskRules`: from x y in the centre to x y on the rim, and width [m]."""
+        ends = [(math.cos(math.radians(angle)), math.sin(math.radians(angle))) for angle in self.vane_angles]
+        radius = self.diameter / 2
+        return tuple((0.0, 0.0, radius * x, radius * y, self.vane_width) for x, y in ends)
 
 
 @dataclass(frozen=True, kw_only=True)

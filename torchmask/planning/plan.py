@@ -9,8 +9,8 @@ from dataclasses import replace
 from typing import Any
 
 from torchmask.design.constraint_base import Constraint, Infeasible
-from torchmask.design.constraints import KeepOutDisc
 from torchmask.design.observed import change_light, instrument_criterion
+from torchmask.design.rules import MaskRules
 from torchmask.design.search import search_mask
 from torchmask.grid import ARCSEC
 from torchmask.instrument.instrument import Instrument
@@ -61,7 +61,7 @@ def plan_observation(
     aperture : Aperture, optional
         A mask that exists, or a full pupil, in place of the searches: only exposure and width are planned then.
     constraints : sequence of Constraint
-        Rules of the searches; the central obstruction of the telescope is one already.
+        Rules of the searches; the central obstruction and the vanes of the telescope are among them already.
     n_frequencies : int
         Of the criterion's grid, per side.
     budget : int
@@ -163,8 +163,9 @@ def _exposed(instrument: Instrument, lengths: Sequence[float], left_out: list[st
 
 
 def _rules(instrument: Instrument, constraints: Sequence[Constraint]) -> tuple[Constraint, ...]:
-    blocked = instrument.telescope.central_obstruction
-    return (*constraints, *([KeepOutDisc(blocked)] if blocked else []))
+    telescope = instrument.telescope
+    own = MaskRules(central_obstruction=telescope.central_obstruction, spiders=telescope.spiders)
+    return (*constraints, *own.constraints())
 
 
 def _search(
