@@ -69,6 +69,11 @@ def test_a_full_pupil_agrees_with_draws_through_a_band():
     assert_agrees(FullAperture(0.5, 0.3), Grid.nyquist(0.6, 550e-9, 32), Seeing(0.25, 5.0), band, oversampling=2)
 
 
+def test_a_pupil_with_vanes_agrees_with_draws():
+    vanes = FullAperture(1.0, 0.2, 0.08, [0.0, math.pi / 2, math.pi, 3 * math.pi / 2])
+    assert_agrees(vanes, NYQUIST, Seeing(0.3, 5.0), oversampling=2)
+
+
 def test_an_exposure_agrees_with_draws():
     seeing = Seeing(0.25, 5.0, exposure=2 * Seeing(0.25, wind=10.0).tau0, wind=(8.0, 6.0))
     # eight instants stand for the exposure: by the midpoint rule that is half a per cent of contrast too much
