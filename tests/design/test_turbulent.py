@@ -193,6 +193,17 @@ def test_full_pupils_agree_with_the_general_integral(obstruction, wind):
     assert (found / exact - 1)[counts].abs().max() < 0.02
 
 
+@pytest.mark.slow
+def test_pupils_with_vanes_agree_with_the_general_integral():
+    """Interpolated between 640 baselines, with cusps along the vanes that T and E|OTF|^2 have in common."""
+    pupil = FullAperture(1.0, 0.2, 0.04, [0.3 + k * math.pi / 2 for k in range(4)])
+    row, column, nu = some_frequencies(SparseAperture([[0.5, 0.0], [-0.5, 0.0]], 0.3, 1.0), GRID, 24, 0.05)
+    exact = mean_square_otf(pupil, GRID, nu, Seeing(0.2))
+    found = criterion_of(r0=0.2).expected_power(pupil)[row, column]
+    assert (found - exact).abs().max() < 0.005 * float(exact.max())
+    assert (found / exact - 1)[exact > 1e-4].abs().max() < 0.05
+
+
 @pytest.mark.parametrize(("ratio", "times"), [(7, 1.61), (10, 1.53), (20, 1.39)])
 def test_full_pupils_at_half_their_diameter_are_above_korff_limit(ratio, times):
     """The limit 0.435 (r0/D)^2 T of large D/r0, and how far above it a pupil is: by an independent integral, to 2 %."""

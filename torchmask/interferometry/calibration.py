@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,11 +27,12 @@ from torchmask.interferometry.star_model import MAP, PLACE, Shared, StarModel
 from torchmask.observation import check_frames
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.geometry import MaskGeometry, turn_and_stretch
-from torchmask.optics.pixel import PixelResponse
+from torchmask.optics.pixel import PixelResponse, SquarePixel
 from torchmask.record import Callback, Record
 
 _REACH = 1.6  # radius of the pixels compared [wavelength / hole diameter]: beyond the first dark ring of a hole
 _LEAST_EXPLAINED = 0.5  # of the variance of a frame: a fit that explains less is not of a star behind this mask
+_FIRST_FILL = 0.5  # of the pixels, where the fit of their fill factor starts
 _FIRST_MODES = 3  # piston, tip and tilt are fitted first
 
 
@@ -48,6 +50,9 @@ class MaskCalibration:
     offset : (2,) mean position (x, y) of the star, relative to pixel [H // 2, W // 2] [pixel]
     offset_errors : (2,) errors of the offset [pixel]
     explained : (T,) fraction of the variance of each frame's pixels around the star that the fit explains
+    fill_factor : sensitive fraction of the area of a pixel, None if it was not estimated; noise may take it out of
+        its range of 0 to 1
+    fill_factor_error : error of the fill factor
 
     Examples
     --------
@@ -75,6 +80,14 @@ class MaskCalibration:
     offset: Tensor
     offset_errors: Tensor
     explained: Tensor
+    fill_factor: float | None = None
+    fill_factor_error: float | None = None
+
+    @property
+    def pixel(self) -> SquarePixel | None:
+        """Estimated pixel response with its fill factor in range, None if it was not estimated or pixels are points."""
+        fill = min(self.fill_factor or 0.0, 1.0)
+        return SquarePixel(fill) if fill > 0 else None
 
     def __str__(self) -> str:
         g, e = self.geometry, self.geometry_errors.tolist()
@@ -91,6 +104,8 @@ class MaskCalibration:
             ("light through the holes", ", ".join(f"{value:.3f} +- {error:.3f}" for value, error in holes)),
             ("explained of the frames", f"{100 * float(self.explained.min()):.1f} % or more"),
         ]
+        if self.fill_factor is not None:
+            rows.append(("fill factor of the pixels", f"{self.fill_factor:.4f} +- {self.fill_factor_error:.4f}"))
         width = max(len(name) for name, _ in rows)
         return "\n".join(f"{name:<{width}}  {value}" for name, value in rows)
 
@@ -103,6 +118,7 @@ def calibrate_mask(
     valid: Tensor | np.ndarray | None = None,
     readout_noise: float = 0.0,
     pixel: PixelResponse | None = None,
+    estimate_pixel: bool = False,
     n_modes: int = 6,
     callback: Callback | None = None,
 ) -> MaskCalibration:
@@ -125,7 +141,10 @@ def calibrate_mask(
     readout_noise : float
         Read-out noise [electrons rms per pixel].
     pixel : PixelResponse, optional
-        Blur by the detector's pixels. None: they are points.
+        Known blur by the detector's pixels. None: they are points, or estimated.
+    estimate_pixel : bool
+        Whether to estimate the fill factor of square pixels too. Frames must be short: motion during a frame looks
+        like larger pixels.
     n_modes : int
         Number of Zernike modes of every hole and frame, at least 3.
     callback : callable, optional
@@ -140,8 +159,9 @@ def calibrate_mask(
     Raises
     ------
     ValueError
-        If the aperture is not a single mask of three holes or more, `n_modes` or `readout_noise` are out of range,
-        `check_frames` rejects the frames, or they do not show a point source behind this mask.
+        If the aperture is not a single mask of three holes or more, `n_modes` or `readout_noise` are out of range, the
+        pixels are both known and to be estimated, `check_frames` rejects the frames, or they do not show a point source
+        behind this mask.
 
     Notes
     -----
@@ -167,6 +187,8 @@ def calibrate_mask(
         raise ValueError(f"n_modes is {n_modes}: at least {_FIRST_MODES}, piston, tip and tilt, are needed")
     if not (math.isfinite(readout_noise) and readout_noise >= 0):
         raise ValueError(f"readout_noise is {readout_noise}: it must be finite and at least 0, in electrons rms")
+    if estimate_pixel and pixel is not None:
+        raise ValueError(f"pixel is {pixel}, which is known, and estimate_pixel is true: leave one of them out")
     frames, valid = (values.cpu() for values in check_frames(frames, valid, grid))
     reach = min(math.ceil(_REACH * grid.period / aperture.subaperture_diameter), (min(grid.shape) - 1) // 2)
     star = StarFrames.around(frames, valid, reach)
@@ -176,7 +198,8 @@ def calibrate_mask(
     coarse, model = (StarModel(aperture, grid, reach, number, pixel) for number in (_FIRST_MODES, n_modes))
     data, counted = star.pixels.flatten(1), star.counted.flatten(1).double()
     even = _even_weights(data, counted)
-    shared = Shared(look.geometry.matrix, centers.new_zeros(len(centers)))
+    fill = centers.new_tensor(_FIRST_FILL) if estimate_pixel else None
+    shared = Shared(look.geometry.matrix, centers.new_zeros(len(centers)), fill)
     fit = _first_fit(coarse, model, data, even, shared, callback)
     _require_star(data, counted, fit)
     fit, _ = fit_together(model, data, even, fit)
@@ -243,7 +266,7 @@ def _require_star(data: Tensor, counted: Tensor, fit: StarFit) -> None:
         )
 
 
-def _estimates(model: StarModel, fit: StarFit, information: Information, middles: Tensor) -> dict[str, Tensor]:
+def _estimates(model: StarModel, fit: StarFit, information: Information, middles: Tensor) -> dict[str, Any]:
     """Return the fields of a `MaskCalibration` that have errors, and these errors."""
     covariances = [information.noise_covariance, information.covariance]
 
@@ -264,13 +287,18 @@ def _estimates(model: StarModel, fit: StarFit, information: Information, middles
     elements, logarithms = fit.shared.matrix.flatten(), fit.shared.log_transmission
     tilts = model.offset_slopes(fit.shared)
     offsets = middles + fit.own @ tilts
-    n = len(offsets)
+    n, end, fill = len(offsets), MAP + model.n_holes, fit.shared.fill
+    pixels = {}
+    if fill is not None:
+        error = errors(lambda value: value, fill[None], slice(end, None))
+        pixels = {"fill_factor": float(fill), "fill_factor_error": float(error)}
     noise = torch.einsum("kx,tkl,lx->tx", tilts, information.own_covariances, tilts).mean(0)
     scatter = offsets.var(0) if n > 1 else torch.zeros_like(noise)
     return {
         "geometry_errors": errors(geometry, elements, slice(0, MAP)),
         "transmissions": transmissions(logarithms),
-        "transmission_errors": errors(transmissions, logarithms, slice(MAP, None)),
+        "transmission_errors": errors(transmissions, logarithms, slice(MAP, end)),
         "offset": offsets.mean(0),
         "offset_errors": (torch.maximum(noise, scatter) / n).sqrt(),
+        **pixels,
     }

@@ -159,11 +159,11 @@ def _step(model: StarModel, frames: Tensor, weights: Tensor, fit: StarFit) -> tu
         known.append(torch.cholesky_inverse(factor))
         promised += float(own_slope @ ahead[-1])
     n = model.n_holes
-    prior = frames.new_zeros(MAP + n, MAP + n)
-    prior[MAP:, MAP:] = (_EVEN * n) ** -2
+    prior, holes = torch.zeros_like(matrices[0]), slice(MAP, MAP + n)
+    prior[holes, holes] = (_EVEN * n) ** -2
     information = Information(torch.stack(matrices), torch.stack(scores), torch.stack(known), prior)
     slope = information.scores.sum(0)
-    slope[MAP:] -= fit.shared.log_transmission.mean() / (_EVEN**2 * n)
+    slope[holes] -= fit.shared.log_transmission.mean() / (_EVEN**2 * n)
     step = information.noise_covariance @ slope
     promised += float(slope @ step)
     return step, torch.stack(ahead) - torch.stack(back) @ step, promised, information

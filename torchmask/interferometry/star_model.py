@@ -19,6 +19,7 @@ from torchmask.optics.zernike import aperture_modes, noll
 
 PLACE = 2  # number of parameters of a frame before its aberrations: logarithm of the light, and background
 MAP = 4  # number of elements of the affine map, the first of the shared parameters
+_TERMS = 12  # of the series of a pixel's blur, which leave less than 1e-16 at the Nyquist frequency
 _SPARE_DEGREE = 10  # of the quadrature, beyond the largest phase: the error falls faster than exponentially
 
 
@@ -28,14 +29,18 @@ class Shared:
 
     matrix : (2, 2) affine map from the given to the actual geometry of the mask
     log_transmission : (N,) logarithm of the light through each hole relative to the mean
+    fill : () sensitive fraction of the area of square pixels, None if it is not a parameter
     """
 
     matrix: Tensor
     log_transmission: Tensor
+    fill: Tensor | None = None
 
     def moved(self, step: Tensor) -> Shared:
-        """Return the parameters after a step (4 + N,)."""
-        return Shared(self.matrix + step[:MAP].view(2, 2), self.log_transmission + step[MAP:])
+        """Return the parameters after a step (4 + N,), or (5 + N,) with that of the pixels last."""
+        end = MAP + len(self.log_transmission)
+        fill = None if self.fill is None else self.fill + step[end]
+        return Shared(self.matrix + step[:MAP].view(2, 2), self.log_transmission + step[MAP:end], fill)
 
 
 class StarModel:
@@ -52,7 +57,7 @@ class StarModel:
     n_modes : int
         Number J of Zernike modes of every hole, at least 3.
     pixel : PixelResponse, optional
-        Blur by the detector's pixels. None: they are points.
+        Known blur by the detector's pixels. None: they are points, unless the shared parameters include their blur.
 
     Notes
     -----
@@ -76,8 +81,7 @@ class StarModel:
         self._modes: Tensor = aperture_modes(aperture, self._points, n_modes)
         self._transfer: Tensor | None = None
         if pixel is not None:
-            nu_y, nu_x = torch.fft.fftfreq(self.side).double(), torch.fft.rfftfreq(self.side).double()
-            self._transfer = pixel.transfer(nu_y[:, None], nu_x[None])
+            self._transfer = pixel.transfer(*self._frequencies())
 
     @property
     def n_holes(self) -> int:
@@ -92,10 +96,11 @@ class StarModel:
     def image(self, own: Tensor, shared: Shared, kernels: tuple[Tensor, Tensor]) -> Tensor:
         """Return the image of one frame (pixels,) [electrons]."""
         amplitude = (self._holes(own, shared) @ kernels[0].T).T * kernels[1]
-        return self._seen(own[0].exp() * amplitude.sum(1).abs() ** 2) + own[1]
+        blur = self._blur(shared)
+        return self._seen(own[0].exp() * amplitude.sum(1).abs() ** 2, blur) + own[1]
 
     def linearise(self, own: Tensor, shared: Shared, kernels: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the image (pixels,) and its derivatives in own (pixels, 2 + N J) and shared (pixels, 4 + N) ones."""
+        """Return the image (pixels,) and its derivatives in own (pixels, 2 + N J) and shared (pixels, S) parameters."""
         hole, carrier = kernels
         pupil = self._holes(own, shared)  # (N, Q)
         columns = torch.cat([self._modes, self._points], 1).to(pupil)  # (Q, J + 2)
@@ -111,10 +116,14 @@ class StarModel:
         slope = (factor * radius).imag * self._wave  # derivative in the phase k x . A r, along r
         by_map = (self.pixels[:, :, None] * slope[:, None, :]).flatten(1)
         intensity = light * total.abs() ** 2
-        image = self._seen(intensity)
+        blur = self._blur(shared)
+        image = self._seen(intensity, blur)
         ones = torch.ones_like(image)
-        by_own = torch.cat([image[:, None], ones[:, None], self._seen(by_modes)], 1)
-        by_shared = self._seen(torch.cat([by_map, by_transmission], 1))
+        by_own = torch.cat([image[:, None], ones[:, None], self._seen(by_modes, blur)], 1)
+        by_shared = self._seen(torch.cat([by_map, by_transmission], 1), blur)
+        if shared.fill is not None:
+            slope = square_blur(shared.fill, *self._frequencies())[1]
+            by_shared = torch.cat([by_shared, self._seen(intensity, slope)[:, None]], 1)
         return image + own[1], by_own, by_shared
 
     def offset_slopes(self, shared: Shared) -> Tensor:
@@ -133,15 +142,40 @@ class StarModel:
         phase = own[PLACE:].view(self.n_holes, self.n_modes) @ self._modes.T
         return (0.5 * shared.log_transmission).exp()[:, None] * self._weights * _phasor(phase)
 
-    def _seen(self, images: Tensor) -> Tensor:
-        """Blur images (pixels, ...) by the detector's pixels."""
-        if self._transfer is None:
+    def _frequencies(self) -> tuple[Tensor, Tensor]:
+        """Return the frequencies nu_y (side, 1) and nu_x (1, side // 2 + 1) of the square [cycles/pixel]."""
+        nu_y, nu_x = torch.fft.fftfreq(self.side).double(), torch.fft.rfftfreq(self.side).double()
+        return nu_y[:, None], nu_x[None]
+
+    def _blur(self, shared: Shared) -> Tensor | None:
+        """Return the transfer function of the pixels, known or a parameter, or None if they are points."""
+        return self._transfer if shared.fill is None else square_blur(shared.fill, *self._frequencies())[0]
+
+    def _seen(self, images: Tensor, transfer: Tensor | None) -> Tensor:
+        """Multiply the transforms of images (pixels, ...) by a function of frequency."""
+        if transfer is None:
             return images
-        flat = images.view(self.side, self.side, -1)
-        transfer = self._transfer[..., None]
-        return torch.fft.irfft2(torch.fft.rfft2(flat, dim=(0, 1)) * transfer, s=2 * [self.side], dim=(0, 1)).view_as(
-            images
-        )
+        spectrum = torch.fft.rfft2(images.view(self.side, self.side, -1), dim=(0, 1)) * transfer[..., None]
+        return torch.fft.irfft2(spectrum, s=2 * [self.side], dim=(0, 1)).view_as(images)
+
+
+def square_blur(fill: Tensor, nu_y: Tensor, nu_x: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the transfer function of square pixels of a fill factor, as `SquarePixel`, and its slope in that factor.
+
+    It is a power series in the fill factor and continues below 0, where a fit to pixels that are points may wander.
+    """
+    y, x = (torch.stack(_sinc_of_square(fill * nu**2)) for nu in (nu_y, nu_x))
+    return y[0] * x[0], y[1] * nu_y**2 * x[0] + y[0] * x[1] * nu_x**2
+
+
+def _sinc_of_square(square: Tensor) -> tuple[Tensor, Tensor]:
+    """Return sinc(s^(1/2)) and its slope in s, by the series of sin(x) / x, for s of at most 1."""
+    value, slope, term = torch.zeros_like(square), torch.zeros_like(square), 1.0
+    for k in range(_TERMS):
+        value = value + term * square**k
+        slope = slope + (k * term * square ** (k - 1) if k else 0.0)
+        term *= -(math.pi**2) / ((2 * k + 2) * (2 * k + 3))
+    return value, slope
 
 
 def _phasor(phase: Tensor) -> Tensor:

@@ -90,6 +90,11 @@ class Shape(ABC):
         return 1.0
 
     @property
+    def without_vanes(self) -> Shape:
+        """The shape without thin vanes across it."""
+        return self
+
+    @property
     def askew(self) -> float:
         """Angle [rad] by which to turn the shape so that no side lies along x."""
         return 0.0

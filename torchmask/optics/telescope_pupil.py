@@ -12,14 +12,12 @@ from torch import Tensor
 
 from torchmask.optics.round import Annulus, Disc
 from torchmask.optics.shape_base import Array, Contour, Corners, half_plane_coverage
-from torchmask.optics.vanes import Spider, VanedOverlap, edges, sector_quadrature, vane_transform
+from torchmask.optics.vanes import Spider, edges, sector_quadrature, vane_transform, vaned_otf
 
 
 @dataclass(frozen=True)
 class TelescopePupil(Annulus):
-    """A disc with a round central obstruction and the straight vanes of a spider.
-
-    Each vane runs from the obstruction, or from the centre if there is none, to the rim.
+    """A disc with a round central obstruction and straight vanes from it, or from the centre, to the rim.
 
     Parameters
     ----------
@@ -58,6 +56,10 @@ class TelescopePupil(Annulus):
     def plural(self) -> str:
         return f"{self.name}s"
 
+    @property
+    def without_vanes(self) -> Disc:
+        return Annulus(self.obstruction) if self.obstruction else Disc()
+
     def turned(self, angle: float) -> Self:
         return replace(self, vane_angles=tuple(own + angle for own in self.vane_angles))
 
@@ -68,15 +70,14 @@ class TelescopePupil(Annulus):
         return edges(self.spider).area * (diameter / 2) ** 2
 
     def outline(self, diameter: float) -> tuple[Contour, ...]:
-        edges_of_discs = super().outline(diameter) if self.obstruction else Disc().outline(diameter)
-        return (*edges_of_discs, *_drawn_vanes(self.spider, diameter))
+        return (*self.without_vanes.outline(diameter), *_drawn_vanes(self.spider, diameter))
 
     @classmethod
     def from_outline(cls, outline: tuple[Contour, ...], tolerance: float) -> tuple[Self, float] | None:
         return None
 
     def coverage(self, offsets: Tensor, cell: Tensor, diameter: float) -> Tensor:
-        ring = (super() if self.obstruction else Disc()).coverage(offsets, cell, diameter)
+        ring = self.without_vanes.coverage(offsets, cell, diameter)
         along, across = (offsets.new_tensor(axis) for axis in self.spider.frames())
         ahead, aside = (offsets @ axis.T for axis in (along, across))  # (..., V)
         half = self.vane_width * diameter / 2
@@ -84,9 +85,7 @@ class TelescopePupil(Annulus):
         return ring * (1 - strip * half_plane_coverage(ahead, along, cell)).prod(-1)
 
     def otf(self, shift: Tensor, diameter: float) -> Tensor:
-        spider, flat = self.spider, (2 / diameter * shift.double()).reshape(-1, 2)
-        overlap: Tensor = VanedOverlap.apply(flat, spider)
-        return (overlap / edges(spider).area).reshape(shift.shape[:-1]).to(shift.dtype)
+        return vaned_otf(shift * (2 / diameter), self.spider)
 
     def quadrature(self, degree: int, diameter: float) -> tuple[Tensor, Tensor]:
         points, weights = sector_quadrature(self.spider, degree)

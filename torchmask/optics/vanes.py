@@ -101,7 +101,16 @@ def edges(spider: Spider) -> Edges:
     )
 
 
-class VanedOverlap(torch.autograd.Function):
+def vaned_otf(shift: Tensor, spider: Spider) -> Tensor:
+    """Return the overlap (...) of the pupil with itself displaced by `shift` (..., 2), over the open area.
+
+    It is computed in float64 and returned in the dtype of `shift`.
+    """
+    overlap: Tensor = _VanedOverlap.apply(shift.double().reshape(-1, 2), spider)
+    return (overlap / edges(spider).area).reshape(shift.shape[:-1]).to(shift.dtype)
+
+
+class _VanedOverlap(torch.autograd.Function):
     """Area (F,) that the pupil shares with its copy displaced by `shift` (F, 2), float64.
 
     By Green's theorem it is an integral along the parts of each boundary that lie in the other copy. Its derivative is
