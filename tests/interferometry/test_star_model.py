@@ -66,6 +66,23 @@ def test_derivatives_are_those_of_autograd(shape, pixel):
     torch.testing.assert_close(by_shared, torch.cat(expected[1:], 1), rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.parametrize("fill", [-0.1, 0.0, 0.7, 1.0])
+def test_derivative_by_the_pixels_is_that_of_autograd(fill):
+    """Also below 0, where the series goes on; within range the blur is that of SquarePixel."""
+    model, values = StarModel(MASKS["disc"], GRID, 4, 3), own(1, 3)
+    matrix, even = MaskGeometry(0.05).matrix, torch.zeros(4, dtype=torch.float64)
+
+    def image(fill):
+        return model.image(values, Shared(matrix, even, fill), model.kernels(matrix))
+
+    at = torch.tensor(fill, dtype=torch.float64)
+    _, _, by_shared = model.linearise(values, Shared(matrix, even, at), model.kernels(matrix))
+    torch.testing.assert_close(by_shared[:, -1], torch.func.jacrev(image)(at), rtol=1e-9, atol=1e-9)
+    if fill > 0:
+        known = StarModel(MASKS["disc"], GRID, 4, 3, SquarePixel(fill))
+        torch.testing.assert_close(image(at), known.image(values, Shared(matrix, even), known.kernels(matrix)))
+
+
 def test_pixels_blur_by_their_transfer_function():
     sharp, blurred = (StarModel(MASKS["disc"], GRID, 12, 3, pixel) for pixel in (None, SquarePixel(0.7)))
     lies, values = shared(MaskGeometry(), [0.0] * 4), own(2, 3)

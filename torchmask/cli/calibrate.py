@@ -34,6 +34,8 @@ class Options(StackOptions, RunOptions):
     """Exposures of the star, .npz or .fits; several FITS files are one stack."""
     pixel_fill: float | None = None
     """Sensitive fraction of the area of a pixel, 1 for pixels without gaps; None: pixels are points."""
+    estimate_pixel: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Estimate that fraction too; exposures must be short, as motion looks like larger pixels."""
     n_modes: int = 6
     """Number of Zernike modes per hole and frame, from Noll mode 1 (piston)."""
 
@@ -44,8 +46,9 @@ def run(options: Options) -> None:
         raise ValueError("no exposures of a star are given: give .npz or FITS files")
     seen = read_stack(options.stacks, options)
     pixel = pixel_response(options.pixel_fill)
+    require_one_pixel(pixel, options.estimate_pixel)
     with new_run("calibrate", options) as output:
-        found = calibrate_on(seen, pixel, options.n_modes, output.callback)
+        found = calibrate_on(seen, pixel, options.estimate_pixel, options.n_modes, output.callback)
         write_calibration(output, found, options.stacks, seen.grid.wavelength)
 
 
@@ -54,8 +57,18 @@ def pixel_response(fill: float | None) -> SquarePixel | None:
     return None if fill is None else SquarePixel(fill)
 
 
+def require_one_pixel(pixel: PixelResponse | None, estimate: bool) -> None:
+    """Raise ValueError if the pixels are both known and to be estimated."""
+    if estimate and pixel is not None:
+        raise ValueError("--pixel-fill says how large pixels are, and --estimate-pixel asks for it: give one of them")
+
+
 def calibrate_on(
-    star: Observation, pixel: PixelResponse | None, n_modes: int = 6, callback: Callback | None = None
+    star: Observation,
+    pixel: PixelResponse | None,
+    estimate_pixel: bool = False,
+    n_modes: int = 6,
+    callback: Callback | None = None,
 ) -> MaskCalibration:
     """Measure the mask's geometry on exposures of a star. Raises ValueError as `calibrate_mask` or for a full pupil."""
     if not isinstance(star.aperture, SparseAperture):
@@ -67,15 +80,16 @@ def calibrate_on(
         valid=star.valid,
         readout_noise=star.readout_noise or 0.0,
         pixel=pixel,
+        estimate_pixel=estimate_pixel,
         n_modes=n_modes,
         callback=callback,
     )
 
 
-def read_star(path: Path, options: StackOptions, pixel_fill: float | None) -> MaskCalibration:
+def read_star(path: Path, options: StackOptions, pixel: PixelResponse | None, estimate_pixel: bool) -> MaskCalibration:
     """Measure the mask's geometry on a file with a star. Raises ValueError, which names --star, if that fails."""
     try:
-        return calibrate_on(read_stack([path], options), pixel_response(pixel_fill))
+        return calibrate_on(read_stack([path], options), pixel, estimate_pixel)
     except ValueError as error:
         raise ValueError(f"--star {path}: {error}") from error
 
@@ -100,4 +114,6 @@ def estimates(found: MaskCalibration, files: Sequence[Path]) -> dict[str, Any]:
         "offset": found.offset.tolist(),
         "offset_errors": found.offset_errors.tolist(),
         "explained": found.explained.tolist(),
+        "fill_factor": found.fill_factor,
+        "fill_factor_error": found.fill_factor_error,
     }

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import tyro
 
 from torchmask import __version__
-from torchmask.cli.calibrate import pixel_response, read_star, write_calibration
+from torchmask.cli.calibrate import pixel_response, read_star, require_one_pixel, write_calibration
 from torchmask.cli.config import stored
 from torchmask.cli.oifits import OIFITSOptions, measure_frames, write_frames
 from torchmask.cli.options import BandOptions, RunOptions, WorkerOptions
@@ -67,6 +67,8 @@ class Options(BandOptions, StackOptions, OIFITSOptions, WorkerOptions, RunOption
     """Exposure time of a frame [tau0 = 0.314 r0 / wind], during which the model lets holes move; 0: snapshots."""
     star: Path | None = None
     """Exposures of a star through the same mask, .npz or .fits, which give its geometry (`torchmask calibrate`)."""
+    estimate_pixel: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Estimate the sensitive fraction of a pixel on --star, instead of --pixel-fill."""
     refine_geometry: Literal["if-seen", "yes", "no"] = "if-seen"
     """Estimate a rotation and magnification of the mask with the image; if-seen: if the frames show an error in it."""
     prior: bool = True
@@ -101,7 +103,14 @@ def run(options: Options) -> int:
         raise ValueError("there is no stack to restore: give .npz or FITS files")
     if options.resume is not None and len(stacks) > 1:
         raise ValueError(f"--resume continues one stack, but {len(stacks)} are given")
-    star = None if options.star is None else read_star(options.star, options, options.pixel_fill)
+    pixel, estimate = pixel_response(options.pixel_fill), options.estimate_pixel
+    require_one_pixel(pixel, estimate)
+    if estimate and options.star is None:
+        raise ValueError("--estimate-pixel needs a star, whose size is known: give --star, or --pixel-fill")
+    star = None if options.star is None else read_star(options.star, options, pixel, estimate)
+    if estimate and star is not None:
+        fill = None if star.pixel is None else star.pixel.fill_factor
+        options = dataclasses.replace(options, pixel_fill=fill, estimate_pixel=False)
     if len(stacks) > 1:
         return restore_several(stacks, options, star)
     (files,) = stacks.values()

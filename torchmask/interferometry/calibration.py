@@ -50,9 +50,8 @@ class MaskCalibration:
     offset : (2,) mean position (x, y) of the star, relative to pixel [H // 2, W // 2] [pixel]
     offset_errors : (2,) errors of the offset [pixel]
     explained : (T,) fraction of the variance of each frame's pixels around the star that the fit explains
-    fill_factor : sensitive fraction of the area of a pixel, None if it was not estimated; noise may take it out of
-        its range of 0 to 1
-    fill_factor_error : error of the fill factor
+    fill_factor, fill_factor_error : sensitive fraction of a pixel's area, which noise may take out of its range of 0
+        to 1, and its error; None if it was not estimated
 
     Examples
     --------
@@ -86,8 +85,7 @@ class MaskCalibration:
     @property
     def pixel(self) -> SquarePixel | None:
         """Estimated pixel response with its fill factor in range, None if it was not estimated or pixels are points."""
-        fill = min(self.fill_factor or 0.0, 1.0)
-        return SquarePixel(fill) if fill > 0 else None
+        return SquarePixel(min(fill, 1.0)) if (fill := self.fill_factor or 0.0) > 0 else None
 
     def __str__(self) -> str:
         g, e = self.geometry, self.geometry_errors.tolist()
@@ -288,10 +286,7 @@ def _estimates(model: StarModel, fit: StarFit, information: Information, middles
     tilts = model.offset_slopes(fit.shared)
     offsets = middles + fit.own @ tilts
     n, end, fill = len(offsets), MAP + model.n_holes, fit.shared.fill
-    pixels = {}
-    if fill is not None:
-        error = errors(lambda value: value, fill[None], slice(end, None))
-        pixels = {"fill_factor": float(fill), "fill_factor_error": float(error)}
+    fill_error = None if fill is None else float(errors(lambda value: value, fill[None], slice(end, None)))
     noise = torch.einsum("kx,tkl,lx->tx", tilts, information.own_covariances, tilts).mean(0)
     scatter = offsets.var(0) if n > 1 else torch.zeros_like(noise)
     return {
@@ -300,5 +295,6 @@ def _estimates(model: StarModel, fit: StarFit, information: Information, middles
         "transmission_errors": errors(transmissions, logarithms, slice(MAP, end)),
         "offset": offsets.mean(0),
         "offset_errors": (torch.maximum(noise, scatter) / n).sqrt(),
-        **pixels,
+        "fill_factor": None if fill is None else float(fill),
+        "fill_factor_error": fill_error,
     }
