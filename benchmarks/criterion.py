@@ -50,7 +50,7 @@ class Config:
     device: str = "cpu"
     dtype: Literal["float64", "float32"] = "float64"
     threads: int | None = None
-    """Of the CPU; None leaves torch's choice."""
+    """Number of threads; None leaves it to torch."""
     clock: Literal["wall", "cpu"] = "wall"
     """On a machine that others use as well, count seconds of the processor, with one thread."""
     n_subapertures: tuple[int, ...] = (6, 11, 20)

@@ -58,7 +58,7 @@ def this_library(observation: Observation, effort: Effort) -> Iterator[Candidate
 
 @dataclass(frozen=True)
 class MFBDSettings:
-    """Of torchmfbd: Karhunen-Loeve modes without piston, step of Adam, regularisation of the division by the OTFs."""
+    """Settings of torchmfbd: Karhunen-Loeve modes without piston, step of Adam, noise that regularises its division."""
 
     n_modes: int
     step: float

@@ -50,9 +50,9 @@ class Options(ExperimentOptions):
     stacks: tyro.conf.Positional[tuple[Path, ...]] = ()
     """Stacks of exposures with their truth (.npz); none: a mask and a full pupil, simulated here."""
     cutoff: float = 0.5
-    """Of the score: D pixel_scale / wavelength [cycles/pixel]."""
+    """Cut-off of the score, D pixel_scale / wavelength [cycles/pixel]."""
     mfbd_iterations: int = 500
-    """Of torchmfbd."""
+    """Number of iterations of torchmfbd."""
 
 
 def best(name: str, candidates: Iterator[Candidate], truth: Tensor | None, cutoff: float) -> dict[str, Any] | None:
@@ -80,7 +80,7 @@ def compare(name: str, observation: Observation, cutoff: float, effort: Effort) 
 
 
 def lead(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """How far this library is ahead on one stack: the score of the best peer without the PSFs over its own."""
+    """Return how far this library is ahead on one stack: the score of the best peer without the PSFs over its own."""
     ours = next(row for row in rows if row["method"] == OURS)
     peer = min((row for row in rows if row["method"] not in (OURS, LIMIT)), key=lambda row: row["score"])
     limit = next(row for row in rows if row["method"] == LIMIT)
@@ -115,7 +115,7 @@ def simulated(smoke: bool) -> dict[str, Observation]:
 
 
 def versions() -> dict[str, str]:
-    """Of everything that was compared. Raises ValueError if the extra is not installed."""
+    """Return a row for everything that was compared. Raises ValueError if the extra is not installed."""
     try:
         others = ("torchmfbd", "scikit-image", "torch", "numpy", "scipy")
         return {"torchmask": torchmask.__version__} | {name: version(name) for name in others}

@@ -39,13 +39,13 @@ class Config:
     n_subapertures: tuple[int, ...] = (6, 11)
     seeds: int = 3
     seconds: float = 10.0
-    """For one search."""
+    """Time of one search [s]."""
     fill_factor: float = 0.15
     methods: tuple[Literal["cma", "cma + gradient", "hybrid"], ...] = ("cma", "cma + gradient", "hybrid")
     clock: Literal["wall", "cpu"] = "wall"
     """On a machine that others use as well, count seconds of the processor, with one thread."""
     threads: int | None = None
-    """None leaves torch's choice."""
+    """Number of threads; None leaves it to torch."""
     smoke: bool = False
 
 

@@ -46,7 +46,7 @@ def observe(number: int, n_holes: int, d_over_r0: float, photons: float, sky: fl
 
 
 def spoil(observation: Observation, how: str) -> Observation:
-    """What no restoration can explain."""
+    """Return the mask and the frames after an error that no restoration can explain."""
     mask, frames = observation.aperture, observation.frames
     assert isinstance(mask, SparseAperture)
     generator = torch.Generator().manual_seed(1)

@@ -35,7 +35,7 @@ ENOUGH = 1.1  # times the isoplanatic score: up to here one PSF is enough
 
 @dataclass(frozen=True, kw_only=True)
 class Options(ObservingOptions):
-    """What the restorations depend on."""
+    """Options of the restorations."""
 
     fields: tuple[float, ...] = (0.25, 0.5, 1.0, 2.0, 4.0)
     """Values of the scene's larger side over theta0, with half of the turbulence in the high layer."""

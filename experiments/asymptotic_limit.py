@@ -47,7 +47,7 @@ _FRAMES = 20  # OTFs held in memory
 
 @dataclass(frozen=True, kw_only=True)
 class Options(SweepOptions):
-    """What the draws depend on."""
+    """Options of the draws."""
 
     frames: tuple[int, ...] = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100)
     """Numbers of exposures K."""
@@ -142,7 +142,7 @@ def draw(task: dict[str, Any]) -> dict[str, Any]:
 
 
 def sampling_error(task: dict[str, Any]) -> float:
-    """By how much the sampled pupil changes the Wiener MSE of 20 exposures: relative, the same pistons in both."""
+    """Return the relative change that sampling the pupil makes to the Wiener MSE of 20 exposures of equal pistons."""
     mask = SparseAperture(task["centers"], task["subaperture_diameter"], DIAMETER)
     limit = criterion(task, 1)
     pistons = uniform_pistons(_FRAMES, mask.n_subapertures, torch.Generator().manual_seed(task["seed"]))
@@ -229,7 +229,7 @@ def check(options: Options) -> None:
 
 
 def setting(options: Options) -> str:
-    """What all rows share."""
+    """Return a sentence on what all rows share."""
     return (
         f"p = {options.exponent:g}, {options.n_photons:g} photons per exposure, N d^2 / D^2 = {options.fill_factor:g}, "
         f"{options.n_pixels} frequencies a side, outer scale {options.outer_scale:g} D."

@@ -15,7 +15,7 @@ MODELS = {"pistons": "random pistons", "von_karman": "von Karman screens"}
 
 
 def findings(d_over_r0: float, rows: Sequence[dict[str, Any]]) -> list[str]:
-    """What the numbers say, in sentences."""
+    """Return what the numbers say, in sentences."""
     pistons = [row for row in rows if row["model"] == "pistons"]
     worst = min(pistons, key=lambda row: (row["ratio"] - 1) / row["ratio_error"])
     sigmas = (worst["ratio"] - 1) / worst["ratio_error"]

@@ -27,7 +27,7 @@ from torchmask.cli.run import new_run
 
 @dataclass(frozen=True, kw_only=True)
 class Options(ObservingOptions):
-    """What the restorations depend on."""
+    """Options of the restorations."""
 
     widths: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.4)
     """Widths of the filter over the wavelength."""

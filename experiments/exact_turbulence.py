@@ -77,7 +77,7 @@ def drawn_mean_square(
 
 
 def _covariance(points: Tensor, seeing: Seeing) -> Tensor:
-    """Of the phases at `points` (S, 2) [m], less the phase at the origin, which leaves no trace in |OTF|."""
+    """Return the covariance of phases at `points` (S, 2) [m], less that at the origin, which |OTF| does not see."""
     structure = seeing.structure(2 * float(points.norm(dim=-1).max()))
     own = structure(points)
     rows = [

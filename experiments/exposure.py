@@ -25,7 +25,7 @@ from torchmask.cli.run import new_run
 
 @dataclass(frozen=True, kw_only=True)
 class Options(ObservingOptions):
-    """What the restorations depend on."""
+    """Options of the restorations."""
 
     exposures: tuple[float, ...] = (0.25, 0.5, 1.0, 2.0, 4.0)
     """Exposure times of a frame, T / tau0."""

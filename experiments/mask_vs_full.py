@@ -168,7 +168,7 @@ def sweep(options: Options, mask: SparseAperture, callback: Callback) -> list[di
 
 
 def setting(options: Options, mask: SparseAperture) -> str:
-    """What all draws share."""
+    """Return a sentence on what all draws share."""
     light = FullAperture(mask.extent).area / mask.area
     kept = f" Of {options.restarts} restorations of the full pupil the lowest chi-square is kept."
     return (

@@ -38,7 +38,7 @@ class MaskSearchOptions(SweepOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class Options(MaskSearchOptions):
-    """What the restorations depend on."""
+    """Options of the restorations."""
 
     photons: tuple[float, ...] = (1e5, 1e6, 1e7)
     """Electrons per frame through the mask."""

@@ -35,7 +35,7 @@ _TOUCHING = 6.0121  # piston structure function of two touching holes [(d/r0)^(5
 
 @dataclass(frozen=True, kw_only=True)
 class Options(SearchedMaskOptions):
-    """What the curve depends on."""
+    """Options of the curve."""
 
     d_over_r0: float = 7.0
     """Strength of the turbulence, D / r0."""
@@ -90,7 +90,7 @@ def reached(rows: Sequence[dict[str, Any]], share: float) -> int:
 
 
 def findings(options: Options, rows: Sequence[dict[str, Any]]) -> list[str]:
-    """What the numbers say, in sentences."""
+    """Return what the numbers say, in sentences."""
     first, last = rows[0], rows[-1]
     begin, end = (reached(rows, share) for share in _FLAT)
     lines = [

@@ -35,7 +35,7 @@ from torchmask.optics.pixel import SquarePixel
 
 @dataclass(frozen=True, kw_only=True)
 class Options(ExperimentOptions):
-    """What the calibration depends on."""
+    """Options of the calibration."""
 
     data: Path = Path("niriss")
     """Folder of the exposures."""

@@ -81,7 +81,7 @@ def find_pose(
 
 
 def valley(points: Sequence[tuple[float, float]]) -> float:
-    """Where the parabola through the lowest point and its neighbours is lowest, within them."""
+    """Return where the parabola through the lowest point and its neighbours is lowest, within them."""
     x, y = np.array(sorted(points)).T
     low = min(max(int(y.argmin()), 1), len(x) - 2)
     a, b, _ = np.polyfit(x[low - 1 : low + 2], y[low - 1 : low + 2], 2)

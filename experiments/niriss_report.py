@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def findings(target: str, calibrator: str, results: dict[str, Any]) -> list[str]:
-    """What was found, in sentences."""
+    """Return what was found, in sentences."""
     pose, own, single = results["pose"], results["companion"], results["calibrator"]
     tried = results["orientations_tried"]
     same, other = (min(r["chi_square"] for r in tried if (r["mirrored"] == pose.mirrored) == s) for s in (True, False))

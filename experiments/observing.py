@@ -46,7 +46,7 @@ _MEAN = 0.683  # confidence of the bars: one standard error
 
 @dataclass(frozen=True, kw_only=True)
 class ObservingOptions(MaskSearchOptions):
-    """What the restorations depend on."""
+    """Options of the restorations."""
 
     budget: int = 3000
     """Number of evaluations of the search."""
@@ -164,14 +164,14 @@ def scores(rows: Sequence[Mapping[str, Any]], reference: Sequence[Mapping[str, A
 
 
 def optimum(cells: Sequence[Mapping[str, Any]], key: str) -> str:
-    """Where the score is best, and which other values are not told from it by their error bars."""
+    """Return where the score is best, and which other values are not told from it by their error bars."""
     best = min(cells, key=lambda cell: cell["score"])
     rivals = [f"{cell[key]:g}" for cell in cells if cell is not best and cell["low"] <= best["high"]]
     return f"{best[key]:g}" + (f" (not told from {', '.join(rivals)})" if rivals else "")
 
 
 def setting_of(options: ObservingOptions) -> str:
-    """What all rows share."""
+    """Return a sentence on what all rows share."""
     return (
         f"{'A given mask' if options.mask else f'A mask of {options.n_subapertures} holes'}; a full pupil reaches as "
         f"far and gets the light of its area. D/r0 = {options.d_over_r0:g}, outer scale "

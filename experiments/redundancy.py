@@ -43,7 +43,7 @@ Shift = tuple[int, int]  # a baseline in pupil samples, (rows, columns)
 
 @dataclass(frozen=True, kw_only=True)
 class Options(ExperimentOptions):
-    """What the exposures depend on."""
+    """Options of the exposures."""
 
     d_over_r0: float = 7.0
     """Strength of the turbulence, D / r0."""
@@ -198,7 +198,7 @@ def draw(
 
 
 def setting(options: Options) -> str:
-    """What all rows share."""
+    """Return a sentence on what all rows share."""
     return (
         f"D/r0 = {options.d_over_r0:g}, outer scale {options.outer_scale:g} D, {options.n_frames} exposures, "
         f"{options.n_pixels} pixels a side."

@@ -30,7 +30,7 @@ def deviation(rows: Sequence[dict[str, Any]], key: str) -> float:
 
 
 def findings(d_over_r0: float, n_frames: int, rows: Sequence[dict[str, Any]]) -> list[str]:
-    """What the numbers say, in sentences."""
+    """Return what the numbers say, in sentences."""
     full = [r for r in rows if r["pupil"] == "full pupil" and 0.3 * DIAMETER < r["baseline"] < 0.7 * DIAMETER]
     golay = [row for row in rows if row["pupil"] == "Golay-6"]
     row = [row for row in rows if row["pupil"] == "row"]

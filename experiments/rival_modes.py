@@ -33,7 +33,7 @@ MASK_MODES = 3  # of every hole: piston, tip and tilt
 
 @dataclass(frozen=True, kw_only=True)
 class Options(ObservingOptions):
-    """What the restorations depend on."""
+    """Options of the restorations."""
 
     modes: tuple[int, ...] = (3, 6, 10, 21, 45, 91, 153, 231)
     """Numbers of Zernike modes of the full pupil, from piston."""

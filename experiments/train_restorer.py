@@ -41,7 +41,7 @@ READOUT_NOISE = 1.5  # electrons rms per pixel
 
 @dataclass(frozen=True, kw_only=True)
 class Options(ExperimentOptions):
-    """What the network and its stacks depend on."""
+    """Options of the network and its stacks."""
 
     mask: str = "golay9"
     """Name of a Golay array of the catalogue."""

@@ -46,7 +46,7 @@ _LEAST = 0.02  # of what one pair of holes gives at most, or of the pupil's larg
 
 @dataclass(frozen=True, kw_only=True)
 class Options(ExperimentOptions):
-    """What the draws depend on."""
+    """Options of the draws."""
 
     n_subapertures: tuple[int, ...] = (6, 11, 20)
     """Numbers of holes, N, of masks at random."""
@@ -57,23 +57,23 @@ class Options(ExperimentOptions):
     fill_factor: float = 0.15
     """Collecting area N d^2 / D^2 of the masks."""
     outer_scale: float | None = None
-    """Of the turbulence, in units of D; None: infinite."""
+    """Outer scale of the turbulence, in units of D; None: infinite."""
     exposure_tau0: float = 0.0
-    """T / tau0, under a wind along x."""
+    """Exposure time over tau0, under a wind along x."""
     width: float = 0.0
-    """Of the band, over its middle wavelength."""
+    """Width of the band, over its middle wavelength."""
     n_instants: int = 8
-    """Of an exposure, if it is not one instant."""
+    """Number of instants that make an exposure, if it has a length."""
     n_wavelengths: int = 3
-    """Of a band, if it is not one wavelength."""
+    """Number of wavelengths that make a band, if it has a width."""
     samples_per_hole: int = 16
-    """Across a hole of a mask, at least."""
+    """Least number of samples across a hole of a mask."""
     n_pixels: int = 48
     """Frequency grid, per side."""
     n_draws: int = 2000
     """Exposures drawn of each pupil."""
     seed: int = 0
-    """Of the masks and draws."""
+    """Random seed of the masks and the draws."""
 
 
 class Case(NamedTuple):
@@ -96,7 +96,7 @@ class Compared(NamedTuple):
     error: Tensor
 
     def row(self, name: str) -> dict[str, Any]:
-        """What they say, in per cent."""
+        """Return the differences of closed form and draws, in per cent."""
         ratio = 100 * (self.closed / self.drawn - 1)
         beyond = 100 * ((self.closed - self.drawn).abs() - 3 * self.error).clamp(min=0) / self.drawn
         return {

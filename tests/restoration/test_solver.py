@@ -306,7 +306,7 @@ def test_a_tournament_cut_short_leaves_the_best_of_each_frame(explain):
 
 @pytest.mark.parametrize(("many_minima", "power"), [(False, 1), (True, 2)])
 def test_frames_of_a_full_pupil_are_weighed_by_the_square_of_their_fit(many_minima, power, explained):
-    """With no escapes to wait for, from the first recalibration on. No decrease, which is 0 to rounding, is the last."""
+    """With no escapes to wait for, from the first recalibration on; a decrease of 0 to rounding does not end it."""
     objective, truth = explained
     poor = replace(truth, z=truth.z * torch.tensor([1.0, 0.9, 0.7, 0.5]).double()[:, None])
     schedule = Schedule(segment=2, escapes=0, **NONE_MISSED)

@@ -53,7 +53,7 @@ class Options(ObservationOptions, MaskRules, SearchOptions, RunOptions):
 
     @classmethod
     def of_instrument(cls, known: Instrument) -> Options:
-        """What an instrument gives; its light and its sky depend on the collecting area."""
+        """Return the options that an instrument sets; its light and its sky depend on the collecting area."""
         return cls(
             **observation_options(known),
             central_obstruction=known.telescope.central_obstruction,

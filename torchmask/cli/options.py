@@ -25,7 +25,7 @@ MASK_SUFFIXES = (".json", ".dxf", ".fits")
 
 @dataclass(frozen=True, kw_only=True)
 class DebugOptions:
-    """How errors are shown."""
+    """Option that shows the traceback of an error."""
 
     debug: tyro.conf.FlagCreatePairsOff[bool] = False
     """Show the traceback of an error."""
@@ -33,7 +33,7 @@ class DebugOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ConfigOptions(DebugOptions):
-    """Where options come from."""
+    """Option that takes other options from a file."""
 
     config: Path | None = None
     """config.yaml of an earlier run, whose values are used for all options not given here."""
@@ -49,7 +49,7 @@ class InstrumentOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(ConfigOptions):
-    """Where results go."""
+    """Option that names the folder of the results."""
 
     out: Path | None = None
     """New folder for the results, such as runs/first; None: runs/COMMAND-date-time."""
@@ -65,7 +65,7 @@ class ExperimentOptions(RunOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class WorkerOptions:
-    """Where tasks run."""
+    """Options of commands that run many tasks."""
 
     workers: int | None = None
     """Number of processes at a time; None: one per core."""

@@ -38,9 +38,9 @@ class Options(Instrument, CatalogOptions, InstrumentOptions, RunOptions):
     n_subapertures: tuple[int, ...] = (6, 9, 12, 16)
     """Numbers of holes to compare."""
     hole_diameters: tuple[float, ...] = ()
-    """To compare [m]; none: 0.5, 0.8 and 1.2 r0."""
+    """Diameters of the holes to compare [m]; none: 0.5, 0.8 and 1.2 r0."""
     exposures: tuple[float, ...] = ()
-    """To compare [s]; none: 0.25, 0.5, 1, 2, 4 and 8 times the coherence time tau0."""
+    """Exposure times to compare [s]; none: 0.25, 0.5, 1, 2, 4 and 8 times the coherence time tau0."""
     widths: tuple[float, ...] = ()
     """Widths of the band to compare [m]; none: that of the band alone."""
     n_frequencies: int = 128
@@ -48,11 +48,11 @@ class Options(Instrument, CatalogOptions, InstrumentOptions, RunOptions):
     budget: int = 1000
     """Evaluations of the criterion in each search."""
     seed: int = 0
-    """Of the searches."""
+    """Random seed of the searches."""
 
     @classmethod
     def of_instrument(cls, known: Instrument) -> Options:
-        """What an instrument gives, which is all of it."""
+        """Return the options that an instrument sets: all of it."""
         return cls(**_fields(known))
 
 
@@ -66,7 +66,7 @@ def _fields(known: Instrument) -> dict[str, Any]:
 
 
 def existing_mask(options: Options) -> Aperture | None:
-    """What --mask names; a pattern without a size of its own, and a full pupil, are as wide as the telescope."""
+    """Return the mask that --mask names; patterns without a size, and full pupils, are as wide as the telescope."""
     if options.mask is None:
         return None
     telescope, name = options.telescope, str(options.mask)
@@ -118,7 +118,7 @@ def _with_blind_mse(choice: Choice) -> dict[str, Any]:
 
 
 def numbers(plan: ObservationPlan) -> dict[str, object]:
-    """What plan.json says: the best point, the whole map, what is missing from it."""
+    """Return the contents of plan.json: the best point, the whole map, and what is missing from it."""
     return {
         "best": _with_blind_mse(plan.best),
         "best_known": _with_blind_mse(plan.best_known),

@@ -163,7 +163,7 @@ class Options(InstrumentOptions, MaskOptions, RunOptions):
 
     @classmethod
     def of_instrument(cls, known: Instrument) -> Options:
-        """What an instrument gives; its light depends on the mask."""
+        """Return the options that an instrument sets; its light depends on the mask."""
         return cls(
             wavelength=known.mean_wavelength,
             n_pixels=known.camera.n_pixels,

@@ -32,7 +32,7 @@ class Options(ExposureOptions, DesignSpace, WorkerOptions, DebugOptions):
 
     @classmethod
     def of_instrument(cls, known: Instrument) -> Options:
-        """What an instrument gives, with the light of the reference fill factor; its sky depends on the area too."""
+        """Return the options that an instrument sets, with the light of the reference fill factor."""
         return cls(
             folder=Path("runs/table"),
             mask_diameter=known.telescope.diameter,

@@ -1,4 +1,4 @@
-"""What the lenses of holes with themselves, at baselines below a hole, have in common under turbulence.
+"""Coherence under turbulence of the lenses of holes with themselves, at baselines shorter than a hole.
 
 All N of them lie at one baseline, so each pair of holes adds, at the frequencies below one hole, a function of the
 separation of the two: products of fixed maps and of functions of the separation, which a spline knows.

@@ -26,7 +26,7 @@ class FrequencyPlane(NamedTuple):
 
     @classmethod
     def of(cls, geometry: Geometry, widest: float, device: torch.device) -> FrequencyPlane:
-        """With room for lenses at baselines `widest` times as long as those on the torus."""
+        """Make a plane with room for lenses at baselines `widest` times as long as those on the torus."""
         widest = max(widest, 1.0)
         margins = [
             int(2 * widest * geometry.reach * n / geometry.period + (widest - 1) * n / 2) + 2 for n in geometry.grid
@@ -57,7 +57,7 @@ class FrequencyPlane(NamedTuple):
         return self.size[0] * self.size[1]
 
     def index(self, corner: Tensor, n_rows: int, n_columns: int) -> Tensor:
-        """Where the pixels of patches with the first pixel `corner` (..., 2) lie, (..., rows, columns)."""
+        """Return the indices (..., rows, columns) of the pixels of patches whose first pixel is `corner` (..., 2)."""
         pixel = corner.nan_to_num(0.0).long()  # NaN, of an optimiser that diverged, must not become an index
         x = pixel[..., :1] + torch.arange(self.origin[1], self.origin[1] + n_columns, device=corner.device)
         y = pixel[..., 1:] + torch.arange(self.origin[0], self.origin[0] + n_rows, device=corner.device)

@@ -44,7 +44,7 @@ class Entries(NamedTuple):
 
 
 class LensPairs:
-    """What the pairs of lenses of masks share, for holes of one geometry under one turbulence.
+    """Coherence that pairs of lenses of a mask share, for holes of one geometry under one turbulence.
 
     pixel : (2,) [m]; scales : the least and largest phases of the band's light, over those at the reference wavelength
     """
@@ -70,8 +70,8 @@ class LensPairs:
         return torch.exp(-d / (1 + d / 3))
 
     def __call__(self, lenses: Lenses, centers: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
-        """What lenses share over `far`, as patches of some sizes: their mask (S,), corner (S, 2) [pixels] and values
-        (S, rows, columns); each counts once more at the opposite frequencies."""
+        """Return what lenses share over `far`, in patches of some sizes: mask (S,), corner (S, 2) [pixels] and values
+        (S, rows, columns). Each patch counts once more at the opposite frequencies."""
         baselines = lenses.baseline * self.pixel
         with torch.no_grad():
             entries, largest = self._select(lenses, baselines, centers)
@@ -186,7 +186,7 @@ class LensPairs:
         return lens * self._kernel(*near)
 
     def _middles(self, lenses: Lenses, centers: Tensor, entries: Entries, which: int) -> Tensor:
-        """Of the first or second lens of each entry (E, 2) [m]."""
+        """Return the middle of the first or second lens of each entry, (E, 2) [m]."""
         lens = entries.second if which else entries.first
         hole = centers[entries.mask, entries.holes[:, which]]
         return torch.where((lens == 0)[:, None], hole, lenses.middle[entries.mask, lens])
@@ -261,7 +261,7 @@ def _parabola(nodes: Tensor, start: Tensor, step: Tensor, n_rows: int, n_columns
 
 
 def _coefficients(nodes: Tensor, start: Tensor, step: Tensor) -> Tensor:
-    """Of the parabolas through values (S, 3, k) at -1, 0, 1 in powers of the pixel (S, 3, k)."""
+    """Return the coefficients (S, 3, k), in powers of the pixel, of parabolas through values (S, 3, k) at -1, 0, 1."""
     below, middle, above = nodes.unbind(1)
     slope, curvature = (above - below) / 2, (above + below) / 2 - middle
     at_start = middle + start * (slope + start * curvature)

@@ -45,8 +45,8 @@ class Lenses(NamedTuple):
 
 
 class Colour(NamedTuple):
-    """What one wavelength of a band needs: its phases over those at the reference, its share of the light, its patches,
-    the exact T (rows * columns) of a hole with itself and the modes (M, n_plane) that it takes part in."""
+    """One wavelength of a band: its phases over those at the reference wavelength, its share of the light, its patches,
+    the exact T (rows * columns) of a hole with itself, and the modes (M, n_plane) that it takes part in."""
 
     scale: float
     share: float
@@ -98,7 +98,7 @@ class LensPatches:
             self.colours.append(Colour(scale, share, plan, splines, slices, central, own_modes))
 
     def __call__(self, centers: Tensor) -> Lenses:
-        """Of masks with `centers` (B, N, 2) [m]."""
+        """Return the lenses of masks with `centers` (B, N, 2) [m]."""
         n = centers.shape[1]
         first, second = _pairs(n, centers.device)
         one, other = centers.index_select(1, first), centers.index_select(1, second)

@@ -105,7 +105,7 @@ class MaskTransfer:
         return torch.stack([power * function for function in lens_functions(lenses.root, *places)], 1)
 
     def _places(self, lenses: Lenses, rows: int, columns: int) -> tuple[Tensor, Tensor]:
-        """How far the light at the pixels is from the lenses' baselines, x and y, over the holes' outer diameter."""
+        """Return the distance of the pixels from the lenses' baselines, x and y, over the holes' outer diameter."""
         x = lenses.corner[..., :1] + torch.arange(columns, device=self.pixel.device)
         y = lenses.corner[..., 1:] + torch.arange(rows, device=self.pixel.device)
         x, y = x[..., None, :], y[..., :, None]

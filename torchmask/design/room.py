@@ -130,7 +130,7 @@ class _Trials:
 def _advice(
     fits: Callable[[float, Sequence[Constraint]], bool], fill_factor: float, constraints: list[Constraint]
 ) -> str:
-    """What to ask for instead: smaller holes or, where their size is not what hinders, less of one rule."""
+    """Return what to ask for instead: smaller holes or, if even tiny ones do not fit, less of one rule."""
     largest = _largest(lambda fill: fits(fill, constraints), fill_factor)
     if largest > 0:
         return f"the largest fill factor at which one was found is {largest:.4g}"

@@ -10,7 +10,7 @@ from torchmask.design.constraints import KeepOutDisc, KeepOutSegment, MinimumGap
 
 @dataclass(frozen=True, kw_only=True)
 class MaskRules:
-    """Where a mask may have no holes, and how much material stays around them.
+    """Rules for where a mask may have holes and how much material stays around them.
 
     Examples
     --------

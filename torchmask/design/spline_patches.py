@@ -34,7 +34,7 @@ class SplinePatches:
         self.start: tuple[float, ...] = tuple(math.ceil(one * self.parts) / self.parts for one in reach)
 
     def lattice(self) -> tuple[Tensor, Tensor]:
-        """Where the functions must be known, x (X,) and y (Y,) [pixels]."""
+        """Return the places at which the functions must be known, x (X,) and y (Y,) [pixels]."""
         axes = [
             torch.arange(-1 - _MARGIN, self.parts * size + 3 + _MARGIN, dtype=torch.float64) / self.parts - start
             for start, size in zip(self.start, self.size, strict=True)
@@ -55,8 +55,8 @@ class SplinePatches:
         return unfolded.permute(1, 2, 0, 3, 4).flatten(2).flatten(0, 1).contiguous()
 
     def weights(self, offset: Tensor) -> Tensor:
-        """Of the slices (..., slices) for patches whose first pixel lies at `offset` (..., 2) from the middle [pixels],
-        -reach <= offset < 1 - reach; differentiable."""
+        """Return the weights (..., slices) of the slices for patches whose first pixel lies at `offset` (..., 2)
+        [pixels] from the middle, -reach <= offset < 1 - reach. They are differentiable."""
         by_axis = []
         for axis in (0, 1):
             place = (offset[..., axis] + self.start[axis]) * self.parts

@@ -32,7 +32,7 @@ class SplineTable:
         self.coefficients: Tensor = coefficients.flatten(1).T.contiguous().to(device, dtype)
 
     def __call__(self, places: Tensor) -> Tensor:
-        """At places (B, L, 2): (B, L, R)."""
+        """Return the functions (B, L, R) at `places` (B, L, 2)."""
         place = places / self.step + self.half
         start = place.detach().nan_to_num(0.0).floor().clamp(1, 2 * self.half - 2)
         basis = cubic_basis(place - start)  # (B, L, 2, 4)

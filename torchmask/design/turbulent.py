@@ -190,7 +190,7 @@ class TurbulentMSE(AsymptoticMSE):
         return power.reshape(*centers.shape[:-2], *power.shape[-2:])
 
     def _table(self, aperture: Aperture, make: Any) -> Any:
-        """What `make` says of apertures of this kind, from the last time where it is known."""
+        """Return what `make` computes for apertures of this kind, kept from the last time if it is known."""
         dtype, device = aperture.centers.dtype, aperture.centers.device
         key = (make.__name__, aperture.shape, aperture.subaperture_diameter, dtype, device)
         if key not in self._tables:
