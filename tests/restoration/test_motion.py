@@ -168,9 +168,11 @@ def methods(five_holes):
 
 
 def test_frames_that_last_are_restored_better_by_who_knows(smeared, methods, tmp_path):
-    told, not_told = methods(2.0).restore(smeared.frames), methods(0.0).restore(smeared.frames)
+    """Over seven seeds the error is 0.41 times that of who does not know, with a standard deviation of 0.066."""
+    whole = {"schedule": None, "max_iterations": 4000}
+    told, not_told = (methods(exposure, **whole).restore(smeared.frames) for exposure in (2.0, 0.0))
     scores = [relative_error(result.object, smeared.object, 0.5) for result in (told, not_told)]
-    assert scores[0] < 0.85 * scores[1]
+    assert scores[0] < (0.41 + 3 * 0.066 * math.sqrt(1 + 1 / 7)) * scores[1]
     found, true = told.motion.flatten(1), smeared.change.flatten(1)  # either direction of time
     alike = (found * true).sum(1).abs() / found.norm(dim=1) / true.norm(dim=1)
     assert float(alike.median()) > 0.7  # in 14 dimensions chance reaches that once in 400
@@ -182,7 +184,7 @@ def test_frames_that_last_are_restored_better_by_who_knows(smeared, methods, tmp
     assert "pistons" not in not_told.summary()
     told.save(tmp_path / "result.npz")
     assert torch.equal(type(told).load(tmp_path / "result.npz").motion, told.motion)
-    again = methods(2.0, tolerance=1.0).restore(smeared.frames, start=told)  # begins where the other has ended
+    again = methods(2.0, tolerance=1.0, **whole).restore(smeared.frames, start=told)  # begins where the other has ended
     assert float(again.cost[0]) < 1.02 * float(told.cost[-1])
 
 
