@@ -95,7 +95,7 @@ def measure(options: Options, callback: Callback) -> list[dict[str, Any]]:
             blind = success_map().outlook(size, photons, options.n_frames)
             row = {"d_over_r0_tried": "d_over_r0" not in blind.outside, "success": blind.success, "cost": blind.cost}
             row |= {"strength": strength, "n_photons": photons, "n_subapertures": n, "d_over_r0": size, "known": known}
-            rows.append(row | {"blind": known + (blind.mse_factor - 1) * (known - floor)})
+            rows.append(row | {"blind": blind.mse(known, known - floor)})
     return rows
 
 
@@ -109,9 +109,9 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
             best = min(own, key=lambda row: row[kind])
             equal = [row["n_subapertures"] for row in own if row[kind] <= (1 + FLAT) * best[kind]]
             cell |= {kind: best["n_subapertures"], f"{kind}_error": best[kind], f"{kind}_equal": equal}
+            cell |= {f"{kind}_11": next((r[kind] / best[kind] for r in own if r["n_subapertures"] == 11), None)}
             if kind == "blind":
                 cell |= {name: best[name] for name in ("d_over_r0", "cost", "success")}
-                cell["eleven"] = next((row[kind] / best[kind] for row in own if row["n_subapertures"] == 11), None)
         cells.append(cell)
     return cells
 
@@ -123,18 +123,18 @@ def markdown(options: Options, cells: Sequence[Mapping[str, Any]]) -> str:
         "",
         f"Relative MSE at a fill factor of {options.fill_factor:g}, K = {options.n_frames}, p = {options.exponent:g}, "
         f"{options.n_pixels} frequencies a side, searches of {options.budget} evaluations; in brackets all N within "
-        f"{100 * FLAT:.0f} % of the least.",
+        f"{100 * FLAT:.0f} % of the least; below N = 11, its error over that.",
         "",
-        "| D/r0 | photons | N, known PSFs | error | N, blind | error | d/r0 there | success | N = 11 over least |",
-        "|---" * 9 + "|",
+        "| D/r0 | photons | N, known PSFs | error | N = 11 | N, blind | error | N = 11 | d/r0 there | cost | success |",
+        "|---" * 11 + "|",
     ]
     for cell in cells:
-        eleven = "-" if cell["eleven"] is None else f"{cell['eleven']:.3f}"
-        lines.append(
-            f"| {cell['strength']:g} | {cell['n_photons']:.0e} | {cell['known']} ({ranges(cell['known_equal'])}) | "
-            f"{cell['known_error']:.4f} | {cell['blind']} ({ranges(cell['blind_equal'])}) | {cell['blind_error']:.4f} "
-            f"| {cell['d_over_r0']:.2f} | {100 * cell['success']:.0f} % | {eleven} |".replace("e+0", "e")
-        )
+        texts = [f"{cell['strength']:g}", f"{cell['n_photons']:.0e}".replace("e+0", "e")]
+        for kind in ("known", "blind"):
+            eleven = "-" if cell[f"{kind}_11"] is None else f"{cell[f'{kind}_11']:.2f}"
+            texts += [f"{cell[kind]} ({ranges(cell[f'{kind}_equal'])})", f"{cell[f'{kind}_error']:.4f}", eleven]
+        texts += [f"{cell['d_over_r0']:.2f}", f"{cell['cost']:.2f}", f"{100 * cell['success']:.0f} %"]
+        lines.append(f"| {' | '.join(texts)} |")
     return "\n".join(lines) + "\n"
 
 

@@ -43,7 +43,7 @@ def test_the_best_number_of_holes_and_those_that_are_as_good():
     (cell,) = number_of_holes.summarise(rows)
     assert (cell["known"], cell["known_equal"]) == (12, [11, 12, 14])
     assert (cell["blind"], cell["blind_equal"]) == (12, [12, 14])
-    assert cell["eleven"] == pytest.approx(1.1)
+    assert cell["blind_11"] == pytest.approx(1.1)
     assert number_of_holes.ranges([3, 5, 6, 7, 9]) == "3, 5-7, 9"
 
 

@@ -76,9 +76,10 @@ def test_beyond_it_warns_and_takes_the_edge(name, value, edge, said):
     assert (outlook.success, outlook.cost) == (within.success, within.cost)
 
 
-def test_losses_do_not_count_as_gains():
-    assert BlindOutlook(0.9, 1.0, 0.8, 1.0).mse_factor == 1
-    assert BlindOutlook(1.5, 0.0, 0.0, 0.2).mse_factor == pytest.approx(2.25)
+def test_the_part_of_an_error_that_can_be_avoided_grows_by_the_square():
+    """A cost below 1 is no gain, and no error exceeds that of knowing nothing."""
+    errors = [BlindOutlook(cost, 0.5, 0.4, 0.6).mse(0.3, 0.2) for cost in (0.9, 1.0, 1.5, 9.0)]
+    assert errors == pytest.approx([0.3, 0.3, 0.1 + 2.25 * 0.2, 1.0], rel=1e-12)
 
 
 def test_the_map_of_the_library_is_as_large_as_it_says():

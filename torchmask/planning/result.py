@@ -37,10 +37,8 @@ class Choice:
 
     @property
     def blind_mse(self) -> float:
-        """The predicted error with what a blind restoration loses: what a mask can avoid grows by the cost squared,
-        up to 1 in all, the error of who knows nothing."""
-        more = 1.0 if self.blind is None else self.blind.mse_factor
-        return min(1.0, self.relative_mse + (more - 1) * self.above_floor)
+        """The predicted error with what a blind restoration loses, or without where that is not known."""
+        return self.relative_mse if self.blind is None else self.blind.mse(self.relative_mse, self.above_floor)
 
 
 @dataclass(frozen=True)

@@ -32,8 +32,8 @@ class BlindOutlook:
 
     Examples
     --------
-    >>> BlindOutlook(cost=1.2, success=0.75, low=0.5, high=0.9).mse_factor
-    1.44
+    >>> round(BlindOutlook(cost=1.2, success=0.75, low=0.5, high=0.9).mse(relative_mse=0.15, above_floor=0.1), 3)
+    0.194
     """
 
     cost: float
@@ -42,10 +42,13 @@ class BlindOutlook:
     high: float
     outside: tuple[str, ...] = ()
 
-    @property
-    def mse_factor(self) -> float:
-        """By what the mean squared error grows: the cost squared, and at least 1."""
-        return max(1.0, self.cost**2)
+    def mse(self, relative_mse: float, above_floor: float) -> float:
+        """What a relative error predicted for known PSFs becomes, of which a mask can avoid `above_floor`.
+
+        That part grows by the square of the cost, where it is above 1: a score is an amplitude. No more than 1 is
+        returned, the error of knowing nothing.
+        """
+        return min(1.0, relative_mse + (max(1.0, self.cost) ** 2 - 1) * above_floor)
 
 
 @dataclass(frozen=True, eq=False)
