@@ -36,7 +36,7 @@ def markdown(setting: str, cells: Sequence[Mapping[str, Any]]) -> str:
     strengths = sorted({cell["d_over_r0"] for cell in cells})
     lines = ["# Where blind restorations succeed", "", setting, ""]
     lines += [
-        f"Successes of those tried (score within {SUCCESS:g} of that for the true PSFs), and the median ratio.",
+        f"Successes of those tried (score within {SUCCESS:g} of that for known PSFs), and the median ratio.",
         "",
     ]
     lines += ["| frames | photons | " + " | ".join(f"d/r0 = {size:g}" for size in strengths) + " |"]
