@@ -119,7 +119,7 @@ def align(estimate: Any, truth: Any, cutoff: float) -> Tensor:
     reference, image = lowpass(truth, cutoff), lowpass(estimate, cutoff)
     if not float(image.norm()) > 0:
         raise ValueError("the estimate is zero below the cut-off: no gain fits it to the truth")
-    image = shift(image, _registration(image, reference))
+    image = shift(image, registration(image, reference))
     return image * ((image * reference).sum() / (image * image).sum())
 
 
@@ -175,7 +175,7 @@ def _frequencies(shape: Sequence[int], dtype: torch.dtype, device: torch.device)
     return nu_y[:, None], nu_x
 
 
-def _registration(image: Tensor, reference: Tensor) -> Tensor:
+def registration(image: Tensor, reference: Tensor) -> Tensor:
     """Return the shift (dy, dx) of `image` that correlates best with `reference`.
 
     The FFT gives the best shift by whole pixels. From there a trust-region Newton method maximises the correlation, a

@@ -46,6 +46,7 @@ def progress_with(**changes):
         "starts": 2,
         "began": 1,
         "rival": Ending(random_state(1), Status.START_LIMIT),
+        "explained": (Ending(random_state(3), Status.START_LIMIT), Ending(random_state(4), Status.CONVERGED, 2e-5)),
         "alike": True,
     }
     return Progress(several(random_state(0), 4), **given | changes)
@@ -63,7 +64,7 @@ def same_state(one, other):
     "changes",
     [
         {},
-        {"rival": None},
+        {"rival": None, "explained": ()},
         {"rival": Ending(random_state(2), Status.CONVERGED, 1e-6), "status": Status.ITERATION_LIMIT},
         {"status": Status.RUNNING, "decrease": None, "alike": False, "costs": [], "began": 0},
         {"costs": [1.0]},
@@ -78,8 +79,11 @@ def test_everything_comes_back(changes, tmp_path):
     same_state(back.state, saved.state)
     assert back.candidates.n_each == 4
     for item in fields(Progress):
-        if item.name not in ("candidates", "rival"):
+        if item.name not in ("candidates", "rival", "explained"):
             assert getattr(back, item.name) == getattr(saved, item.name), item.name
+    for one, other in zip(back.explained, saved.explained, strict=True):
+        same_state(one.state, other.state)
+        assert (one.status, one.decrease) == (other.status, other.decrease)
     assert (back.rival is None) == (saved.rival is None)
     if saved.rival is not None:
         same_state(back.rival.state, saved.rival.state)
@@ -114,7 +118,7 @@ def test_a_damaged_checkpoint_is_refused(tmp_path):
         file.path.write_bytes(damaged)
         with pytest.raises(ValueError, match=r"state\.npz"):
             file.load(CPU)
-    optional = {"decrease", "rival_decrease"}  # where a start is not at its end
+    optional = {"decrease", "rival_decrease", "explained1_decrease"}  # where a start is not at its end
     for name in parts.keys() - optional:
         np.savez(file.path, **{key: value for key, value in parts.items() if key != name})
         with pytest.raises(ValueError, match=rf"state\.npz has no {name}\b"):

@@ -370,7 +370,8 @@ def test_frames_of_a_full_pupil_have_had_their_starts(monkeypatch, explained):
 )
 def test_aberrations_of_faint_frames_are_integrated_out(faint, traits, integrated, explained):
     """After the descents, whose costs stay as they are."""
-    schedule = Schedule(faint=faint, rounds=2, moves=2, start_iterations=5, candidates=(), **NONE_MISSED, **BRISK)
+    numbers = {"rounds": 2, "moves": 2, "start_iterations": 5, "averaged": 1}
+    schedule = Schedule(faint=faint, candidates=(), **numbers, **NONE_MISSED, **BRISK)
     records: list[Record] = []
     progress = solver_of(explained[0], records.append, schedule=schedule, **traits).solve(Known())
     assert progress.integrated is integrated

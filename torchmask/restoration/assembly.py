@@ -95,6 +95,8 @@ def _message(progress: Progress) -> str:
         message = f"stopped at max_iterations = {iterations}"
     else:
         message = f"stopped after the {progress.iterations} iterations that a start may take"
-    if progress.starts > 1:
+    if progress.averaged > 1:
+        message += f"; the mean object of {progress.averaged} starts, of {progress.starts} made"
+    elif progress.starts > 1:
         message += f"; the best of {progress.starts} starts" + (", two of which ended alike" if progress.alike else "")
     return message + ("; then the aberrations were integrated out" if progress.integrated else "")

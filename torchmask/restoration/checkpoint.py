@@ -57,9 +57,11 @@ class Progress:
     starts : number of starts, including the present one
     began : number of iterations before the present start
     rival : final state of the best earlier start
+    explained : final states of the starts that explain the frames, if the mean of several objects is wanted
     alike : whether the last two starts ended in the same result
     refinement : whether the position of the mask is fitted too, or will be if the frames require it
     integrated : whether the aberrations have been integrated out, which is done at the end and not stored
+    averaged : number of starts whose objects have been averaged, likewise
     """
 
     candidates: Candidates
@@ -71,9 +73,11 @@ class Progress:
     starts: int = 1
     began: int = 0
     rival: Ending | None = None
+    explained: tuple[Ending, ...] = ()
     alike: bool = False
     refinement: Refinement = Refinement.OFF
     integrated: bool = False
+    averaged: int = 1
 
     @property
     def state(self) -> State:
@@ -128,6 +132,9 @@ class Checkpoint:
         arrays |= {"refinement": progress.refinement.name} | _ending_arrays("", progress.ending)
         if progress.rival is not None:
             arrays |= _ending_arrays("rival_", progress.rival)
+        arrays["n_explained"] = len(progress.explained)
+        for number, ending in enumerate(progress.explained):
+            arrays |= _ending_arrays(f"explained{number}_", ending)
         save_npz(self.path, arrays, replace=True)
 
     def load(self, device: torch.device) -> Progress | None:
@@ -140,10 +147,11 @@ class Checkpoint:
                 f"{self.path} is the checkpoint of other frames or settings, or of another version: give another name "
                 "or delete it"
             )
-        has_rival = any(name.startswith("rival_") for name in stored)
-        prefixes = ("", "rival_") if has_rival else ("",)
-        endings = [prefix + name for prefix in prefixes for name in _NEEDED]
-        missing = [name for name in ("costs", "n_candidates", "refinement", *_NUMBERS, *endings) if name not in stored]
+        rivals = ["rival_"] if any(name.startswith("rival_") for name in stored) else []
+        explained = [f"explained{number}_" for number in range(int(stored.get("n_explained", 0)))]
+        needed = [prefix + name for prefix in ("", *rivals, *explained) for name in _NEEDED]
+        needed += ["costs", "n_candidates", "n_explained", "refinement", *_NUMBERS]
+        missing = [name for name in needed if name not in stored]
         if missing:
             raise ValueError(f"{self.path} has no {', '.join(missing)}: it is damaged, delete it to start again")
         now = _ending(stored, "", device)
@@ -152,7 +160,8 @@ class Checkpoint:
             np.atleast_1d(stored["costs"]).tolist(),
             status=now.status,
             decrease=now.decrease,
-            rival=_ending(stored, "rival_", device) if has_rival else None,
+            rival=_ending(stored, "rival_", device) if rivals else None,
+            explained=tuple(_ending(stored, prefix, device) for prefix in explained),
             refinement=Refinement[stored["refinement"].item()],
             **{name: stored[name].item() for name in _NUMBERS},
         )

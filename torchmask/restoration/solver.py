@@ -6,7 +6,8 @@ turbulence and the noise are updated; the assumed noise falls from the residual 
 to the residual of the model, if that is larger. Once the object is sharp, frames and object escape from local minima;
 when nothing changes any more, each frame is weighted by how well it fits. A start ends when a segment gains nothing or
 its iterations are used up. If its verdict is that it missed the object, another one starts from random aberrations, and
-the best is kept. At the end, the aberrations of faint frames are integrated out, those of others gain modes.
+the best is kept. At the end, the aberrations of faint frames are integrated out, those of others gain modes. For a full
+pupil, whose starts end in many minima, the objects of several that explain the frames are averaged.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from torchmask.restoration.aberrations import AberrationBasis
 from torchmask.restoration.calibration import recalibrate
 from torchmask.restoration.candidates import Candidates, play_stage
 from torchmask.restoration.checkpoint import Checkpoint, Ending, Progress, Status
+from torchmask.restoration.consensus import average_starts
 from torchmask.restoration.descent import Variables, descend
 from torchmask.restoration.finish import finish
 from torchmask.restoration.frames import FrameStack
@@ -34,10 +36,12 @@ from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.starts import (
     Known,
     expected_parameters,
+    first_candidates,
     first_state,
     fit_new_frames,
-    random_candidates,
+    has_tournament,
     start_from_result,
+    start_rms,
 )
 from torchmask.restoration.state import State
 from torchmask.restoration.traits import Refinement, Traits
@@ -88,6 +92,12 @@ class Solver:
         held = traits.prior_on_aberrations and not traits.many_minima  # not tried for a full pupil
         self.is_open: bool = held and Free.OBJECT | Free.ABERRATIONS in objective.free
         self.is_faint: bool = self.is_open and change < schedule.faint
+        turbulent = Free.ABERRATIONS in objective.free and traits.prior_on_aberrations and not traits.estimated
+        self.prior_r0: float | None = traits.r0 if turbulent else None  # of the aberrations' prior, at first [m]
+        many_ends = turbulent and traits.many_minima and Free.OBJECT in objective.free
+        self.averages: bool = many_ends and schedule.averaged > 1
+        at_most = schedule.averaged_iterations if self.averages else schedule.start_iterations
+        self.start_iterations: int = min(at_most, schedule.start_iterations)
         self.judge: Judge = Judge(self.setting, stack, traits, schedule)
 
     def solve(self, known: Known, start: RestorationResult | None = None, file: Checkpoint | None = None) -> Progress:
@@ -104,6 +114,8 @@ class Solver:
         if self.is_open and ended.status is not Status.ITERATION_LIMIT:
             how = (self.schedule, self.minimizer, self.callback)
             self.objective = finish(self.objective, self.setting, ended, *how, self.traits, is_faint=self.is_faint)
+        if len(ended.explained) > 1:
+            average_starts(self.objective, ended, self.schedule, self.minimizer)
         return ended
 
     def begin(self, known: Known, start: RestorationResult | None) -> Progress:
@@ -112,13 +124,14 @@ class Solver:
         if known.covariance is not None:  # the prior is centred on the estimated aberrations
             self.objective = self.objective.with_changes(centre=state.z)
         if start is None:
-            return Progress(self._first_candidates(state, self.traits.seed), refinement=self.traits.refinement)
+            first = first_candidates(self.objective, state, self.traits, self.schedule, self.traits.seed)
+            return Progress(first, refinement=self.traits.refinement)
         warm, n_known = start_from_result(self.objective, state, start, self.unit)
         warm = self.setting.in_motion(warm, self.traits.seed, start.motion)
         self._place(warm)
         progress = Progress(Candidates(warm, 1), escapes=self.schedule.escapes, refinement=self.traits.refinement)
         if n_known < len(warm.z) and Free.ABERRATIONS in self.objective.free:
-            rms = self._start_rms() if self._has_tournament() else None
+            rms = start_rms(self.traits, self.schedule) if has_tournament(self.objective, self.traits) else None
             progress.state, progress.n_evaluations = fit_new_frames(
                 self.objective, warm, n_known, rms, self.schedule, self.minimizer, self.traits.seed
             )
@@ -135,6 +148,8 @@ class Solver:
             if ended and may_start_again and progress.iterations > self.schedule.sharp_after:
                 self._judge_start(progress)
             save(progress)
+        if progress.status is Status.ITERATION_LIMIT and progress.rival is not None:  # the last start was cut short
+            progress.state = self.judge.compare(self.objective, progress.ending, progress.rival).best.state
         self._place(progress.state)
         return progress
 
@@ -153,22 +168,6 @@ class Solver:
         z = expected_parameters(self.objective, known.coefficients)
         weight = 1.0 if self.traits.prior_on_aberrations or self.traits.estimated else 0.0
         return first_state(self.objective, z, known.object, self.first_inflation, weight)
-
-    def _has_tournament(self) -> bool:
-        """Zero is a saddle point for a full pupil: a symmetric pupil does not show the sign of the even modes."""
-        return self.traits.many_minima and not self.traits.estimated and Free.ABERRATIONS in self.objective.free
-
-    def _start_rms(self) -> float:
-        schedule = self.schedule
-        return schedule.start_rms if self.traits.prior_on_aberrations else schedule.start_rms_unwhitened
-
-    def _first_candidates(self, state: State, seed: int) -> Candidates:
-        """Return the first start of a mask from zero aberrations, every other one from random aberrations."""
-        if self._has_tournament():
-            return random_candidates(self.objective, state, self.schedule.n_candidates, self._start_rms(), seed)
-        if seed == self.traits.seed:
-            return Candidates(state, 1)
-        return random_candidates(self.objective, state, 1, self._start_rms(), seed)
 
     def _play(self, progress: Progress) -> None:
         """Play one stage of the tournament; end the tournament if no iterations are left."""
@@ -220,11 +219,11 @@ class Solver:
         """Return which limit on iterations has been reached, or RUNNING."""
         if len(progress.costs) >= self.traits.max_iterations:
             return Status.ITERATION_LIMIT
-        return Status.RUNNING if progress.iterations < self.schedule.start_iterations else Status.START_LIMIT
+        return Status.RUNNING if progress.iterations < self.start_iterations else Status.START_LIMIT
 
     def _last_iteration(self, progress: Progress) -> int:
         """Return the number of the present start's last iteration, counted over all starts."""
-        return min(progress.began + self.schedule.start_iterations, self.traits.max_iterations)
+        return min(progress.began + self.start_iterations, self.traits.max_iterations)
 
     def _descend(self, progress: Progress, objective: MyopicObjective, state: State, n_iterations: int) -> State:
         n_each = progress.candidates.n_each
@@ -240,16 +239,15 @@ class Solver:
         return descend(objective, state, min(n_iterations, left), self.minimizer, listen)
 
     def _recalibrate(self, objective: MyopicObjective, state: State, *, sharpen: bool) -> State:
-        power = 2 if self.traits.many_minima else 1
-        return recalibrate(objective, state, power if sharpen else None, follow_r0=self.traits.r0_is_open)
+        power = (2 if self.traits.many_minima else 1) if sharpen else None
+        return recalibrate(objective, state, power, follow_r0=self.traits.r0_is_open)
 
     def _escape(self, progress: Progress) -> None:
         """Restart outlying frames, and shift the object by a fraction of a pixel; if nothing changes, never try again.
 
         Frames of a full pupil already had many starts in the tournament, unless they started from a sensor's estimate.
         """
-        progress.escapes += 1
-        state = progress.state
+        progress.escapes, state = progress.escapes + 1, progress.state
         if self.traits.estimated or not self.traits.many_minima:
             seed = self.traits.seed + progress.escapes
             state, evaluations = escapes.restart_outlier_frames(
@@ -265,24 +263,23 @@ class Solver:
     def _judge_start(self, progress: Progress) -> None:
         """At the end of a start, keep the best so far, and begin another one if that has missed the object.
 
-        If two starts agree, no further one is made.
+        If two starts agree, no further one is made. For a full pupil, others begin until enough explain the frames.
         """
         best, verdict, progress.alike = self.judge.compare(self.objective, progress.ending, progress.rival)
-        missed = verdict.finding is Finding.NOT_EXPLAINED
-        spent = len(progress.costs) >= self.traits.max_iterations
-        if missed and not progress.alike and progress.starts < self.schedule.starts and not spent:
+        if self.averages and self.verdict(progress.ending).explained:
+            progress.explained += (progress.ending,)
+        again, needed = verdict.finding is Finding.NOT_EXPLAINED and not progress.alike, 1  # iterations
+        if progress.explained:
+            again, needed = len(progress.explained) < self.schedule.averaged, self.start_iterations
+        spent = len(progress.costs) + needed > self.traits.max_iterations or progress.starts >= self.schedule.starts
+        if again and not spent:
             seed, found = self.traits.seed + progress.starts, progress.state.geometry
             progress.rival, progress.began, progress.starts = best, len(progress.costs), progress.starts + 1
             progress.escapes, progress.status, progress.decrease = 0, Status.RUNNING, None
-            progress.candidates = self._first_candidates(replace(self._first_state(Known()), geometry=found), seed)
+            state = replace(self._first_state(Known()), geometry=found)
+            progress.candidates = first_candidates(self.objective, state, self.traits, self.schedule, seed)
         else:
             progress.state, progress.status, progress.decrease = best.state, best.status, best.decrease
-
-    @property
-    def prior_r0(self) -> float | None:
-        """Initial r0 of the prior on the aberrations [m]; None if they are known or have another prior or none."""
-        known = self.traits.estimated or Free.ABERRATIONS not in self.objective.free
-        return self.traits.r0 if self.traits.prior_on_aberrations and not known else None
 
     def verdict(self, ending: Ending) -> Verdict:
         """Return the verdict on whether the ending of one start, or of all, explains the frames."""
@@ -296,5 +293,4 @@ class Solver:
             image, z = variables()
             coefficients = self.objective.model.aberrations.coefficients(z[: len(self.objective.frames)])
             arrays = {"object": self.objective.model.window.crop(image) * self.unit, "coefficients": coefficients}
-        scalars = {"cost": progress.costs[-1]}
-        self.callback(Record("restoration", step, self._last_iteration(progress), scalars, arrays))
+        self.callback(Record("restoration", step, self._last_iteration(progress), {"cost": progress.costs[-1]}, arrays))

@@ -16,6 +16,7 @@ from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.result import RestorationResult
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.state import Calibration, State
+from torchmask.restoration.traits import Traits
 
 
 @dataclass(frozen=True)
@@ -101,6 +102,31 @@ def first_state(
             image = image / float(model(image, z).mean())
     inflation = torch.full_like(neutral.transmission, first_inflation)
     return State(image, z, Calibration(neutral.transmission, inflation, aberration_weight))
+
+
+def has_tournament(objective: MyopicObjective, traits: Traits) -> bool:
+    """Whether a restoration begins with a tournament of candidates.
+
+    Zero is a saddle point for a full pupil: a symmetric pupil does not show the sign of the even modes.
+    """
+    return traits.many_minima and not traits.estimated and Free.ABERRATIONS in objective.free
+
+
+def start_rms(traits: Traits, schedule: Schedule) -> float:
+    """Return the rms of random aberrations at a start."""
+    return schedule.start_rms if traits.prior_on_aberrations else schedule.start_rms_unwhitened
+
+
+def first_candidates(
+    objective: MyopicObjective, state: State, traits: Traits, schedule: Schedule, seed: int
+) -> Candidates:
+    """Return the candidates of a start: zero aberrations for a mask's first one, random ones for every other."""
+    rms = start_rms(traits, schedule)
+    if has_tournament(objective, traits):
+        return random_candidates(objective, state, schedule.n_candidates, rms, seed)
+    if seed == traits.seed:
+        return Candidates(state, 1)
+    return random_candidates(objective, state, 1, rms, seed)
 
 
 def random_candidates(objective: MyopicObjective, state: State, n_each: int, rms: float, seed: int) -> Candidates:
