@@ -99,7 +99,7 @@ def test_aberrations_are_fitted_to_the_mean_object(explained):
 
 # --- whole restorations
 
-BRISK = {"candidates": ((2, 4),), "segment": 4, "sharp_after": 4, "escapes": 0, "averaged_iterations": 8}
+BRISK = {"candidates": ((2, 4),), "segment": 4, "sharp_after": 4, "escapes": 0, "start_iterations": 8}
 
 
 def restore(explained, schedule, **given):
@@ -117,8 +117,7 @@ def restore(explained, schedule, **given):
     ],
 )
 def test_starts_that_explain_the_frames_are_averaged(chance, averaged, message, iterations, explained):
-    limits = {"start_iterations": 8, "alike": -1.0}
-    schedule = Schedule(chance=chance, averaged=averaged, **BRISK, **limits)
+    schedule = Schedule(chance=chance, averaged=averaged, alike=-1.0, **BRISK)
     records: list[Record] = []
     result = restore(explained, schedule, callback=records.append)
     assert message is None or message in result.message

@@ -36,7 +36,7 @@ def test_refuses_candidates_that_do_not_halve(candidates):
         Schedule(candidates=candidates)
 
 
-@pytest.mark.parametrize("name", ["segment", "start_iterations", "starts", "averaged", "averaged_iterations"])
+@pytest.mark.parametrize("name", ["segment", "start_iterations", "starts", "averaged"])
 def test_refuses_counts_below_one(name):
     with pytest.raises(ValueError, match=f"{name} is 0: it must be at least 1"):
         Schedule(**{name: 0})

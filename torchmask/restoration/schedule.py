@@ -29,7 +29,6 @@ class Schedule:
     missed : for a full pupil, minimum of the allowed excess, as a fraction of the change from frame to frame
     starts : maximum number of starts, where the object was missed
     averaged : for a full pupil, number of starts that explain the frames, the mean of whose objects is the result
-    averaged_iterations : maximum number of iterations of each of them, if `start_iterations` is not smaller
     alike : relative difference of the excess chi-square of two starts below which they count as the same
     outlying : a frame is outlying if its residual variance is larger than this number times that of well-fitted frames
     restarts : number of random starts of the aberrations of an outlying frame
@@ -61,13 +60,12 @@ class Schedule:
     first_inflation: float = 30.0
     start_rms: float = 0.7
     start_rms_unwhitened: float = 0.1
-    candidates: tuple[tuple[int, int], ...] = ((8, 30), (4, 70), (2, 100))
+    candidates: tuple[tuple[int, int], ...] = ((16, 30), (8, 70), (4, 100), (2, 100))
     model_errors: float = 2.0
     chance: float = 2.0
     missed: float = 0.0013
     starts: int = 4
     averaged: int = 3
-    averaged_iterations: int = 600
     alike: float = 0.03
     outlying: float = 1.25
     restarts: int = 6
@@ -94,7 +92,7 @@ class Schedule:
         stages = [number for number, _ in self.candidates] + [1]
         if any(later * 2 != earlier for earlier, later in pairwise(stages)):
             raise ValueError(f"candidates is {self.candidates}: each stage must have half as many as the one before it")
-        for name in ("segment", "start_iterations", "starts", "averaged", "averaged_iterations"):
+        for name in ("segment", "start_iterations", "starts", "averaged"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}: it must be at least 1")
 

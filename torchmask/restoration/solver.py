@@ -96,8 +96,6 @@ class Solver:
         self.prior_r0: float | None = traits.r0 if turbulent else None  # of the aberrations' prior, at first [m]
         many_ends = turbulent and traits.many_minima and Free.OBJECT in objective.free
         self.averages: bool = many_ends and schedule.averaged > 1
-        at_most = schedule.averaged_iterations if self.averages else schedule.start_iterations
-        self.start_iterations: int = min(at_most, schedule.start_iterations)
         self.judge: Judge = Judge(self.setting, stack, traits, schedule)
 
     def solve(self, known: Known, start: RestorationResult | None = None, file: Checkpoint | None = None) -> Progress:
@@ -219,11 +217,11 @@ class Solver:
         """Return which limit on iterations has been reached, or RUNNING."""
         if len(progress.costs) >= self.traits.max_iterations:
             return Status.ITERATION_LIMIT
-        return Status.RUNNING if progress.iterations < self.start_iterations else Status.START_LIMIT
+        return Status.RUNNING if progress.iterations < self.schedule.start_iterations else Status.START_LIMIT
 
     def _last_iteration(self, progress: Progress) -> int:
         """Return the number of the present start's last iteration, counted over all starts."""
-        return min(progress.began + self.start_iterations, self.traits.max_iterations)
+        return min(progress.began + self.schedule.start_iterations, self.traits.max_iterations)
 
     def _descend(self, progress: Progress, objective: MyopicObjective, state: State, n_iterations: int) -> State:
         n_each = progress.candidates.n_each
@@ -270,7 +268,7 @@ class Solver:
             progress.explained += (progress.ending,)
         again, needed = verdict.finding is Finding.NOT_EXPLAINED and not progress.alike, 1  # iterations
         if progress.explained:
-            again, needed = len(progress.explained) < self.schedule.averaged, self.start_iterations
+            again, needed = len(progress.explained) < self.schedule.averaged, self.schedule.start_iterations
         spent = len(progress.costs) + needed > self.traits.max_iterations or progress.starts >= self.schedule.starts
         if again and not spent:
             seed, found = self.traits.seed + progress.starts, progress.state.geometry
