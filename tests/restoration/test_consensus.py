@@ -52,7 +52,7 @@ def averaged(objective, states, n_iterations):
     """The state and evaluations after the average of several starts."""
     explained = tuple(Ending(state, Status.CONVERGED) for state in states)
     ended = Progress(Candidates(states[0], 1), explained=explained)
-    average_starts(objective, ended, Schedule(segment=n_iterations), ProjectedLBFGS())
+    average_starts(objective, ended, Schedule(segment=n_iterations), ProjectedLBFGS(), None)
     return ended.state, ended.n_evaluations
 
 
@@ -99,6 +99,7 @@ def test_aberrations_are_fitted_to_the_mean_object(explained):
 
 # --- whole restorations
 
+STAGES = ("restoration", "fit to the mean")
 BRISK = {"candidates": ((2, 4),), "segment": 4, "sharp_after": 4, "escapes": 0, "start_iterations": 8}
 
 
@@ -122,7 +123,12 @@ def test_starts_that_explain_the_frames_are_averaged(chance, averaged, message, 
     result = restore(explained, schedule, callback=records.append)
     assert message is None or message in result.message
     assert len(result.cost) == iterations
-    assert [record.step for record in records] == list(range(1, iterations + 1))
+    steps = {stage: [record.step for record in records if record.stage == stage] for stage in STAGES}
+    assert steps["restoration"] == list(range(1, iterations + 1))
+    last = steps["fit to the mean"]
+    assert last == list(range(1, len(last) + 1))
+    assert bool(last) == ("mean" in (message or ""))
+    assert len(records) == iterations + len(last)
     assert bool((result.object >= 0).all())
 
 

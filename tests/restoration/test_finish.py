@@ -38,7 +38,7 @@ def test_finer_modes_begin_at_the_same_aberrations(n_common, exposure, five_hole
     finer = basis_of(five_holes, 6, n_common, exposure)
     moving = basis_of(five_holes, 3, n_common, exposure) if exposure else None
     objective, state = explain(ExposureModel(five_holes, GRID, still))
-    setting = Setting.of(objective, moving, finer)
+    setting = Setting.of(objective, moving, lambda: finer)
     state = setting.in_motion(state, seed=0)
     there = setting.in_finer_modes(state)
     before, after = setting.objective_at(objective, state), setting.objective_at(objective, there)
@@ -54,7 +54,7 @@ def test_finer_modes_begin_at_the_same_aberrations(n_common, exposure, five_hole
 def test_aberrations_stay_as_they_are_without_finer_modes(five_holes, explained):
     objective, state = explained
     assert Setting.of(objective).in_finer_modes(state) is state
-    waiting = Setting.of(objective, basis_of(five_holes, 3, 0, 1.0), basis_of(five_holes, 6, 0, 1.0))
+    waiting = Setting.of(objective, basis_of(five_holes, 3, 0, 1.0), lambda: basis_of(five_holes, 6, 0, 1.0))
     assert waiting.in_finer_modes(state) is state  # it has not begun to move
 
 
@@ -88,7 +88,7 @@ def test_more_modes_explain_what_few_leave(five_holes, explain):
     )
     start = truth.model.aberrations.coefficients(state.z)[..., :3]
     begun = replace(state, z=basis.parameters_of(start))
-    setting = Setting.of(few, finer=truth.model.aberrations)
+    setting = Setting.of(few, finer=lambda: truth.model.aberrations)
     records = []
     objective, progress = ended(few, begun, setting, Schedule(last_iterations=200), records)
     chi_square = [float(fit_of_frames(*pair)[1].mean()) for pair in ((few, begun), (objective, progress.state))]

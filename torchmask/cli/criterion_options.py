@@ -192,11 +192,15 @@ class ObservationOptions(CriterionOptions):
 
 
 def observation_options(known: Instrument) -> dict[str, Any]:
-    """Return the values of `ObservationOptions` that an instrument gives; light and sky depend on the open area."""
+    """Return the options of `design` and `rank` that an instrument sets; light and sky depend on the open area."""
     return exposure_options(known) | {
         "r0": known.site.r0,
         "outer_scale": known.site.outer_scale,
         "mask_diameter": known.telescope.diameter,
+        "central_obstruction": known.telescope.central_obstruction,
+        "spiders": known.telescope.spiders,
+        "exponent": known.source.exponent,
+        "knee": known.knee,
         "wavelength": known.mean_wavelength,
         "n_frames": known.frames,
         "readout_noise": known.camera.readout_noise,

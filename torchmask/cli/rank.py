@@ -58,14 +58,8 @@ class Options(ObservationOptions, MaskRules, RunOptions):
 
     @classmethod
     def of_instrument(cls, known: Instrument) -> Options:
-        """Return the options that an instrument sets; its light and its sky depend on the collecting area."""
-        return cls(
-            **observation_options(known),
-            central_obstruction=known.telescope.central_obstruction,
-            spiders=known.telescope.spiders,
-            exponent=known.source.exponent,
-            knee=known.knee,
-        )
+        """Return the options that an instrument sets."""
+        return cls(**observation_options(known))
 
 
 def patterns(options: Options) -> list[Pattern]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
@@ -165,6 +166,9 @@ class AberrationBasis(nn.Module):
             expected = expected - torch.einsum("njmj->j", covariance)[low:high].sum() / n_sub
         ratio = float((modes**2).sum() / len(z) / expected)
         return min(max(ratio, _STRENGTH_RANGE[0]), _STRENGTH_RANGE[1])
+
+
+MakesBasis = Callable[[], AberrationBasis | None]
 
 
 def plain_basis(aperture: Aperture, n_modes: int) -> AberrationBasis:

@@ -17,7 +17,7 @@ from torchmask.io import as_array, load_npz, save_npz
 from torchmask.optics.geometry import MaskGeometry
 from torchmask.restoration.candidates import Candidates
 from torchmask.restoration.objective import MyopicObjective
-from torchmask.restoration.state import Calibration, State
+from torchmask.restoration.state import Calibration, Modes, State
 from torchmask.restoration.traits import Refinement
 
 
@@ -100,7 +100,8 @@ class Progress:
 
 
 _NUMBERS = ("n_evaluations", "escapes", "starts", "began", "alike")
-_NEEDED = ("image", "z", "geometry", "status", *(item.name for item in fields(Calibration)))  # arrays of an ending
+# arrays of an ending
+_NEEDED = ("image", "z", "geometry", "modes", "status", *(item.name for item in fields(Calibration)))
 
 
 @dataclass(frozen=True)
@@ -180,7 +181,8 @@ def fingerprint_of(objective: MyopicObjective, settings: Sequence[object], known
 
 def _ending_arrays(prefix: str, ending: Ending) -> dict[str, Any]:
     state, calibration = ending.state, ending.state.calibration
-    values = {"image": state.image, "z": state.z, "geometry": state.geometry.matrix, "status": ending.status.name}
+    values: dict[str, Any] = {"image": state.image, "z": state.z, "geometry": state.geometry.matrix}
+    values |= {"modes": state.modes.name, "status": ending.status.name}
     values |= {item.name: getattr(calibration, item.name) for item in fields(Calibration)}
     if ending.decrease is not None:
         values["decrease"] = ending.decrease
@@ -197,7 +199,7 @@ def _ending(stored: dict[str, np.ndarray], prefix: str, device: torch.device) ->
     decrease = stored.get(prefix + "decrease")
     status = Status[stored[prefix + "status"].item()]
     return Ending(
-        State(tensor("image"), tensor("z"), calibration, geometry),
+        State(tensor("image"), tensor("z"), calibration, geometry, Modes[stored[prefix + "modes"].item()]),
         status,
         None if decrease is None else float(decrease),
     )

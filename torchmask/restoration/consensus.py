@@ -12,26 +12,26 @@ from dataclasses import replace
 import torch
 
 from torchmask.metrics import registration, shift
+from torchmask.record import Callback
 from torchmask.restoration.calibration import calibrate, share_noise_inflation
 from torchmask.restoration.candidates import Candidates, select, with_candidates
 from torchmask.restoration.checkpoint import Progress
-from torchmask.restoration.descent import Variables, descend
+from torchmask.restoration.descent import descend
 from torchmask.restoration.escapes import tilt
+from torchmask.restoration.finish import reporter
 from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.state import Calibration, State
 
 
-def average_starts(objective: MyopicObjective, ended: Progress, schedule: Schedule, minimizer: Minimizer) -> None:
+def average_starts(
+    objective: MyopicObjective, ended: Progress, schedule: Schedule, minimizer: Minimizer, callback: Callback | None
+) -> None:
     """Give `ended` the mean object of its starts that explain the frames, and the aberrations fitted to that object.
 
     Each frame begins with those aberrations among the starts' that fit the mean object best.
     """
-
-    def count(cost: float, evaluations: int, variables: Variables) -> None:
-        ended.n_evaluations += evaluations
-
     states = [ending.state for ending in ended.explained]
     together = registered_mean(objective, states)
     n_each = len(states) if not objective.model.aberrations.n_common else 1  # which all frames share
@@ -39,8 +39,9 @@ def average_starts(objective: MyopicObjective, ended: Progress, schedule: Schedu
     crowded = with_candidates(objective, n_each)
     fitted = share_noise_inflation(calibrate(crowded, together))
     best = select(crowded, Candidates(fitted, n_each), 1).state
+    listen = reporter(ended, "fit to the mean", schedule.segment, callback)
     known_object = objective.with_changes(free=objective.free & ~Free.OBJECT)
-    found = descend(known_object, best, schedule.segment, minimizer, count)
+    found = descend(known_object, best, schedule.segment, minimizer, listen)
     ended.state, ended.averaged = calibrate(objective, found), len(states)
     ended.n_evaluations += 2 * n_each  # calibration and choice
 

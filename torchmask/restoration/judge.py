@@ -16,10 +16,11 @@ from torchmask.restoration.verdict import Tolerance, Verdict, judge
 
 
 class Comparison(NamedTuple):
-    """The better of two endings, the verdict on it, and whether both leave the same residual."""
+    """The better of two endings, the verdict on it and on the later one, and whether both leave the same residual."""
 
     best: Ending
     verdict: Verdict
+    now: Verdict
     alike: bool
 
 
@@ -52,11 +53,11 @@ class Judge:
         """Compare the present ending with the best of the earlier ones, if there is one."""
         after = self.verdict(objective, now)
         if rival is None:
-            return Comparison(now, after, alike=False)
+            return Comparison(now, after, after, alike=False)
         before = self.verdict(objective, rival)
         best, verdict = (rival, before) if before.excess < after.excess else (now, after)
         scale = max(verdict.excess, verdict.limit - 1)
-        return Comparison(best, verdict, abs(before.excess - after.excess) < self.alike * scale)
+        return Comparison(best, verdict, after, abs(before.excess - after.excess) < self.alike * scale)
 
     def _left_out(self, n_modes: int) -> LeftOut:
         if n_modes not in self._beyond:

@@ -16,10 +16,10 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchmask.optics.aperture import Aperture
-from torchmask.restoration.aberrations import AberrationBasis
+from torchmask.restoration.aberrations import AberrationBasis, MakesBasis
 from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.placement import placed_as
-from torchmask.restoration.state import State
+from torchmask.restoration.state import Modes, State
 
 _FIRST = 0.1  # rms of the first changes, relative to their prior
 
@@ -31,17 +31,17 @@ class Setting:
     told : the mask as the user describes it
     still : basis of the aberrations of snapshots
     moving : the same basis with changes during the exposure; None: frames are snapshots
-    finer : basis with more modes, and with the same changes, for the last descent; None: there are no more
+    finer : makes the basis with more modes, and with the same changes, for the last descent; None: there are no more
     """
 
     told: Aperture
     still: AberrationBasis
     moving: AberrationBasis | None = None
-    finer: AberrationBasis | None = None
+    finer: MakesBasis | None = None
 
     @classmethod
     def of(
-        cls, objective: MyopicObjective, moving: AberrationBasis | None = None, finer: AberrationBasis | None = None
+        cls, objective: MyopicObjective, moving: AberrationBasis | None = None, finer: MakesBasis | None = None
     ) -> Setting:
         """Return the setting of an objective of snapshots; known aberrations do not move and have no more modes."""
         model, is_free = objective.model, Free.ABERRATIONS in objective.free
@@ -49,7 +49,7 @@ class Setting:
 
     def awaits_motion(self, state: State) -> bool:
         """Whether the aberrations change during the exposure, and the state does not have the change yet."""
-        return self.moving is not None and state.z.shape[1] < self.moving.n_parameters
+        return self.moving is not None and state.modes is Modes.STILL
 
     def in_motion(self, state: State, seed: int, change: Tensor | None = None) -> State:
         """Return the state with changes of the aberrations, if it awaits them.
@@ -58,41 +58,53 @@ class Setting:
         """
         if self.moving is None or not self.awaits_motion(state):
             return state
-        size = (len(state.z), self.moving.n_parameters - self.still.n_parameters)
+        size = (len(state.z), self._n_changes)
         generator = torch.Generator().manual_seed(seed)
         first = _FIRST * torch.randn(size, dtype=state.z.dtype, device="cpu", generator=generator).to(state.z)
         if change is not None:
             known = self.moving.parameters_of_change(change.to(first))
             first[: len(change)] = known[:, self.still.n_own : self.moving.n_own]
-        return replace(state, z=self._widened(state.z, first))
+        return replace(state, z=self._widened(state.z, first), modes=Modes.MOVING)
 
     def in_finer_modes(self, state: State) -> State:
         """Return the state in the basis `finer`, with the same aberrations; the state itself if there is none."""
-        still, finer = self.still, self.finer
-        if finer is None or self.awaits_motion(state):
+        still, finer = self.still, None if self.finer is None or self.awaits_motion(state) else self.finer()
+        if finer is None:
             return state
         own, change, common = state.z.tensor_split([still.n_own, state.z.shape[1] - still.n_common], dim=1)
         now = (own @ still.mixing[:, : still.n_own].to(own).T).unflatten(1, (still.n_subapertures, still.n_modes))
         now = pad(now, (0, finer.n_modes - still.n_modes)).flatten(1)
-        mixing = finer.mixing[:, : finer.n_own - change.shape[1]].to(own)
-        return replace(state, z=torch.cat([now @ torch.linalg.pinv(mixing).T, change, common], dim=1))
+        mixing = finer.mixing[:, : finer.n_own - self._n_changes].to(own)
+        z = torch.cat([now @ torch.linalg.pinv(mixing).T, change, common], dim=1)
+        return replace(state, z=z, modes=Modes.FINER)
 
     def objective_at(self, objective: MyopicObjective, state: State) -> MyopicObjective:
         """Return the objective with its mask and its aberrations as `state` has them."""
-        objective = placed_as(objective, self.told, state.geometry)
-        n_parameters, model, centre = state.z.shape[1], objective.model, objective.centre
-        if n_parameters == model.aberrations.n_parameters:
+        objective, basis = placed_as(objective, self.told, state.geometry), self._basis(state)
+        model, centre = objective.model, objective.centre
+        if model.aberrations.n_parameters == basis.n_parameters:
             return objective
-        if self.finer is not None and n_parameters == self.finer.n_parameters:
-            basis, centre = self.finer, torch.zeros_like(state.z)
-        elif self.moving is not None and n_parameters == self.moving.n_parameters:
-            basis = self.moving
-            centre = self._widened(centre, centre.new_zeros(len(centre), n_parameters - self.still.n_parameters))
+        if state.modes is Modes.FINER:
+            centre = torch.zeros_like(state.z)
         else:
-            basis = self.still
-            centre = torch.cat([centre[:, : basis.n_own], centre[:, centre.shape[1] - basis.n_common :]], dim=1)
+            own, common = centre[:, : self.still.n_own], centre[:, centre.shape[1] - self.still.n_common :]
+            centre = torch.cat([own, common], dim=1)
+            if state.modes is Modes.MOVING:
+                centre = self._widened(centre, centre.new_zeros(len(centre), self._n_changes))
         model = model.through(model.pupil.aperture, basis.to(model.device))
         return objective.with_changes(model=model, centre=centre)
+
+    @property
+    def _n_changes(self) -> int:
+        """Number of parameters of a frame for the change of its aberrations."""
+        return 0 if self.moving is None else self.moving.n_parameters - self.still.n_parameters
+
+    def _basis(self, state: State) -> AberrationBasis:
+        if state.modes is Modes.STILL:
+            return self.still
+        basis = self.moving if state.modes is Modes.MOVING else self.finer and self.finer()
+        assert basis is not None, f"the state has aberrations that this setting lacks: {state.modes.value}"
+        return basis
 
     def _widened(self, z: Tensor, change: Tensor) -> Tensor:
         """Insert the parameters (T, M) of a change into z (T, K) of snapshots."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass, replace
 
@@ -12,7 +13,13 @@ from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.band import Band
 from torchmask.optics.pixel import PixelResponse
-from torchmask.restoration.aberrations import AberrationBasis, estimated_basis, moving_basis, turbulent_basis
+from torchmask.restoration.aberrations import (
+    AberrationBasis,
+    MakesBasis,
+    estimated_basis,
+    moving_basis,
+    turbulent_basis,
+)
 from torchmask.restoration.forward import ExposureModel
 
 
@@ -102,11 +109,12 @@ class ModelRecipe:
         aperture = self.aperture if follows_aperture else self.aperture.still()
         return self._build(aperture, basis)
 
-    def later_bases(
-        self, still: AberrationBasis, *, blind: bool
-    ) -> tuple[AberrationBasis | None, AberrationBasis | None]:
-        """Return the moving and the finer basis that follow upon `still`; only a blind restoration has the latter."""
-        return self.moving_basis(still), self.finer_basis() if blind else None
+    def later_bases(self, still: AberrationBasis, *, blind: bool) -> tuple[AberrationBasis | None, MakesBasis | None]:
+        """Return the moving basis that follows upon `still`, and what makes the finer one of a blind restoration.
+
+        The latter takes seconds for tens of holes, and is made once, when it is needed.
+        """
+        return self.moving_basis(still), functools.cache(self.finer_basis) if blind else None
 
     def moving_basis(self, still: AberrationBasis) -> AberrationBasis | None:
         """Return the basis `still` extended by changes during an exposure; None for snapshots."""

@@ -18,7 +18,7 @@ from dataclasses import replace
 from torchmask.optics.geometry import MaskGeometry
 from torchmask.record import Callback, Record
 from torchmask.restoration import escapes
-from torchmask.restoration.aberrations import AberrationBasis
+from torchmask.restoration.aberrations import AberrationBasis, MakesBasis
 from torchmask.restoration.calibration import recalibrate
 from torchmask.restoration.candidates import Candidates, play_stage
 from torchmask.restoration.checkpoint import Checkpoint, Ending, Progress, Status
@@ -65,8 +65,8 @@ class Solver:
         Called with a `Record` after every iteration.
     moving : AberrationBasis, optional
         Aberrations that change during a frame. None: frames are snapshots.
-    finer : AberrationBasis, optional
-        Aberrations with more modes for the last descent. None: there are no more.
+    finer : callable, optional
+        Makes the aberrations with more modes for the last descent. None: there are no more.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class Solver:
         minimizer: Minimizer,
         callback: Callback | None = None,
         moving: AberrationBasis | None = None,
-        finer: AberrationBasis | None = None,
+        finer: MakesBasis | None = None,
     ) -> None:
         self.objective: MyopicObjective = objective
         self.setting: Setting = Setting.of(objective, moving, finer)
@@ -113,7 +113,7 @@ class Solver:
             how = (self.schedule, self.minimizer, self.callback)
             self.objective = finish(self.objective, self.setting, ended, *how, self.traits, is_faint=self.is_faint)
         if len(ended.explained) > 1:
-            average_starts(self.objective, ended, self.schedule, self.minimizer)
+            average_starts(self.objective, ended, self.schedule, self.minimizer, self.callback)
         return ended
 
     def begin(self, known: Known, start: RestorationResult | None) -> Progress:
@@ -263,8 +263,8 @@ class Solver:
 
         If two starts agree, no further one is made. For a full pupil, others begin until enough explain the frames.
         """
-        best, verdict, progress.alike = self.judge.compare(self.objective, progress.ending, progress.rival)
-        if self.averages and self.verdict(progress.ending).explained:
+        best, verdict, now, progress.alike = self.judge.compare(self.objective, progress.ending, progress.rival)
+        if self.averages and now.explained:
             progress.explained += (progress.ending,)
         again, needed = verdict.finding is Finding.NOT_EXPLAINED and not progress.alike, 1  # iterations
         if progress.explained:

@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from enum import Enum
 
 import torch
 from torch import Tensor
 
 from torchmask.optics.geometry import MaskGeometry
+
+
+class Modes(Enum):
+    """Aberrations that the parameters of a state stand for."""
+
+    STILL = "those of snapshots"
+    MOVING = "the same, which change during the exposure"
+    FINER = "more of them, for the last descent"
 
 
 @dataclass(frozen=True)
@@ -36,12 +45,14 @@ class State:
     image : (H', W') object in units of the stack's mean pixel
     z : (T, K) parameters of the aberrations; the common ones are equal in all frames
     geometry : rotation and magnification of the mask relative to the given centres, as far as estimated
+    modes : aberrations that `z` stands for
     """
 
     image: Tensor
     z: Tensor
     calibration: Calibration
     geometry: MaskGeometry = field(default_factory=MaskGeometry)
+    modes: Modes = Modes.STILL
 
     def of_frames(self, part: slice | Tensor) -> State:
         """Return the same object with the aberrations of some of the frames."""
