@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+from pathlib import Path
 
 import pytest
 import torch
@@ -10,6 +11,7 @@ import yaml
 
 from torchmask.cli import design, plan, rank
 from torchmask.cli.main import main
+from torchmask.cli.options import MaskOptions, load_aperture
 from torchmask.cli.program import parse
 from torchmask.design.manufacture import load_mask, mask_wavelength, save_json
 from torchmask.design.observed import instrument_criterion
@@ -17,7 +19,7 @@ from torchmask.grid import ARCSEC
 from torchmask.instrument.instrument import Instrument
 from torchmask.instrument.parts import Camera, Site, Source, Telescope
 from torchmask.observation import Observation
-from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.aperture import FullAperture, SparseAperture
 
 pytestmark = pytest.mark.usefixtures("coarse_figures")
 
@@ -61,6 +63,35 @@ def test_frames_are_simulated_as_the_instrument_takes_them(folder, capsys):
     again = ["simulate", "--config", str(folder / "run/config.yaml"), "--out", str(folder / "again")]
     assert main(again) == 0
     assert Observation.load(folder / "again/stack.npz").frames.equal(stack.frames)
+
+
+def test_a_full_pupil_is_that_of_the_telescope(folder, capsys):
+    telescope = dataclasses.replace(KNOWN.telescope, vane_width=0.05, vane_angles=(0.0, 90.0))
+    vaned = dataclasses.replace(KNOWN, telescope=telescope)
+    vaned.save(folder / "vaned.json")
+    told = ["simulate", "--instrument", folder / "vaned.json", "--mask", "full", "--scene.size", "0.4"]
+    assert main([*map(str, told), "--out", str(folder / "run")]) == 0
+    pupil, expected = Observation.load(folder / "run/stack.npz").aperture, telescope.pupil()
+    assert isinstance(pupil, FullAperture)
+    for name in ("mask_diameter", "central_obstruction", "vane_width", "vane_angles"):
+        assert getattr(pupil, name) == getattr(expected, name), name
+    assert f"{vaned.photons(float(expected.area)):.4g} photons in each" in capsys.readouterr().out
+
+
+def test_what_is_given_of_a_full_pupil_wins():
+    telescope = dataclasses.replace(KNOWN.telescope, vane_width=0.05, vane_angles=(0.0, 90.0))
+    own = MaskOptions(mask=Path("full"), mask_diameter=1.0, central_obstruction=0.1, vane_angles=(30.0, 210.0))
+    expected = FullAperture(1.0, 0.1, 0.05, [math.radians(30), math.radians(210)])
+    assert load_aperture(own, telescope).area == expected.area
+    with pytest.raises(ValueError, match=r"--central-obstruction is 0.2 m: .* less than --mask-diameter, 0.1 m"):
+        load_aperture(MaskOptions(mask=Path("full"), mask_diameter=0.1), telescope)
+
+
+def test_patterns_without_a_size_are_as_wide_as_the_telescope():
+    golay = load_aperture(MaskOptions(mask=Path("golay6"), fill_factor=0.1), KNOWN.telescope)
+    assert golay.mask_diameter == 1.2
+    built = load_aperture(MaskOptions(mask=Path("niriss"), allow_overlap=True), KNOWN.telescope)
+    assert built.mask_diameter == SparseAperture.from_catalog("niriss").mask_diameter
 
 
 def test_a_mask_is_designed_for_the_instrument(folder):

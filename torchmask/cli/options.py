@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,6 +12,7 @@ import tyro
 from torchmask.design.manufacture import load_mask, mask_wavelength
 from torchmask.grid import ARCSEC
 from torchmask.instrument.parts import Telescope
+from torchmask.optics import catalog
 from torchmask.optics.aperture import Aperture, FullAperture, SparseAperture
 from torchmask.optics.band import Band
 from torchmask.optics.overlaps import check_overlaps
@@ -197,16 +198,25 @@ class MaskOptions(CatalogOptions):
     """Mask file (.json, .dxf, .fits), name from `torchmask masks`, or `full` for a full pupil of --mask-diameter."""
     mask_diameter: float | None = None
     """Diameter D of a mask from the catalogue or of a full pupil [m]; None: as built."""
-    central_obstruction: float = 0.0
-    """Diameter of the central obstruction of a full pupil [m]."""
-    vane_width: float = 0.0
-    """Width of the vanes of a full pupil, which hold its secondary mirror [m]."""
-    vane_angles: tuple[float, ...] = ()
-    """Direction of each vane of a full pupil from its centre to its rim, counterclockwise from +x [degrees]."""
+    central_obstruction: float | None = None
+    """Diameter of the central obstruction of a full pupil [m]; None: that of the instrument, or else 0."""
+    vane_width: float | None = None
+    """Width of the vanes of a full pupil, which hold its secondary mirror [m]; None: that of the instrument, or else
+    0."""
+    vane_angles: tuple[float, ...] | None = None
+    """Direction of each vane of a full pupil from its centre to its rim, counterclockwise from +x [degrees]; None:
+    those of the instrument, or else no vanes."""
 
 
-def load_aperture(options: MaskOptions) -> Aperture:
-    """Return the aperture of `options.mask`, float64. Raises ValueError if it is missing, unknown or invalid."""
+_PUPIL = ("central_obstruction", "vane_width", "vane_angles")  # of a full pupil, in `MaskOptions` and `Telescope`
+
+
+def load_aperture(options: MaskOptions, telescope: Telescope | None = None) -> Aperture:
+    """Return the aperture of `options.mask`, float64. Raises ValueError if it is missing, unknown or invalid.
+
+    A full pupil, and a pattern of the catalogue that has no size, are those of the telescope where the options say
+    nothing else.
+    """
     if options.mask is None:
         raise ValueError(
             f"--mask is missing: give a mask file ({', '.join(MASK_SUFFIXES)}), a name from `torchmask masks`, or "
@@ -214,32 +224,40 @@ def load_aperture(options: MaskOptions) -> Aperture:
         )
     name = str(options.mask)
     if name == FULL:
-        if options.mask_diameter is None:
-            raise ValueError("a full pupil needs --mask-diameter [m]")
-        FullAperture(options.mask_diameter)  # raises for an invalid diameter, before it is divided by
-        if not 0 <= options.central_obstruction < options.mask_diameter:
-            raise ValueError(
-                f"--central-obstruction is {options.central_obstruction:g} m: it must be at least 0 and less than "
-                f"--mask-diameter, {options.mask_diameter:g} m"
-            )
-        telescope = Telescope(
-            diameter=options.mask_diameter,
-            central_obstruction=options.central_obstruction,
-            vane_width=options.vane_width,
-            vane_angles=options.vane_angles,
-        )
-        return telescope.pupil()
-    for option in ("central_obstruction", "vane_width", "vane_angles"):
+        return _full_pupil(options, telescope)
+    for option in _PUPIL:
         if getattr(options, option):
-            name = option.replace("_", "-")
-            raise ValueError(f"--{name} is for a full pupil (--mask full): leave it out for a mask")
+            option = option.replace("_", "-")
+            raise ValueError(f"--{option} is for a full pupil (--mask full): leave it out for a mask")
     if is_mask_file(options.mask):
         return require_apart(name, load_mask_file(options.mask, options), options.allow_overlap)
+    diameter = options.mask_diameter
+    if telescope is not None and diameter is None and name in catalog.names():
+        diameter = telescope.diameter if catalog.entry(name).pupil_diameter is None else None
     try:
-        mask = SparseAperture.from_catalog(name, options.mask_diameter, options.fill_factor, options.mirrored)
+        mask = SparseAperture.from_catalog(name, diameter, options.fill_factor, options.mirrored)
     except ValueError as error:
         raise ValueError(f"--mask {name}: {error}") from error
     return require_apart(name, mask, options.allow_overlap)
+
+
+def _full_pupil(options: MaskOptions, telescope: Telescope | None) -> FullAperture:
+    diameter = options.mask_diameter
+    if telescope is None:
+        if diameter is None:
+            raise ValueError("a full pupil needs --mask-diameter [m]")
+        FullAperture(diameter)  # raises for an invalid diameter, before it is divided by
+        telescope = Telescope(diameter=diameter)
+    told = {name: getattr(options, name) for name in _PUPIL if getattr(options, name) is not None}
+    obstruction = told.get("central_obstruction", telescope.central_obstruction)
+    if diameter is None:
+        diameter = telescope.diameter
+    if not 0 <= obstruction < diameter:
+        raise ValueError(
+            f"--central-obstruction is {obstruction:g} m: it must be at least 0 and less than --mask-diameter, "
+            f"{diameter:g} m"
+        )
+    return replace(telescope, diameter=diameter, **told).pupil()
 
 
 def told_wavelength(options: MaskOptions) -> float | None:

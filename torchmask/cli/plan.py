@@ -9,11 +9,10 @@ from typing import Annotated, Any
 
 import tyro
 
-from torchmask.cli.options import FULL, CatalogOptions, InstrumentOptions, MaskOptions, RunOptions, load_aperture
+from torchmask.cli.options import CatalogOptions, InstrumentOptions, MaskOptions, RunOptions, load_aperture
 from torchmask.cli.run import new_run
 from torchmask.design.manufacture import save_json
 from torchmask.instrument.instrument import Instrument
-from torchmask.optics import catalog
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.pupil import Aperture
 from torchmask.planning.plan import plan_observation
@@ -69,21 +68,9 @@ def existing_mask(options: Options) -> Aperture | None:
     """Return the mask that --mask names; patterns without a size, and full pupils, are as wide as the telescope."""
     if options.mask is None:
         return None
-    telescope, name = options.telescope, str(options.mask)
-    diameter = options.mask_diameter
-    if diameter is None and (name == FULL or (name in catalog.names() and catalog.entry(name).pupil_diameter is None)):
-        diameter = telescope.diameter
+    names = (item.name for item in dataclasses.fields(CatalogOptions))
     return load_aperture(
-        MaskOptions(
-            mask=options.mask,
-            mask_diameter=diameter,
-            fill_factor=options.fill_factor,
-            mirrored=options.mirrored,
-            allow_overlap=options.allow_overlap,
-            central_obstruction=telescope.central_obstruction if name == FULL else 0.0,
-            vane_width=telescope.vane_width if name == FULL else 0.0,
-            vane_angles=telescope.vane_angles if name == FULL else (),
-        )
+        MaskOptions(mask=options.mask, **{name: getattr(options, name) for name in names}), options.telescope
     )
 
 

@@ -201,11 +201,11 @@ def observing_wavelength(options: Options) -> float:
 
 def run(options: Options) -> None:
     """Simulate, and write the stack."""
-    told = load_aperture(options)
+    known = None if options.instrument is None else Instrument.load(options.instrument)
+    told = load_aperture(options, None if known is None else known.telescope)
     true = options.true_mask.apply(told)
     aperture = true or told
     wavelength = observing_wavelength(options)
-    known = None if options.instrument is None else Instrument.load(options.instrument)
     photons, sky = (DEFAULT_PHOTONS, 0.0) if known is None else (known.photons(told.area), known.sky(told.area))
     n_photons = photons if options.n_photons is None else options.n_photons
     conditions = options.conditions.make(options.turbulence.exposure_time, wavelength, sky)
