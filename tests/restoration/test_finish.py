@@ -47,7 +47,12 @@ def test_finer_modes_begin_at_the_same_aberrations(n_common, exposure, five_hole
     assert torch.allclose(after.model(state.image, there.z), before.model(state.image, state.z), rtol=1e-9)
     common = slice(finer.n_own, None)
     assert torch.equal(there.z[:, common], state.z[:, state.z.shape[1] - finer.n_common :])
-    back = setting.objective_at(after, state)
+    again = setting.in_first_modes(there)
+    assert again.modes is state.modes
+    assert torch.allclose(again.z, state.z, atol=1e-9)
+    assert setting.in_first_modes(state) is state
+    back = setting.objective_at(after, again)
+    assert back.centre.shape == state.z.shape
     assert torch.equal(back.model(state.image, state.z), before.model(state.image, state.z))
 
 

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from torchmask.restoration.aberrations import turbulent_basis
 from torchmask.restoration.checkpoint import Ending, Status
 from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.judge import Judge
@@ -27,10 +28,14 @@ TRAITS = Traits(
 )
 
 
+def stack_of(objective):
+    return FrameStack(objective.frames, torch.ones_like(objective.frames, dtype=torch.bool), 1.0, 0.003**2)
+
+
 def test_each_ending_is_judged_where_it_has_found_the_mask(explain):
     """An ending that knows of the turn is explained as if nothing had been turned; one that does not is worse."""
     objective, state = explain(noise=0.003)
-    stack = FrameStack(objective.frames, torch.ones_like(objective.frames, dtype=torch.bool), 1.0, 0.003**2)
+    stack = stack_of(objective)
     told = objective.model.pupil.aperture
     expected = Judge(Setting.of(objective), stack, TRAITS, Schedule()).verdict(
         objective, Ending(state, Status.CONVERGED)
@@ -48,3 +53,22 @@ def test_each_ending_is_judged_where_it_has_found_the_mask(explain):
         assert not found.alike
         assert found.verdict == judge.verdict(objective, there)
     assert judge.compare(objective, here, here).alike
+
+
+def test_the_last_descent_is_held_to_the_modes_of_the_search(explain, five_holes):
+    """The limit stays where it was, while the degrees of freedom count the modes that were added."""
+    objective, state = explain(noise=0.003)
+    n_modes = objective.model.aberrations.n_modes
+    finer = turbulent_basis(five_holes, n_modes + 5, 0, TRAITS.r0, TRAITS.outer_scale)
+    setting = Setting.of(objective, finer=lambda: finer)
+    judge = Judge(setting, stack_of(objective), TRAITS, Schedule(chance=0.0))
+    before = judge.verdict(objective, Ending(state, Status.CONVERGED))
+    there = setting.in_finer_modes(state)
+    at_end = setting.objective_at(objective, there)
+    after = judge.verdict(at_end, Ending(there, Status.CONVERGED))
+    assert before.model_error > 0
+    assert after.model_error == pytest.approx(before.model_error, rel=1e-6)
+    assert after.limit == pytest.approx(before.limit, rel=1e-6)
+    assert after.phase_error == pytest.approx(before.phase_error, rel=1e-6)
+    # five modes more in each of five holes, less what their prior holds
+    assert 0 < before.degrees_of_freedom - after.degrees_of_freedom <= 25 * len(objective.frames)

@@ -7,10 +7,11 @@ from typing import NamedTuple
 from torchmask.restoration.calibration import fit_of_frames
 from torchmask.restoration.checkpoint import Ending, Status
 from torchmask.restoration.frames import FrameStack
-from torchmask.restoration.model_error import NO_MODEL_ERROR, LeftOut, expected_error
+from torchmask.restoration.model_error import NO_MODEL_ERROR, LeftOut, ModelError, expected_error
 from torchmask.restoration.motion import Setting
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.schedule import Schedule
+from torchmask.restoration.state import Modes, State
 from torchmask.restoration.traits import Traits
 from torchmask.restoration.verdict import Tolerance, Verdict, judge
 
@@ -46,7 +47,7 @@ class Judge:
         # For a full pupil poor minima, not modes left out, dominate the residual; `tolerance` allows for them.
         error = NO_MODEL_ERROR
         if not self.traits.many_minima:
-            error = expected_error(objective, state, self._left_out(objective.model.aberrations.n_modes))
+            error = self._expected_error(objective, state)
         return judge(chi_square, pixels, self.contrast, error, self.tolerance, at_rest=at_rest)
 
     def compare(self, objective: MyopicObjective, now: Ending, rival: Ending | None) -> Comparison:
@@ -58,6 +59,20 @@ class Judge:
         best, verdict = (rival, before) if before.excess < after.excess else (now, after)
         scale = max(verdict.excess, verdict.limit - 1)
         return Comparison(best, verdict, after, abs(before.excess - after.excess) < self.alike * scale)
+
+    def _expected_error(self, objective: MyopicObjective, state: State) -> ModelError:
+        """Return the model error that is allowed for, which is that of the modes of the search.
+
+        The last descent is too short to bring all its modes to rest, so the fit is not held to what they could explain;
+        the degrees of freedom count them nonetheless.
+        """
+        error = expected_error(objective, state, self._left_out(objective.model.aberrations.n_modes))
+        if state.modes is not Modes.FINER:
+            return error
+        first = self.setting.in_first_modes(state)
+        objective = self.setting.objective_at(objective, first)
+        before = expected_error(objective, first, self._left_out(objective.model.aberrations.n_modes))
+        return before._replace(fitted=error.fitted)
 
     def _left_out(self, n_modes: int) -> LeftOut:
         if n_modes not in self._beyond:

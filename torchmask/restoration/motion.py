@@ -68,19 +68,19 @@ class Setting:
 
     def in_finer_modes(self, state: State) -> State:
         """Return the state in the basis `finer`, with the same aberrations; the state itself if there is none."""
-        still, finer = self.still, None if self.finer is None or self.awaits_motion(state) else self.finer()
-        if finer is None:
+        if self.finer is None or self.awaits_motion(state) or self.finer() is None:
             return state
-        own, change, common = state.z.tensor_split([still.n_own, state.z.shape[1] - still.n_common], dim=1)
-        now = (own @ still.mixing[:, : still.n_own].to(own).T).unflatten(1, (still.n_subapertures, still.n_modes))
-        now = pad(now, (0, finer.n_modes - still.n_modes)).flatten(1)
-        mixing = finer.mixing[:, : finer.n_own - self._n_changes].to(own)
-        z = torch.cat([now @ torch.linalg.pinv(mixing).T, change, common], dim=1)
-        return replace(state, z=z, modes=Modes.FINER)
+        return self._in_modes(state, Modes.FINER)
+
+    def in_first_modes(self, state: State) -> State:
+        """Return the state with the part of its aberrations that the modes of the search can represent."""
+        if state.modes is not Modes.FINER:
+            return state
+        return self._in_modes(state, Modes.STILL if self.moving is None else Modes.MOVING)
 
     def objective_at(self, objective: MyopicObjective, state: State) -> MyopicObjective:
         """Return the objective with its mask and its aberrations as `state` has them."""
-        objective, basis = placed_as(objective, self.told, state.geometry), self._basis(state)
+        objective, basis = placed_as(objective, self.told, state.geometry), self._basis(state.modes)
         model, centre = objective.model, objective.centre
         if model.aberrations.n_parameters == basis.n_parameters:
             return objective
@@ -99,12 +99,22 @@ class Setting:
         """Number of parameters of a frame for the change of its aberrations."""
         return 0 if self.moving is None else self.moving.n_parameters - self.still.n_parameters
 
-    def _basis(self, state: State) -> AberrationBasis:
-        if state.modes is Modes.STILL:
+    def _basis(self, modes: Modes) -> AberrationBasis:
+        if modes is Modes.STILL:
             return self.still
-        basis = self.moving if state.modes is Modes.MOVING else self.finer and self.finer()
-        assert basis is not None, f"the state has aberrations that this setting lacks: {state.modes.value}"
+        basis = self.moving if modes is Modes.MOVING else self.finer and self.finer()
+        assert basis is not None, f"the state has aberrations that this setting lacks: {modes.value}"
         return basis
+
+    def _in_modes(self, state: State, modes: Modes) -> State:
+        """Return the state in other modes, with the change of its aberrations; modes that it lacks begin at zero."""
+        here, there, n_changes = self._basis(state.modes), self._basis(modes), self._n_changes
+        own, change, common = state.z.tensor_split([here.n_own - n_changes, here.n_own], dim=1)
+        now = (own @ here.mixing[:, : own.shape[1]].to(own).T).unflatten(1, (here.n_subapertures, here.n_modes))
+        now = pad(now, (0, there.n_modes - here.n_modes)).flatten(1)  # a negative width cuts modes off
+        mixing = there.mixing[:, : there.n_own - n_changes].to(own)
+        z = torch.cat([now @ torch.linalg.pinv(mixing).T, change, common], dim=1)
+        return replace(state, z=z, modes=modes)
 
     def _widened(self, z: Tensor, change: Tensor) -> Tensor:
         """Insert the parameters (T, M) of a change into z (T, K) of snapshots."""

@@ -32,7 +32,7 @@ class Verdict:
     chi_square : chi-square of the residuals over its degrees of freedom
     degrees_of_freedom : number of valid pixels, less the effective number of parameters fitted to each frame, given
         their prior. The object is not counted, as its prior constrains it and all frames share it
-    model_error : expected contribution to the chi-square of modes that the model leaves out
+    model_error : expected contribution to the chi-square of modes that the search leaves out
     limit : chi-square up to which the frames count as explained
     phase_error : rms of the modes left out, over a sub-aperture [rad]
     frames : frames that are not explained individually, counted from 0
