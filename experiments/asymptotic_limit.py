@@ -162,7 +162,7 @@ def masks(options: Options, callback: Callback) -> dict[str, SparseAperture]:
         reference_fill_factor=options.fill_factor,
         diameter_over_r0=(),
         seed=(options.seed,),
-        n_pixels=options.n_pixels,
+        n_frequencies=options.n_pixels,
         exponent=options.exponent,
         budget=options.budget,
     )

@@ -132,7 +132,7 @@ def choose_mask(options: MaskSearchOptions, callback: Callback) -> SparseApertur
         fill_factor=(options.fill_factor,),
         reference_fill_factor=options.fill_factor,
         diameter_over_r0=(),
-        n_pixels=64 if options.smoke else 256,
+        n_frequencies=64 if options.smoke else 256,
         budget=options.budget,
     )
     table = design_table(space, options.sweep, **options.keywords(callback))

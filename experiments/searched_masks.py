@@ -41,7 +41,7 @@ def design_space(options: SearchedMaskOptions, **changes: Any) -> DesignSpace:
         "n_frames": (options.n_frames,),
         "diameter_over_r0": (),
         "seed": options.seed,
-        "n_pixels": options.n_pixels,
+        "n_frequencies": options.n_pixels,
         "exponent": options.exponent,
         "budget": options.budget,
     }

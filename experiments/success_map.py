@@ -193,7 +193,7 @@ def choose_masks(options: Options, callback: Callback) -> list[SparseAperture]:
         fill_factor=(FILL_FACTOR,),
         reference_fill_factor=FILL_FACTOR,
         diameter_over_r0=(),
-        n_pixels=64 if options.smoke else 128,
+        n_frequencies=64 if options.smoke else 128,
         budget=100 if options.smoke else 2000,
     )
     table = design_table(space, options.sweep, **options.keywords(callback))

@@ -8,12 +8,16 @@ import pytest
 import torch
 from ezdxf import readfile
 
+from torchmask.cli import design, rank, table
 from torchmask.cli.design import Options, warn_of_wide_holes
 from torchmask.cli.main import main
 from torchmask.cli.options import require_wavelength
+from torchmask.design.constraint_base import Infeasible
 from torchmask.design.constraints import KeepOutDisc, RimMargin, check_mask
 from torchmask.design.criterion import AsymptoticMSE
 from torchmask.design.manufacture import load_mask
+from torchmask.design.space import DesignSpace
+from torchmask.design.table import design_table
 from torchmask.design.tolerance import machining_tolerance
 from torchmask.design.turbulent import TurbulentMSE
 from torchmask.grid import Grid
@@ -66,16 +70,40 @@ def test_metrics_are_of_the_detector_and_of_the_workshop(folder):
     assert metrics["hole_over_r0"] == pytest.approx(math.sqrt(0.1 / 4) / 0.5, rel=1e-12)
 
 
-def test_the_error_does_not_depend_on_the_frequencies_but_by_sampling():
-    """Counted on the grid, the noise of 5 electrons would be 16 times as large at four times the frequencies."""
-    mask = SparseAperture([[0.0, 0.4], [0.3, -0.2], [-0.3, -0.2]], 0.2, 1.0)
-    values = []
-    for n_frequencies in (128, 512):
-        grid = Grid.nyquist(1.0, 550e-9, n_frequencies)
-        noise = NoisePSD(1e5, 5.0, 128**2)
-        criterion = AsymptoticMSE(grid, PowerLawPSD(1.5, 1e5), noise, 20)
-        values.append(float(criterion.relative(mask)))
-    assert values[0] == pytest.approx(values[1], rel=0.01)
+@pytest.mark.parametrize("module", [design, rank, table])
+def test_the_error_does_not_depend_on_the_frequencies_but_by_sampling(module, tmp_path, monkeypatch):
+    """Counted on their grid, the noise of 5 electrons would be 64 times as large at 512 as at 64.
+
+    The sampling error of a mean of the same smooth kind is that of the object's PSD; a ratio has it twice.
+    """
+    mask, values, means = SparseAperture.from_catalog("golay9", 1.0, 0.15), {}, {}
+    for n_frequencies in (64, 128, 512):
+        criterion = criterion_of(module, n_frequencies, tmp_path, monkeypatch)
+        values[n_frequencies], means[n_frequencies] = float(criterion.relative(mask)), criterion.object_psd.mean()
+    for coarse in (64, 128):
+        error = abs(float(means[coarse] / means[512]) - 1)
+        assert error < 0.01
+        assert values[coarse] == pytest.approx(values[512], rel=2 * error)
+
+
+def criterion_of(module, n_frequencies, folder, monkeypatch):
+    """The criterion of a command for 1e5 photons and 5 electrons, on a grid."""
+    noise = {"readout_noise": 5.0, "n_pixels": 128}
+    if module is not table:
+        options = module.Options(n_photons=1e5, **noise)
+        return options.observation(n_frequencies, 1.5, 1 / 64, 0.15).criterion()
+    used = []
+
+    def note(criterion, *_, **__):
+        used.append(criterion)
+        raise Infeasible("only its criterion is asked for")
+
+    monkeypatch.setattr("torchmask.design.table.search_mask", note)
+    space = DesignSpace(
+        n_subapertures=(9,), n_photons=(1e5,), n_frequencies=n_frequencies, diameter_over_r0=(), **noise
+    )
+    design_table(space, folder, n_workers=1)
+    return used[-1]
 
 
 @pytest.mark.parametrize(("r0", "enough"), [(0.05, 60), (0.1, 15)])

@@ -21,7 +21,7 @@ TINY = [
     "--n-subapertures",
     "3",
     "5",
-    "--n-pixels",
+    "--n-frequencies",
     "32",
     "--n-frames",
     "2",
@@ -54,7 +54,7 @@ def test_rows_are_written_and_not_computed_twice(tmp_path, capsys):
 
 def test_under_turbulence_the_error_is_that_criterion_and_the_sky_grows_with_the_area(tmp_path):
     space = DesignSpace(
-        n_subapertures=(3,), fill_factor=(0.06,), n_pixels=32, n_frames=(4,), diameter_over_r0=(5.0,), budget=20,
+        n_subapertures=(3,), fill_factor=(0.06,), n_frequencies=32, n_frames=(4,), diameter_over_r0=(5.0,), budget=20,
         method="cma", n_photons=(1e5,), readout_noise=2.0,
     )  # fmt: skip
     conditions = ExposureConditions(pixel_fill_factor=1.0, sky=5.0)
@@ -64,7 +64,7 @@ def test_under_turbulence_the_error_is_that_criterion_and_the_sky_grows_with_the
     criterion = TurbulentMSE(
         space.grid,
         PowerLawPSD(1.5, light),
-        NoisePSD(light, 2.0),
+        NoisePSD(light, 2.0, 128**2),
         4,
         **conditions.with_light(0.06 / 0.15).keywords(0.2, 20.0),
     )
@@ -74,14 +74,14 @@ def test_under_turbulence_the_error_is_that_criterion_and_the_sky_grows_with_the
 
 
 def test_conditions_that_cannot_be_are_refused_before_any_work(tmp_path):
-    space = DesignSpace(n_subapertures=(3,), n_pixels=32, diameter_over_r0=(3.0,))
+    space = DesignSpace(n_subapertures=(3,), n_frequencies=32, diameter_over_r0=(3.0,))
     for conditions, said in (
         (ExposureConditions(exposure=1e-3), "without wind"),
         (ExposureConditions(sky=-1.0), "sky"),
     ):
         with pytest.raises(ValueError, match=said):
             design_table(space, tmp_path / "table", conditions=conditions, n_workers=1)
-    still = DesignSpace(n_subapertures=(3,), n_pixels=32, diameter_over_r0=())
+    still = DesignSpace(n_subapertures=(3,), n_frequencies=32, diameter_over_r0=())
     with pytest.raises(ValueError, match="need turbulence"):
         design_table(still, tmp_path / "table", conditions=ExposureConditions(), n_workers=1)
     assert not (tmp_path / "table").exists()
@@ -111,7 +111,7 @@ def test_an_instrument_gives_all_but_the_axes(tmp_path, monkeypatch):
     space, conditions = asked["space"], asked["conditions"]
     assert (space.fill_factor, space.n_frames, space.diameter_over_r0) == ((0.05, 0.1), (2,), (pytest.approx(4.0),))
     assert (space.mask_diameter, space.outer_scale, space.central_obstruction) == (1.2, 30.0, 0.2)
-    assert space.grid == known.grid()
+    assert (space.n_pixels, space.readout_noise, space.grid) == (24, 2.5, known.grid(256))
     area = float(SparseAperture.from_catalog("golay6", 1.2, 0.15).area)
     assert space.n_photons[0] == pytest.approx(known.photons(area), rel=1e-12)
     assert conditions.sky == pytest.approx(known.sky(area), rel=1e-12)

@@ -21,7 +21,9 @@ from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.otf import analytic_otf
 from torchmask.spectra import NoisePSD, PowerLawPSD
 
-SMALL = DesignSpace(n_subapertures=(3, 5), n_pixels=32, n_frames=(2,), n_draws=2, diameter_over_r0=(3.0,), budget=64)
+SMALL = DesignSpace(
+    n_subapertures=(3, 5), n_frequencies=32, n_frames=(2,), n_draws=2, diameter_over_r0=(3.0,), budget=64
+)
 
 
 @pytest.fixture(scope="module")
@@ -47,12 +49,12 @@ def test_photons_grow_with_the_collecting_area():
 
 def test_errors_are_those_of_the_mask_at_its_own_flux(tmp_path):
     space = replace(SMALL, n_subapertures=(3,), fill_factor=(0.06,), readout_noise=2.0, n_photons=(1e5,), knee=1 / 32)
-    space = replace(space, diameter_over_r0=(), exponent=2.0, n_frames=(7,))
+    space = replace(space, diameter_over_r0=(), exponent=2.0, n_frames=(7,), n_pixels=48)
     table = design_table(space, tmp_path, n_workers=1)
     (row,) = table.rows
     photons = 1e5 * 0.06 / 0.15
     grid = Grid.nyquist(1.0, 550e-9, 32)
-    criterion = AsymptoticMSE(grid, PowerLawPSD(2.0, photons, 1 / 32), NoisePSD(photons, 2.0), 7)
+    criterion = AsymptoticMSE(grid, PowerLawPSD(2.0, photons, 1 / 32), NoisePSD(photons, 2.0, 48**2), 7)
     mask = table.aperture(row)
     floor = criterion.floor(1.0) / criterion.object_psd.mean()
     assert row.relative_mse == pytest.approx(float(criterion.relative(mask)), rel=1e-12)
@@ -110,8 +112,8 @@ def test_a_space_without_any_design_is_refused_before_any_work(tmp_path):
 def test_holes_too_small_to_sample_are_rows_that_say_so():
     space = replace(SMALL, n_subapertures=(3,), fill_factor=(1e-4,), diameter_over_r0=(1.0,))
     (row,) = space.designs()
-    assert row.infeasible == "a hole spans less than 2 samples of the pupil: n_pixels must be at least 693"
-    (row,) = replace(space, n_pixels=693).designs()
+    assert row.infeasible == "a hole spans less than 2 samples of the pupil: n_frequencies must be at least 693"
+    (row,) = replace(space, n_frequencies=693).designs()
     assert row.infeasible is None
 
 
@@ -123,6 +125,7 @@ def trial(**change):
         "mask_diameter": 1.0,
         "wavelength": 550e-9,
         "n_pixels": 64,
+        "n_frequencies": 64,
         "pixel_scale": 275e-9,
         "oversampling": 8,
         "exponent": 1.5,
@@ -265,7 +268,8 @@ def test_two_workers_give_the_numbers_of_one(tmp_path, small):
         ({"n_draws": 1}, r"n_draws is 1: a standard error needs at least 2"),
         ({"method": "anneal"}, r"method is 'anneal': known methods are hybrid, cma"),
         ({"budget": 0}, r"budget is 0"),
-        ({"n_pixels": 1}, r"n_pixels"),
+        ({"n_frequencies": 1}, r"n_pixels"),
+        ({"n_pixels": 0}, r"n_pixels is 0"),
     ],
 )
 def test_a_space_that_makes_no_sense_is_refused(change, message):

@@ -14,7 +14,7 @@ from torchmask.grid import Grid
 from torchmask.optics.packing import hole_diameter
 
 AXES = ("n_subapertures", "fill_factor", "n_photons", "n_frames", "diameter_over_r0", "seed")
-_WHOLE = ("n_subapertures", "n_frames", "seed", "n_pixels", "n_draws")
+_WHOLE = ("n_subapertures", "n_frames", "seed", "n_pixels", "n_frequencies", "n_draws")
 _SAMPLES = 512  # minimum across the pupil raster for turbulence, where the sampled OTF biases the error by 0.1 %
 _MAY_BE_ZERO = ("seed", "exponent", "readout_noise")
 _NOT_NUMBERS = ("method", "budget", "pixel_scale", *(field.name for field in fields(MaskRules)))
@@ -49,8 +49,10 @@ class DesignSpace(MaskRules):
     """Diameter of the mask, D [m]."""
     wavelength: float = 550e-9
     """Wavelength of the observation [m]."""
-    n_pixels: int = 256
-    """Number of pixels per side of the image."""
+    n_pixels: int = 128
+    """Pixels per side of the detector's field, which sets the total read-out noise; the criterion has its own grid."""
+    n_frequencies: int = 256
+    """Frequencies per side of the criterion's grid."""
     pixel_scale: float | None = None
     """Angle on the sky of one pixel [rad]; None: the largest without aliasing for D, at the wavelength."""
     exponent: float = 1.5
@@ -86,15 +88,15 @@ class DesignSpace(MaskRules):
 
     @property
     def grid(self) -> Grid:
-        """Grid of the image."""
+        """Grid of the criterion's frequencies."""
         if self.pixel_scale is None:
-            return Grid.nyquist(self.mask_diameter, self.wavelength, self.n_pixels)
-        return Grid(self.n_pixels, self.pixel_scale, self.wavelength)
+            return Grid.nyquist(self.mask_diameter, self.wavelength, self.n_frequencies)
+        return Grid(self.n_frequencies, self.pixel_scale, self.wavelength)
 
     @property
     def oversampling(self) -> int:
         """Oversampling of the pupil under turbulence, which limits errors of the sampled OTF."""
-        return math.ceil(_SAMPLES / self.n_pixels)
+        return math.ceil(_SAMPLES / self.n_frequencies)
 
     def designs(self) -> Iterator[Design]:
         """Yield the rows of the table before anything is computed; those that cannot be built say why."""
@@ -126,9 +128,9 @@ class DesignSpace(MaskRules):
             over = strength * math.sqrt(fill_factor / n)
             return f"d/r0 is {over:.3g}, above {self.max_hole_over_r0:g}: fill_factor must be at most {largest:.4g}"
         relative = self.mask_diameter * math.sqrt(fill_factor / n) / self.grid.period  # of the width of the raster
-        if relative * self.n_pixels * self.oversampling < 2:
+        if relative * self.n_frequencies * self.oversampling < 2:
             need = math.ceil(2 / relative)
-            return f"a hole spans less than 2 samples of the pupil: n_pixels must be at least {need}"
+            return f"a hole spans less than 2 samples of the pupil: n_frequencies must be at least {need}"
         return None
 
 

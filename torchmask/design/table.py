@@ -124,7 +124,7 @@ def design_table(
     Examples
     --------
     >>> import tempfile
-    >>> space = DesignSpace(n_subapertures=(3, 6), fill_factor=(0.1,), n_pixels=64, n_draws=2, budget=500)
+    >>> space = DesignSpace(n_subapertures=(3, 6), fill_factor=(0.1,), n_frequencies=64, n_draws=2, budget=500)
     >>> table = design_table(space, tempfile.mkdtemp(), n_workers=1)
     >>> [row.n_subapertures for row in table.rows if row.relative_mse < 0.3]
     [6]
@@ -160,7 +160,7 @@ def design_table(
 
 def _scene(space: DesignSpace, row: Design) -> dict[str, Any]:
     """Return the values on which searches and measurements depend besides the mask."""
-    names = ("mask_diameter", "wavelength", "n_pixels", "exponent", "knee", "readout_noise")
+    names = ("mask_diameter", "wavelength", "n_pixels", "n_frequencies", "exponent", "knee", "readout_noise")
     return {name: getattr(space, name) for name in names} | {
         "pixel_scale": space.grid.pixel_scale,
         "photons_per_frame": row.photons_per_frame,
@@ -186,10 +186,10 @@ def _turbulence_task(space: DesignSpace, row: Design) -> dict[str, Any]:
 
 
 def _criterion(task: dict[str, Any]) -> AsymptoticMSE:
-    grid = Grid(task["n_pixels"], task["pixel_scale"], task["wavelength"])
+    grid = Grid(task["n_frequencies"], task["pixel_scale"], task["wavelength"])
     photons = task["photons_per_frame"]
     object_psd = PowerLawPSD(task["exponent"], photons, task["knee"])
-    noise_psd = NoisePSD(photons, task["readout_noise"])
+    noise_psd = NoisePSD(photons, task["readout_noise"], task["n_pixels"] ** 2)
     if "conditions" not in task:
         return AsymptoticMSE(grid, object_psd, noise_psd, task["n_frames"])
     conditions = from_json(ExposureConditions, task["conditions"])
