@@ -16,6 +16,7 @@ from torchmask.atmosphere.seeing import Seeing
 from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.band import Band
+from torchmask.optics.phasor import phasor
 from torchmask.optics.psf import fold
 from torchmask.optics.pupil import PupilSamples
 
@@ -90,7 +91,7 @@ def _covariance(points: Tensor, seeing: Seeing) -> Tensor:
 def _otf(samples: PupilSamples, grid: Grid, phase: Tensor | None = None) -> Tensor:
     """The autocorrelation (..., H, W) of the pupil's samples, 1 at 0 for an ideal pupil."""
     weights = samples.weights.to(torch.complex128)
-    field = (weights if phase is None else weights * torch.polar(torch.ones_like(phase), phase)).flatten(-2)
+    field = (weights if phase is None else weights * phasor(phase)).flatten(-2)
     pupil = torch.zeros(*field.shape[:-1], math.prod(samples.raster), dtype=field.dtype)
     pupil = pupil.scatter_add(-1, samples.index.flatten(-2).expand(field.shape), field).unflatten(-1, samples.raster)
     intensity = torch.fft.fft2(pupil).abs() ** 2 / math.prod(samples.raster)

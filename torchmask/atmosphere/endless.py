@@ -26,6 +26,7 @@ from torch import Tensor
 
 from torchmask.atmosphere.random_field import COMPLEX, folded_density
 from torchmask.atmosphere.von_karman import von_karman_psd
+from torchmask.optics.phasor import phasor
 
 _RATIO = 3.0  # between the lower edges of successive bands
 _STEEPNESS = 8  # exponent of the cuts exp(-x^8)
@@ -161,10 +162,10 @@ class ScreenWindow:
 
             fy, fx = raster.frequencies()
             y, x = (torch.arange(n, **_HOST) * s + lead for n, s, lead in zip(shape, step, raster.lead, strict=True))
-            waves = _phasor(y[:, None] * fy).to(device, COMPLEX[dtype])
+            waves = phasor(2 * math.pi * y[:, None] * fy).to(device, COMPLEX[dtype])
             self.bands.append(LocalBand(raster, raster.amplitude(density).to(device, dtype), waves))
             # The transform stores only fx >= 0, so each fx > 0 counts twice, for -fx too.
-            wave = torch.where(fx > 0, 2, 1)[:, None] * _phasor(fx[:, None] * x)
+            wave = torch.where(fx > 0, 2, 1)[:, None] * phasor(2 * math.pi * fx[:, None] * x)
             columns += [wave.real, -wave.imag]
         self.columns: Tensor = torch.cat(columns).to(device, dtype)
         """Real and imaginary waves that evaluate all bands but the first on the columns of the window."""
@@ -202,7 +203,7 @@ class Screen:
         fine, smooth = None, []
         for number, band in enumerate(self.window.bands):
             tile, offset = band.raster.locate((corner[1], corner[0]))
-            moves = (_phasor(f * o) for f, o in zip(band.raster.frequencies(), offset, strict=True))
+            moves = (phasor(2 * math.pi * f * o) for f, o in zip(band.raster.frequencies(), offset, strict=True))
             to_y, to_x = (move.to(self.window.device, COMPLEX[self.window.dtype]) for move in moves)
             waves = self._waves(number, tile)
             if band.waves is None:
@@ -261,7 +262,3 @@ def _odd_fast(least: int) -> int:
         if rest == 1:
             return number
         number += 2
-
-
-def _phasor(cycles: Tensor) -> Tensor:
-    return torch.polar(torch.ones_like(cycles), 2 * math.pi * cycles)

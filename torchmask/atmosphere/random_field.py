@@ -20,6 +20,7 @@ from scipy.fft import next_fast_len
 from torch import Tensor
 
 from torchmask.atmosphere.von_karman import PSD_CONSTANT, von_karman_psd
+from torchmask.optics.phasor import phasor
 
 _RATIO = 3.0  # between the frequencies of successive bands
 _CUTOFF = 2.0  # lower edge of the first band, in units of 1 / margin
@@ -124,7 +125,10 @@ class RandomField:
         self.amplitudes: list[Tensor] = [(math.sqrt(2) * band.amplitude).to(device, dtype) for band in bands]
         places = [torch.arange(n, **_HOST) * s for n, s in zip(shape, step, strict=True)]
         self.waves: list[tuple[Tensor, Tensor]] = [
-            (_phasor(places[0][:, None] * fy).to(**self.kind), _phasor(fx[:, None] * places[1]).to(**self.kind))
+            (
+                phasor(2 * math.pi * places[0][:, None] * fy).to(**self.kind),
+                phasor(2 * math.pi * fx[:, None] * places[1]).to(**self.kind),
+            )
             for fy, fx, _ in bands[1:]
         ]
 
@@ -144,7 +148,3 @@ class RandomField:
         for c, (wave_y, wave_x) in zip(coefficients[1:], self.waves, strict=True):
             field = field + wave_y @ c @ wave_x
         return field
-
-
-def _phasor(cycles: Tensor) -> Tensor:
-    return torch.polar(torch.ones_like(cycles), 2 * math.pi * cycles)

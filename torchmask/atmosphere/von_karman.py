@@ -16,6 +16,7 @@ import torch
 from scipy import special
 from torch import Tensor
 
+from torchmask.optics.phasor import phasor
 from torchmask.optics.pupil import Aperture
 from torchmask.optics.zernike import aperture_modes, noll
 
@@ -177,8 +178,8 @@ def _gram(aperture: Aperture, n_modes: int, spectrum: _Spectrum, places: Tensor,
         transform = _mode_transforms(points, modes, frequency, n_known, n_angles)  # (R, A, J)
         weight = 2 * math.pi / n_angles * area * spectrum(frequency)
         transform = weight.sqrt()[:, None, None] * transform
-        phasor = _phasor(frequency[:, None, None] * (_directions(n_angles) @ places.T))  # (R, A, N)
-        field = (phasor[..., None] * transform[..., None, :]).flatten(0, 1).flatten(1)  # (R A, N J)
+        shift = phasor(2 * math.pi * frequency[:, None, None] * (_directions(n_angles) @ places.T))  # (R, A, N)
+        field = (shift[..., None] * transform[..., None, :]).flatten(0, 1).flatten(1)  # (R A, N J)
         total += field.real.T @ field.real + field.imag.T @ field.imag
     return total
 
@@ -190,7 +191,8 @@ def _mode_transforms(points: Tensor, modes: Tensor, frequency: Tensor, n_known: 
     `n_known` angles and interpolated to the many that a long baseline needs. For round shapes the azimuthal order of
     the modes is enough.
     """
-    half = _phasor(frequency[:, None, None] * (_directions(n_known) @ points.T)) @ modes.to(torch.complex128)
+    waves = phasor(2 * math.pi * frequency[:, None, None] * (_directions(n_known) @ points.T))  # (R, known, Q)
+    half = waves @ modes.to(torch.complex128)
     series = torch.fft.fft(torch.cat([half, half.conj()], dim=1), dim=1, norm="forward")
     padded = series.new_zeros(len(frequency), 2 * n_angles, modes.shape[-1])
     padded[:, :n_known] = series[:, :n_known]
@@ -213,7 +215,3 @@ def _directions(n_angles: int) -> Tensor:
     """Return unit vectors (A, 2) at uniform angles on half a turn."""
     angle = math.pi / n_angles * torch.arange(n_angles, dtype=torch.float64, device="cpu")
     return torch.stack([angle.cos(), angle.sin()], dim=-1)
-
-
-def _phasor(cycles: Tensor) -> Tensor:
-    return torch.polar(torch.ones_like(cycles), 2 * math.pi * cycles)

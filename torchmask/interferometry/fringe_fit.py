@@ -11,6 +11,7 @@ from torch import Tensor
 from torchmask.grid import Grid
 from torchmask.interferometry.visibilities import fringe_waves, pairs_and_triangles, triangle_sides
 from torchmask.optics.aperture import Aperture
+from torchmask.optics.phasor import phasor
 from torchmask.optics.pixel import PixelResponse
 
 _FIELD = 4  # width of the field for the fringes' envelope, relative to the frames, to avoid wrap-around
@@ -119,7 +120,7 @@ class FringeModel:
         """
         height, width = self.grid.shape
         ramp = -2 * math.pi * (self._nu_x * (x + width // 2) + self._nu_y * (y + height // 2))
-        spectrum = self._transfer * torch.polar(torch.ones_like(ramp), ramp)
+        spectrum = self._transfer * phasor(ramp)
         envelope = torch.fft.ifft2(spectrum).real
         waves = fringe_waves(self.aperture, self.grid, self.pairs)
         if self._seen is None:
@@ -140,7 +141,7 @@ class FringeModel:
         ]
 
         def wave(turns: Tensor) -> Tensor:
-            return torch.polar(torch.ones_like(turns), 2 * math.pi * turns)
+            return phasor(2 * math.pi * turns)
 
         return [(wave(float(v) * places[0]), wave(float(u) * places[1])) for u, v in nu]
 

@@ -16,6 +16,7 @@ from torchmask.interferometry.observables import Observables
 from torchmask.interferometry.visibilities import sky_stations, triangle_sides
 from torchmask.observation import Observation, check_frames
 from torchmask.optics.noise import noise_variance
+from torchmask.optics.phasor import phasor
 from torchmask.optics.pixel import PixelResponse
 
 
@@ -138,7 +139,7 @@ def _triples(fit: FringeFit, model: FringeModel, n_holes: int) -> tuple[Tensor, 
     products = n_holes**3 * (a * b * c - a * bc - b * ac - c * ab + fit.cubes[:, 1:])
     light = fit.light**3 - 3 * fit.light * fit.covariance[:, 0, 0] + fit.cubes[:, 0].real
     triple = products.sum(0) / light.sum()
-    turn = torch.polar(torch.ones_like(triple.abs()), -triple.angle())
+    turn = phasor(-triple.angle())
     noise = _triple_noise(fit, sides, turn, n_holes)
     rest = products * turn - triple.abs() * light[:, None]
     along, across = (

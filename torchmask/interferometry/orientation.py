@@ -12,6 +12,7 @@ from torch import Tensor
 from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture, SparseAperture
 from torchmask.optics.geometry import MaskGeometry
+from torchmask.optics.phasor import phasor
 
 _FINENESS = 4  # oversampling of the frequencies relative to those of the frames
 _TURNS = 181  # number of rotations tried over 180 degrees: the other half looks the same
@@ -148,6 +149,6 @@ def _fringe_power(aperture: SparseAperture, grid: Grid) -> Tensor:
     patch = torch.fft.ifft2(aperture.shape.otf(shift, aperture.subaperture_diameter) ** 2)
     x, y = nu_x * grid.shape[1], nu_y * grid.shape[0]  # whole pixels, in FFT order
     phase = 2 * math.pi / grid.period * aperture.centers.detach().double()
-    waves = [torch.polar(torch.ones_like(angle), angle) for angle in (phase[:, 1:] * y.T, phase[:, :1] * x)]
+    waves = [phasor(angle) for angle in (phase[:, 1:] * y.T, phase[:, :1] * x)]
     pairs = (waves[0].T @ waves[1]).abs() ** 2 - len(phase)
     return torch.fft.fft2(patch * pairs).real

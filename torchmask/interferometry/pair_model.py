@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchmask.interferometry.measurements import Measurements
+from torchmask.optics.phasor import phasor
 
 PARAMETERS = 3  # of a companion: contrast, east and north
 _FAINTEST, _BRIGHTEST = -0.5, 0.98  # range of contrasts of a map; at 1 the derivatives in the contrast vanish
@@ -35,7 +36,7 @@ def pair_visibilities(frequencies: Tensor, companion: Tensor) -> Tensor:
     True
     """
     contrast, turns = companion[..., :1], companion[..., 1:] @ frequencies.T
-    return (1 + contrast * torch.polar(torch.ones_like(turns), -2 * math.pi * turns)) / (1 + contrast)
+    return (1 + contrast * phasor(-2 * math.pi * turns)) / (1 + contrast)
 
 
 class PairResiduals:
@@ -120,7 +121,7 @@ class PairResiduals:
         by_contrast = 2 * (1 - c) * (turns.cos() - 1) / (1 + c) ** 3
         by_turn = -2 * c * turns.sin() / (1 + c) ** 2
         sides = -2 * math.pi * (companion[..., 1:] @ self._sides.T)
-        wave = torch.polar(torch.ones_like(sides), sides)
+        wave = phasor(sides)
         ratio = wave / (1 + c * wave)
         return (by_contrast, 2 * math.pi * by_turn), (ratio.imag, -2 * math.pi * c * ratio.real)
 

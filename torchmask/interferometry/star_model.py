@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.phasor import phasor
 from torchmask.optics.pixel import PixelResponse
 from torchmask.optics.zernike import aperture_modes, noll
 
@@ -91,7 +92,7 @@ class StarModel:
     def kernels(self, matrix: Tensor) -> tuple[Tensor, Tensor]:
         """Return exp(-i k x . A r) for the points of a hole (pixels, Q), and for the centres (pixels, N)."""
         directions = self._wave * self.pixels @ matrix
-        return _phasor(-directions @ self._points.T), _phasor(-directions @ self.centers.T)
+        return phasor(-directions @ self._points.T), phasor(-directions @ self.centers.T)
 
     def image(self, own: Tensor, shared: Shared, kernels: tuple[Tensor, Tensor]) -> Tensor:
         """Return the image of one frame (pixels,) [electrons]."""
@@ -140,7 +141,7 @@ class StarModel:
     def _holes(self, own: Tensor, shared: Shared) -> Tensor:
         """Return the field (N, Q) on the points of every hole, of unit sum without aberrations."""
         phase = own[PLACE:].view(self.n_holes, self.n_modes) @ self._modes.T
-        return (0.5 * shared.log_transmission).exp()[:, None] * self._weights * _phasor(phase)
+        return (0.5 * shared.log_transmission).exp()[:, None] * self._weights * phasor(phase)
 
     def _frequencies(self) -> tuple[Tensor, Tensor]:
         """Return the frequencies nu_y (side, 1) and nu_x (1, side // 2 + 1) of the square [cycles/pixel]."""
@@ -176,7 +177,3 @@ def _sinc_of_square(square: Tensor) -> tuple[Tensor, Tensor]:
         slope = slope + (k * term * square ** (k - 1) if k else 0.0)
         term *= -(math.pi**2) / ((2 * k + 2) * (2 * k + 3))
     return value, slope
-
-
-def _phasor(phase: Tensor) -> Tensor:
-    return torch.polar(torch.ones_like(phase), phase)

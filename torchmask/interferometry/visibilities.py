@@ -14,6 +14,7 @@ from torchmask.interferometry.observables import Observables
 from torchmask.observation import Observation
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.otf import OTF
+from torchmask.optics.phasor import phasor
 from torchmask.optics.zernike import ZernikePhase
 
 _SAMPLES_PER_HOLE = 8
@@ -148,7 +149,7 @@ def fringe_waves(aperture: Aperture, grid: Grid, pairs: Tensor) -> Tensor:
     centers = aperture.centers.detach().double().cpu()
     nu = (centers[pairs[:, 1]] - centers[pairs[:, 0]]) / grid.period
     phase = 2 * math.pi * nu @ pixel_positions(grid).T
-    return torch.polar(torch.ones_like(phase), phase)
+    return phasor(phase)
 
 
 def _transmitted(result: Restored, aperture: Aperture, grid: Grid, pairs: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchmask.grid import Grid
+from torchmask.optics.phasor import phasor
 from torchmask.optics.psf import PSF
 from torchmask.optics.pupil import Aperture
 
@@ -54,7 +55,7 @@ def analytic_otf(aperture: Aperture, grid: Grid, pistons: Tensor | None = None) 
             if pistons is not None:
                 # An image moves by +s for a phase that grows along +x: exp(-2 pi i nu s) at nu = c_m - c_k.
                 delta = pistons[..., k] - pistons[..., m]
-                term = term * torch.polar(torch.ones_like(delta), delta)[..., None, None]
+                term = term * phasor(delta)[..., None, None]
             total = term if total is None else total + term
     assert total is not None
     return total

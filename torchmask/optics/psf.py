@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from torchmask.grid import Grid
+from torchmask.optics.phasor import phasor
 from torchmask.optics.pupil import Aperture, PupilSamples
 
 
@@ -47,7 +48,7 @@ def focal_intensity(samples: PupilSamples, phase: Tensor | None = None) -> Tenso
     if phase is None:
         field = weights.to(torch.complex64 if weights.dtype == torch.float32 else torch.complex128)
     else:
-        field = weights * torch.polar(torch.ones_like(phase), phase)
+        field = weights * phasor(phase)
     field, index = field.flatten(-2), index.expand(field.shape).flatten(-2)
     pupil = torch.zeros(*field.shape[:-1], math.prod(samples.raster), dtype=field.dtype, device=field.device)
     pupil = pupil.scatter_add(-1, index, field).unflatten(-1, samples.raster)
