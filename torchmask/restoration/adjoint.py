@@ -77,10 +77,10 @@ def data_fidelity(
         amplitude = model.amplitude(samples, field)
         transfer = torch.fft.rfft2(intensity(amplitude))
         weight = precision[part] if len(precision) > 1 else precision
-        error = model.window.crop(torch.fft.irfft2(transfer * spectrum, s=shape)) - frames[part]
-        error = -model.background.residual(-error, weight)
-        residual = error * weight
-        value = 0.5 * torch.linalg.vecdot(residual.flatten(1), error.flatten(1)).double()
+        made = model.window.crop(torch.fft.irfft2(transfer * spectrum, s=shape))
+        error = model.background.residual(frames[part] - made, weight)
+        residual = error * -weight
+        value = -0.5 * torch.linalg.vecdot(residual.flatten(1), error.flatten(1)).double()
         if not (want_object or want_aberrations):
             return value, None, None, None
         back = torch.fft.rfft2(residual, s=shape)

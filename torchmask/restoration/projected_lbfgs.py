@@ -81,10 +81,12 @@ class Corrections:
         row = self._order.pop(0) if len(self._order) == self._size else len(self._order)
         self._order.append(row)
         self._theta = energy / curvature
-        for index, vector in ((row, change), (self._size + row, step)):
-            self._pairs[index] = vector
-            for table, seen in ((self._products, vector), (self._free_products, vector * self._free)):
-                table[index] = table[:, index] = self._pairs @ seen
+        rows, vectors = [row, self._size + row], torch.stack([change, step])
+        self._pairs[rows] = vectors
+        # Reading all pairs takes most of the time, so they are read once for both tables.
+        products = (torch.cat([vectors, vectors * self._free]) @ self._pairs.T).split(2)
+        for table, found in zip((self._products, self._free_products), products, strict=True):
+            table[rows], table[:, rows] = found, found.T
 
     def forget(self) -> None:
         """Drop all pairs, so that the approximate Hessian is the identity."""
