@@ -176,8 +176,8 @@ def compare(
     table = {name: sum(values) / len(values) for name, values in each.items()}
     better = sum(a < b for a, b in zip(each["network"], each["Wiener"], strict=True))
     for name, value in table.items():
-        log(f"comparison/{name.replace(' ', '_')}/score", value)
-    log("comparison/improved", better / len(restored))
+        log(f"summary/{name.replace(' ', '_')}/score", value)
+    log("summary/improved", better / len(restored))
     return table | {"improved": better / len(restored)}
 
 

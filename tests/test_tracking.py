@@ -15,7 +15,6 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tensorboard.plugins.custom_scalar.layout_pb2 import Layout
 from tensorboard.plugins.hparams.metadata import parse_session_start_info_plugin_data
 
 from torchmask import tracking
@@ -40,16 +39,10 @@ class Config:
 
 
 def events(folder: Path) -> EventAccumulator:
-    """Everything in the event file of a run, of which there must be one."""
-    assert len(list(folder.rglob("events.out.tfevents*"))) == 1  # a second would be a second run in TensorBoard
+    """Everything in the event file of a run, of which its folder must hold one."""
+    assert len(list(folder.glob("events.out.tfevents*"))) == 1
     accumulator = EventAccumulator(str(folder), size_guidance={"scalars": 0, "images": 0, "tensors": 0})
     return accumulator.Reload()
-
-
-def layout(accumulator: EventAccumulator) -> dict[str, dict[str, list[str]]]:
-    proto = Layout()
-    proto.ParseFromString(accumulator.Tensors("custom_scalars__config__")[-1].tensor_proto.string_val[0])
-    return {c.title: {chart.title: list(chart.multiline.tag) for chart in c.chart} for c in proto.category}
 
 
 def record(step: int, stage: str = "restoration/mask", n_steps: int = 40, **arrays: torch.Tensor) -> Record:
@@ -78,8 +71,8 @@ def test_a_whole_run_is_read_back(tmp_path, dtype):
         log.table("comparison/scores", [{"aperture": "mask", "score": 0.0625}])
 
     read = events(folder)
-    for stage, n in (("design/cma", 5), ("restoration/mask", 40), ("restoration/full", 40)):
-        points = read.Scalars(f"{stage}/cost")
+    for kind, variant, n in (("design", "cma", 5), ("restoration", "mask", 40), ("restoration", "full", 40)):
+        points = events(folder / variant).Scalars(f"{kind}/cost")
         assert [point.step for point in points] == list(range(1, n + 1))
         np.testing.assert_allclose([point.value for point in points], [1 / k for k in range(1, n + 1)], rtol=1e-6)
     assert [(p.step, p.value) for p in read.Scalars("comparison/score_mask")] == [(0, 0.0625)]
@@ -87,13 +80,10 @@ def test_a_whole_run_is_read_back(tmp_path, dtype):
     table = read.Tensors("comparison/scores/text_summary")[0].tensor_proto.string_val[0].decode()
     assert table.splitlines() == ["| aperture | score |", "| --- | --- |", "| mask | 0.0625 |"]
 
-    steps = [image.step for image in read.Images("restoration/mask/object")]
-    assert steps == [1, 6, 11, 16, 21, 26, 31, 36, 40]  # at intervals and at the end
-    assert (read.Images("restoration/mask/object")[0].height, read.Images("restoration/mask/object")[0].width) == (
-        20,
-        24,
-    )
-    assert not [tag for tag in read.Tags()["images"] if "centers" in tag]  # a table of numbers is no image
+    images = events(folder / "mask").Images("restoration/object")
+    assert [image.step for image in images] == [1, 6, 11, 16, 21, 26, 31, 36, 40]  # at intervals and at the end
+    assert (images[0].height, images[0].width) == (20, 24)
+    assert not events(folder / "cma").Tags()["images"]  # a table of numbers is no image
 
     rows = read_metrics(folder)
     assert len(rows) == 5 + 40 + 40 + 1
@@ -117,19 +107,21 @@ def test_a_whole_run_is_read_back(tmp_path, dtype):
     assert torch.from_numpy(state["object"]).dtype == dtype
 
 
-def test_the_layout_groups_the_curves_of_alike_stages(tmp_path):
+def test_alike_stages_are_runs_with_the_same_tags(tmp_path):
     with RunLogger(tmp_path / "run") as log:
-        for stage in ("design/cma", "restoration/mask", "restoration/full"):
-            for step in (1, 2):
-                log(record(step, stage))
-        log.scalar("comparison/score (mask)", 0.1)
-    assert layout(events(tmp_path / "run")) == {
-        "design": {"cost": ["^design/cma/cost$"], "misfit": ["^design/cma/misfit$"]},
-        "restoration": {
-            name: [f"^restoration/mask/{name}$", f"^restoration/full/{name}$"] for name in ("cost", "misfit")
-        },
-        "comparison": {"score (mask)": [r"^comparison/score\ \(mask\)$"]},  # a regular expression
+        for stage in ("restoration/mask", "restoration/full", "design/cma/7 holes", "fit"):
+            log(record(1, stage, object=torch.ones(16, 16)))
+        log.scalar("summary/mask/score", 0.1)
+        log.image("observation/mask/frame", torch.ones(16, 16))
+    curves = ["restoration/cost", "restoration/misfit"]
+    tags = {name: events(tmp_path / "run" / name).Tags() for name in ("", "mask", "full", "cma_7_holes")}
+    assert {name: tag["scalars"] for name, tag in tags.items()} == {
+        "": ["fit/cost", "fit/misfit"],
+        "mask": [*curves, "summary/score"],
+        "full": curves,
+        "cma_7_holes": ["design/cost", "design/misfit"],
     }
+    assert sorted(tags["mask"]["images"]) == ["observation/frame", "restoration/object"]
 
 
 @pytest.mark.parametrize("fails", [False, True])
@@ -174,9 +166,9 @@ def test_an_interrupted_run_is_readable_with_what_was_reached(tmp_path, error, s
     checkpoint = load_npz(tmp_path / "run" / "checkpoints" / "restoration_mask.npz", ["object", "z", "step"])
     assert checkpoint["step"] == 7
     assert np.all(checkpoint["z"] == 7)
-    read = events(tmp_path / "run")
-    assert len(read.Scalars("restoration/mask/cost")) == 7
-    assert read.Images("restoration/mask/object")[-1].step == 7
+    read = events(tmp_path / "run" / "mask")
+    assert len(read.Scalars("restoration/cost")) == 7
+    assert read.Images("restoration/object")[-1].step == 7
 
 
 LOG_FOR_EVER = """
@@ -314,7 +306,7 @@ def test_the_event_file_of_a_default_run_is_small_and_logging_cheap(tmp_path):
             for step in range(1, 1001):
                 log(record(step, stage, 1000, object=noise, z=torch.zeros(20, 11, 6)))
     per_record = (time.process_time() - start) / 2000
-    assert sum(path.stat().st_size for path in (tmp_path / "run").glob("events*")) < 20e6
+    assert sum(path.stat().st_size for path in (tmp_path / "run").rglob("events*")) < 20e6
     assert per_record < 5e-3  # measured: below 1 ms; an iteration of a restoration takes 50
 
 

@@ -3,6 +3,7 @@
 A run folder contains
 
     events.out.tfevents...   scalars, images, figures, text and hyperparameters for TensorBoard
+    VARIANT/events...        curves and images of stages "KIND/VARIANT", as a TensorBoard run of their own
     metrics.jsonl            one JSON object per line: stage, step, n_steps, seconds, scalars
     config.json              configuration of the run
     environment.json         command, seed, versions
@@ -22,6 +23,7 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from types import TracebackType
@@ -67,6 +69,9 @@ class RunLogger:
     images, up to 8 times in a stage and at its end. All arrays are saved as a checkpoint every 5 seconds and at the
     end. `writer` is the SummaryWriter, for anything else that TensorBoard can show.
 
+    TensorBoard gives each run one colour and draws runs together that have the same tags. The stages
+    "restoration/mask" and "restoration/full" therefore become runs `mask` and `full` with the tag "restoration/cost".
+
     Examples
     --------
     >>> import tempfile, torch
@@ -84,8 +89,6 @@ class RunLogger:
 
         self.directory: Path = new_folder(directory)
         self._start = time.monotonic()
-        self._charts: dict[str, dict[str, list[str]]] = {}  # category -> title -> tags
-        self._charted: set[tuple[str, str]] = set()
         self._last: dict[str, Record] = {}
         self._unsaved: set[str] = set()
         self._last_checkpoint = self._start
@@ -93,7 +96,9 @@ class RunLogger:
         self._session_end: Any = None
         self._closed = False
         self._conclusion: dict[str, Any] = {}
-        self.writer: Any = SummaryWriter(str(self.directory), flush_secs=_FLUSH_INTERVAL)
+        self._new_writer = partial(SummaryWriter, flush_secs=_FLUSH_INTERVAL)
+        self.writer: Any = self._new_writer(str(self.directory))
+        self._writers: dict[str, Any] = {"": self.writer}  # of stages KIND/VARIANT, by VARIANT
         self._metrics = open(self.directory / "metrics.jsonl", "x", encoding="utf-8", buffering=1)  # noqa: SIM115
         self._write_status("running")
         environment = _environment(seed)
@@ -129,16 +134,18 @@ class RunLogger:
         self.writer._get_file_writer().add_summary(start)
 
     def scalar(self, tag: str, value: float, step: int = 0) -> None:
-        """Log one number, such as a final score, under the tag "group/name"."""
+        """Log one number under "kind/name" or "kind/variant/name"; "summary/..." stands below the curves."""
         stage, _, name = tag.rpartition("/")
         self._write_scalars(stage or "scalars", step, {name: value})
 
     def image(self, tag: str, image: Any, step: int = 0) -> None:
-        """Log an image (H, W), stretched by `viz.stretch`. Raises ValueError if it has another shape."""
+        """Log an image (H, W), stretched by `viz.stretch`; tags as in `scalar`. Raises ValueError for other shapes."""
         values = as_array(image)
         if values.ndim != 2:
             raise ValueError(f"image {tag} has shape {values.shape}: it must be (rows, columns)")
-        self.writer.add_image(tag, (255 * stretch(values) + 0.5).astype(np.uint8), step, dataformats="HW")
+        stage, _, name = tag.rpartition("/")
+        writer, kind = self._place(stage or "images")
+        writer.add_image(f"{kind}/{name}", (255 * stretch(values) + 0.5).astype(np.uint8), step, dataformats="HW")
 
     def figure(self, name: str, figure: Figure, step: int = 0) -> None:
         """Log a figure and write it to NAME.png in the run folder, replacing an earlier one of that name."""
@@ -182,7 +189,8 @@ class RunLogger:
                 self.writer._get_file_writer().add_summary(self._session_end)
         finally:
             self._metrics.close()
-            self.writer.close()
+            for writer in self._writers.values():
+                writer.close()
             self._write_status(status, error)
 
     def __enter__(self) -> RunLogger:
@@ -203,25 +211,16 @@ class RunLogger:
         seconds = round(time.monotonic() - self._start, 3)
         row = to_json({"stage": stage, "step": step, **more, "seconds": seconds, "scalars": values})
         self._metrics.write(json.dumps(row, allow_nan=False) + "\n")  # line-buffered: on disk at once
+        writer, kind = self._place(stage)
         for name, value in values.items():
-            self.writer.add_scalar(f"{stage}/{name}", value, step)
-        self._add_charts(stage, values)
+            writer.add_scalar(f"{kind}/{name}", value, step)
 
-    def _add_charts(self, stage: str, names: Mapping[str, float]) -> None:
-        """Group curves for CUSTOM SCALARS: a category per kind of stage, in it a chart per scalar of all its stages."""
-        new = [name for name in names if (stage, name) not in self._charted]
-        for name in new:
-            self._charted.add((stage, name))
-            self._charts.setdefault(stage.split("/")[0], {}).setdefault(name, []).append(f"{stage}/{name}")
-        if new:  # TensorBoard shows only the last layout of a run
-            self.writer.add_custom_scalars(
-                {
-                    title: {
-                        name: ["Multiline", [f"^{re.escape(tag)}$" for tag in tags]] for name, tags in charts.items()
-                    }
-                    for title, charts in self._charts.items()
-                }
-            )
+    def _place(self, stage: str) -> tuple[Any, str]:
+        """Return the writer of a stage "KIND/VARIANT", and KIND; without a variant, that of the whole run."""
+        kind, _, variant = stage.partition("/")
+        if variant not in self._writers:
+            self._writers[variant] = self._new_writer(str(self.directory / _file_name(variant)))
+        return self._writers[variant], kind
 
     def _log_images(self, record: Record, every: int) -> None:
         for name, values in record.arrays.items():

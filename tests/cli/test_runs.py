@@ -85,7 +85,7 @@ def test_design_writes_a_mask_that_obeys_and_its_error(runs):
     assert {"mask.svg", "design_mask.png", "design_uv_coverage.png", "design_history.png"} <= {
         path.name for path in folder.iterdir()
     }
-    assert {row["stage"] for row in read_metrics(folder)} == {"design/hybrid", "design/refine", "design"}
+    assert {row["stage"] for row in read_metrics(folder)} == {"design/hybrid", "design/refine", "summary"}
     assert json.loads((folder / "status.json").read_text())["status"] == "finished"
 
 

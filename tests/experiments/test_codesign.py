@@ -28,8 +28,7 @@ FIGURES = [
     "design_mask.png",
     "design_uv_coverage.png",
     *(f"observation_{name}_{what}.png" for name in ("full", "mask") for what in ("frames", "mtf", "psf")),
-    "restoration_full_cost.png",
-    "restoration_mask_cost.png",
+    "restoration_cost.png",
 ]
 
 
@@ -54,18 +53,24 @@ def test_every_result_is_in_the_folder(finished):
         assert result[f"{name}_frames"].shape == (3, 64, 64)
         assert result[f"{name}_object"].min() >= 0
     stages = {row["stage"] for row in read_metrics(finished)}
-    assert {"design/cma", "design/refine", "restoration/mask", "restoration/full", "comparison/mask"} <= stages
+    assert {"design/cma", "design/refine", "restoration/mask", "restoration/full", "summary/mask"} <= stages
 
 
 def test_tensorboard_finds_scalars_and_images(finished):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    events = EventAccumulator(str(finished), size_guidance={"images": 0, "scalars": 0})
-    events.Reload()
-    tags = events.Tags()
-    assert {"restoration/mask/cost", "restoration/full/cost", "comparison/mask/score"} <= set(tags["scalars"])
-    images = {"restoration/mask/object", "figures/design/mask", "figures/design/uv_coverage", "figures/comparison"}
-    assert images | {"observation/mask/first_frame", "figures/observation/full/mtf"} <= set(tags["images"])
+    tags = {}
+    for name in ("", "mask", "full", "cma", "refine"):
+        events = EventAccumulator(str(finished / name), size_guidance={"images": 0, "scalars": 0})
+        tags[name] = events.Reload().Tags()
+    for name in ("mask", "full"):  # the same tags: TensorBoard draws both in one card
+        assert {"restoration/cost", "simulation/kept_light", "summary/score"} <= set(tags[name]["scalars"])
+        assert {"restoration/object", "observation/first_frame"} <= set(tags[name]["images"])
+    assert tags["cma"]["scalars"] == tags["refine"]["scalars"] == ["design/relative_mse"]
+    assert tags[""]["scalars"] == ["summary/relative_mse"]
+    figures = {"figures/design/mask", "figures/design/uv_coverage", "figures/comparison", "figures/restoration/cost"}
+    assert figures | {"figures/observation/full/mtf"} <= set(tags[""]["images"])
+    assert "restoration/cost/text_summary" in tags[""]["tensors"]
 
 
 def test_the_full_pupil_gets_photons_by_its_area_and_reaches_as_far(finished):
@@ -74,7 +79,7 @@ def test_the_full_pupil_gets_photons_by_its_area_and_reaches_as_far(finished):
     separation = np.linalg.norm(result["centers"][:, None] - result["centers"][None], axis=-1).max()
     diameter = float(result["subaperture_diameter"])
     expected = (separation + diameter) ** 2 / (5 * diameter**2)
-    ratio = rows["comparison/full/photons_per_frame"] / rows["comparison/mask/photons_per_frame"]
+    ratio = rows["summary/full/photons_per_frame"] / rows["summary/mask/photons_per_frame"]
     assert ratio == pytest.approx(expected, rel=1e-12)
 
 

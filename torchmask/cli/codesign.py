@@ -17,7 +17,7 @@ from rich.table import Table
 from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.cli.design import search
 from torchmask.cli.options import ExperimentOptions, SearchOptions, require_wavelength
-from torchmask.cli.report import log_design, log_observation
+from torchmask.cli.report import log_cost, log_design, log_observation
 from torchmask.cli.run import Run, new_run
 from torchmask.design.criterion import AsymptoticMSE
 from torchmask.design.search import SearchResult
@@ -37,8 +37,9 @@ from torchmask.restoration.verdict import Verdict
 from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
 from torchmask.spectra import NoisePSD, PowerLawPSD
-from torchmask.viz import figures as viz
 from torchmask.viz.comparison import comparison_figure
+
+LABELS = {"mask": "mask", "full": "full pupil"}  # in figures; in this order, so that each has one colour everywhere
 
 
 @dataclass(frozen=True)
@@ -224,20 +225,22 @@ def codesign(
         "subaperture_diameter": mask.subaperture_diameter,
         "relative_mse": design.relative_mse,
     }
-    pictures, verdicts = {}, dict[str, Verdict | None]()
+    pictures, costs, verdicts = {}, {}, dict[str, Verdict | None]()
     for name, aperture in (("mask", mask), ("full", full)):
         light = scene * (aperture.area / mask.area)
         observation = observe(options, light, aperture, label_stage(callback, name))
         log_observation(f"observation/{name}", observation, logger)
         result = restore(options, observation, label_stage(callback, name))
         verdicts[name] = result.verdict
-        logger.figure(f"restoration/{name}_cost", viz.history_figure({name: result.cost.tolist()}, "cost"))
+        costs[LABELS[name]] = result.cost.tolist()
         table[name] = metrics(observation, result, cutoff)
         for key, value in table[name].items():
-            logger.scalar(f"comparison/{name}/{key}", value)
-        pictures[f"{name}, {table[name]['photons_per_frame']:.1e} photons"] = (observation.frames[0], result.object)
+            logger.scalar(f"summary/{name}/{key}", value)
+        title = f"{LABELS[name]}, {table[name]['photons_per_frame']:.1e} photons"
+        pictures[title] = (observation.frames[0], result.object)
         arrays |= {f"{name}_object": result.object, f"{name}_coefficients": result.coefficients}
         arrays |= {f"{name}_frames": observation.frames}
+    log_cost("restoration/cost", costs, logger)
     logger.figure("comparison", comparison_figure(scene, pictures, cutoff, image_grid(options).pixel_scale))
     logger.table("comparison/table", [{"instrument": name, **row} for name, row in table.items()])
     save_npz(logger.directory / "result.npz", {**arrays, "scene": scene})

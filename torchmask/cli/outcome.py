@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from torchmask.cli.report import restored_figure
+from torchmask.cli.report import log_cost, restored_figure
 from torchmask.data.light import clouded_frames
 from torchmask.data.restored import save_restored
 from torchmask.io import write_json
@@ -14,7 +14,6 @@ from torchmask.metrics import relative_error, ssim
 from torchmask.observation import Observation
 from torchmask.restoration.result import RestorationResult
 from torchmask.tracking import RunLogger
-from torchmask.viz import figures as viz
 from torchmask.viz.comparison import comparison_figure
 
 
@@ -72,14 +71,14 @@ def log_outcome(
             sky=sky,
         ),
     )
-    logger.figure(f"{prefix}cost", viz.history_figure({"restoration": result.cost.tolist()}, "cost"))
+    log_cost(f"{prefix}cost", {"restoration": result.cost.tolist()}, logger)
     if observation.object is not None:
         cutoff = observation.grid.cutoff(observation.aperture.mask_diameter)
         pictures = {"stack": (observation.frames[0], result.object)}
         logger.figure(f"{prefix}comparison", comparison_figure(observation.object, pictures, cutoff, scale, sky))
     for name, value in table.items():
         if name not in ("verdict", "clouded_frames"):
-            logger.scalar(f"comparison/{prefix}restored/{name}", float(value))
+            logger.scalar(f"summary/{prefix}{name}", float(value))
 
 
 def summarise_outcome(result: RestorationResult, table: Mapping[str, Any]) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,6 +22,14 @@ from torchmask.viz import style as drawing
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+COST_STEPS = (
+    "The cost falls within a segment and may step between two:\n"
+    "there noise and turbulence are estimated anew, or candidates change.",
+    "So costs can be compared within a segment only. The first iterations follow several candidates for every frame "
+    "and show their mean; every start of the restoration begins in that way, and its cost leaps up. Frames that lie "
+    "far off are started anew, too.",
+)
+
 
 def log_design(design: SearchResult, grid: Grid, logger: RunLogger, constraints: Sequence[Constraint] = ()) -> None:
     """Draw the mask with the zones it must avoid, its spatial frequencies, and the history of the search."""
@@ -35,7 +43,7 @@ def log_design(design: SearchResult, grid: Grid, logger: RunLogger, constraints:
             {stage: best for stage, best in design.history.items() if len(best)}, "relative MSE", "evaluations"
         ),
     )
-    logger.scalar("design/relative_mse", design.relative_mse)
+    logger.scalar("summary/relative_mse", design.relative_mse)
 
 
 def draw_zones(figure: Figure, constraints: Sequence[Constraint], scale: float) -> None:
@@ -66,6 +74,14 @@ def log_observation(name: str, observation: Observation, logger: RunLogger) -> N
     logger.figure(f"{name}/mtf", viz.mtf_figure(otfs, grid))
     logger.figure(f"{name}/frames", viz.frames_figure(observation.frames, pixel_scale=grid.pixel_scale))
     logger.image(f"{name}/first_frame", observation.frames[0])
+
+
+def log_cost(name: str, curves: Mapping[str, Sequence[float]], logger: RunLogger) -> None:
+    """Draw the cost of restorations at every iteration, and explain its steps in the figure and as text."""
+    figure = viz.history_figure(curves, "cost")
+    figure.axes[0].set_title(COST_STEPS[0], fontsize=8.5)
+    logger.figure(name, figure)
+    logger.text(name, " ".join(COST_STEPS))
 
 
 @drawing.styled
