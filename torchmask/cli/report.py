@@ -23,11 +23,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COST_STEPS = (
-    "The cost falls within a segment and may step between two:\n"
-    "there noise and turbulence are estimated anew, or candidates change.",
-    "So costs can be compared within a segment only. The first iterations follow several candidates for every frame "
-    "and show their mean; every start of the restoration begins in that way, and its cost leaps up. Frames that lie "
-    "far off are started anew, too.",
+    "The cost falls within a segment and steps between two, where noise and\n"
+    "turbulence are estimated anew or candidates change; it leaps at a new start.",
+    "So costs can be compared within a segment only. The first iterations of every start follow several candidates for "
+    "each frame, and show their mean.",
 )
 
 
