@@ -76,7 +76,7 @@ def with_presets(options: Options) -> Options:
         options = dataclasses.replace(options, **whole)
     if options.smoke:
         tiny: dict[str, Any] = {"photons": (1e5, 1e6), "d_over_r0": (3.0,), "seeds": (0, 1), "views": 1, "n_frames": 2}
-        tiny |= {"n_pixels": 48, "iterations": 8, "n_subapertures": 5, "budget": 200}
+        tiny |= {"n_pixels": 32, "iterations": 8, "n_subapertures": 4, "budget": 100}
         options = dataclasses.replace(options, **tiny)
     return options
 

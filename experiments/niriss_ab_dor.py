@@ -249,11 +249,11 @@ def run(options: Options) -> None:
     """Analyse both stars in a new folder."""
     if options.smoke:
         options = dataclasses.replace(
-            options, crop=32, n_wavelengths=1, static_modes=3, radius=12.0, max_iterations=20, n_injections=2, step=0.1
+            options, crop=32, n_wavelengths=1, static_modes=3, radius=12.0, max_iterations=20, n_injections=1, step=0.1
         )
     stars = {name: read(options.data, name, options.crop) for name in (options.target, options.calibrator)}
     if options.smoke:
-        stars = {name: (exposures[:3], grid) for name, (exposures, grid) in stars.items()}
+        stars = {name: (exposures[:2], grid) for name, (exposures, grid) in stars.items()}
     with new_run("niriss_ab_dor", options) as output:
         results = analyse(options, stars, output)
         lines = findings(options.target, options.calibrator, results)

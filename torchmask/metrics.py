@@ -82,7 +82,7 @@ def shift_transfer(shape: Sequence[int], offset: Tensor) -> Tensor:
         raise ValueError(f"offset has shape {tuple(offset.shape)}: its last axis must be (dy, dx), in pixels")
     nu_y, nu_x = _frequencies(shape, offset.dtype, offset.device)
     angle = -2 * math.pi * (nu_y * offset[..., 0, None, None] + nu_x * offset[..., 1, None, None])
-    return torch.polar(torch.ones_like(angle), angle)
+    return torch.complex(angle.cos(), angle.sin())  # torch.polar takes four times as long
 
 
 def align(estimate: Any, truth: Any, cutoff: float) -> Tensor:

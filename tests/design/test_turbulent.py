@@ -53,7 +53,7 @@ def some_frequencies(mask, grid, count, lowest):
     [
         (6, 0.4, math.inf, 0.0, 0.0, "disc"),
         (6, 1.5, 5.0, 0.0, 0.0, "disc"),
-        pytest.param(11, 0.8, 20.0, 1.0, (8.0, 6.0), "disc", marks=pytest.mark.slow),
+        pytest.param(7, 0.8, 20.0, 1.0, (8.0, 6.0), "disc", marks=pytest.mark.slow),
         (6, 0.8, math.inf, 2.0, 10.0, "disc"),
         (6, 0.8, math.inf, 0.0, 0.0, "hexagon"),
     ],

@@ -119,23 +119,22 @@ def test_refuses_nonsense():
 
 
 @pytest.mark.slow
-def test_adam_restores_nearly_as_well_as_the_default():
-    """Mean score of three seeds within 1.1 of the default's, with at most 5 times the evaluations.
+def test_adam_restores_about_as_well_as_the_default():
+    """Over 8 seeds its error is 0.926 times the default's, with a standard deviation of 0.11; it takes 4 evaluations
+    for each iteration.
 
-    The learning rate was chosen on another mask, flux and seed. Here the ratio of the mean scores is 1.05 +- 0.02.
+    The mean of two seeds may be off by three of its standard errors, that of the 8 included. The learning rate was
+    chosen on another mask, flux and seed.
     """
-    grid, mask = Grid.nyquist(1.0, 550e-9, 64), SparseAperture.from_catalog("golay6", 1.0, 0.3)
+    grid, mask = Grid.nyquist(1.0, 550e-9, 40), SparseAperture.from_catalog("golay6", 1.0, 0.3)
     scene = make_scene(grid.shape, 1e6, SceneOptions(size=0.5))
-    scores, evaluations = {}, {}
     adam = TorchMinimizer(partial(torch.optim.Adam, lr=1.0), steps=4)
-    for name, options in {"default": {}, "adam": {"minimizer": adam}}.items():
-        method = MyopicDeconvolution(mask, grid, 3, max_iterations=500, **options)
-        results = []
-        for seed in (10, 11, 12):
-            generator = torch.Generator().manual_seed(seed)
-            seen = simulate_observation(scene, mask, grid, TurbulencePhase(0.25, 20.0), Detector(1.5), 4, generator)
-            results.append(method.restore(seen.frames))
-        scores[name] = sum(relative_error(result.object, scene, 0.5) for result in results) / len(results)
-        evaluations[name] = sum(result.n_evaluations for result in results)
-    assert scores["adam"] < 1.1 * scores["default"]
-    assert evaluations["adam"] < 5 * evaluations["default"]
+    methods = [MyopicDeconvolution(mask, grid, 3, max_iterations=300, minimizer=one) for one in (None, adam)]
+    ratios, seeds = [], (10, 11)
+    for seed in seeds:
+        generator = torch.Generator().manual_seed(seed)
+        seen = simulate_observation(scene, mask, grid, TurbulencePhase(0.25, 20.0), Detector(1.5), 3, generator)
+        default, found = (method.restore(seen.frames) for method in methods)
+        ratios.append(relative_error(found.object, scene, 0.5) / relative_error(default.object, scene, 0.5))
+        assert found.n_evaluations < 5 * default.n_evaluations
+    assert sum(ratios) / len(seeds) < 0.926 + 3 * 0.11 * math.sqrt(1 / len(seeds) + 1 / 8)
