@@ -258,9 +258,15 @@ def value_and_gradient(function, aperture, phase):
 
 
 @pytest.mark.filterwarnings("ignore")  # the compiler warns of its own doings
-@pytest.mark.parametrize("backend", ["aot_eager", pytest.param("inductor", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
-    "name", ["PSF", "criterion", pytest.param("criterion under turbulence", marks=pytest.mark.slow)]
+    ("name", "backend"),
+    [
+        ("PSF", "aot_eager"),
+        ("criterion", "aot_eager"),
+        pytest.param("PSF", "inductor", marks=pytest.mark.slow),
+        pytest.param("criterion", "inductor", marks=pytest.mark.slow),
+        pytest.param("criterion under turbulence", "aot_eager", marks=pytest.mark.slow),
+    ],
 )
 def test_compiled_modules_do_what_eager_ones_do(name, backend):
     """Also after an optimiser has moved the holes: nothing of the first call is frozen into the graph."""

@@ -181,7 +181,7 @@ def test_coefficients_scatter_as_said(five_holes):
         z = torch.randn(6, columns.shape[1], dtype=torch.float64, generator=generator)
         true = (z @ columns.T).unflatten(1, (5, 3))
         frames = torch.poisson(model(image, true.flatten(1)).clamp(min=0), generator=generator)
-        result = method.restore(frames, known_object=image[:48, :48], n_samples=30)
+        result = method.restore(frames, known_object=image[:48, :48], n_samples=12)
         error = result.coefficients - true
         error[..., 0] -= error[..., 0].mean(1, keepdim=True)
         pulls.append(float((error / result.coefficients_std).square().mean().sqrt()))
