@@ -374,9 +374,9 @@ def test_refuses_shapes_that_disagree(observation, restored, restoring):
 def test_reference_stacks(name, limit, dtype, shared_stack):
     """One call, nothing known but the instrument.
 
-    The limits of the masks are those measured in float64 plus 2 % for another platform; float32 takes less time. A start
-    of the full pupil ends in another minimum after another rounding: the limit of one, without the mean of three, is a
-    lead of 1.5 over the best peer.
+    The limits of the masks are those measured in float64 plus 2 % for another platform; float32 takes less time. A
+    start of the full pupil ends in another minimum after another rounding: the limit of one, without the mean of three,
+    is a lead of 1.5 over the best peer.
     """
     stack = shared_stack(name)
     method = MyopicDeconvolution(stack.aperture, stack.grid, schedule=Schedule(averaged=1), dtype=dtype)
