@@ -367,14 +367,13 @@ def test_refuses_shapes_that_disagree(observation, restored, restoring):
     ("name", "limit", "dtype"),
     [
         ("skylab_1e7_mask", 0.062, torch.float32),
-        ("mgs_1e6_mask", 0.1385, torch.float32),
         ("skylab_1e7_full", 0.0737, torch.float64),
     ],
 )
 def test_reference_stacks(name, limit, dtype, shared_stack):
     """One call, nothing known but the instrument.
 
-    The limits of the masks are those measured in float64 plus 2 % for another platform; float32 takes less time. A
+    The limit of the mask is that measured in float64 plus 2 % for another platform; float32 takes less time. A
     start of the full pupil ends in another minimum after another rounding: the limit of one, without the mean of three,
     is a lead of 1.5 over the best peer.
     """
