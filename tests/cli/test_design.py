@@ -167,8 +167,9 @@ def test_a_mask_is_searched_under_turbulence(tmp_path):
     grid, noise = Grid.nyquist(1.0, 550e-9, 32), NoisePSD(1e5, 5.0, 48**2)
     seen = {"r0": 0.2, "outer_scale": 20.0, "pixel": SquarePixel(1.0), "sky": 2.0}
     criterion = TurbulentMSE(grid, PowerLawPSD(1.5, 1e5), noise, 20, **seen)
-    found = json.loads((out / "metrics.json").read_text())["relative_mse"]
-    assert found == pytest.approx(float(criterion.relative(load_mask(out / "mask.json"))), rel=1e-6)
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["machining"]["error_of"] == "both"
+    assert metrics["relative_mse"] == pytest.approx(float(criterion.relative(load_mask(out / "mask.json"))), rel=1e-6)
 
 
 def test_options_of_turbulence_are_those_of_the_criterion():

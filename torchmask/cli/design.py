@@ -24,8 +24,7 @@ from torchmask.design.manufacture import least_pixels, save_fits, save_json
 from torchmask.design.redundancy import analyse_redundancy
 from torchmask.design.rules import MaskRules
 from torchmask.design.search import SearchResult, search_mask
-from torchmask.design.tolerance import Kind, machining_tolerance
-from torchmask.design.turbulent import TurbulentMSE
+from torchmask.design.tolerance import machining_tolerance
 from torchmask.instrument.instrument import Instrument
 from torchmask.io import write_json
 from torchmask.optics.aperture import SparseAperture
@@ -136,13 +135,11 @@ def warn_of_wide_holes(options: Options, r0: float) -> None:
 
 
 def machining(criterion: AsymptoticMSE, aperture: SparseAperture, seed: int) -> dict[str, float | str]:
-    """Return the machining tolerance for metrics.json: the rms error [m] of positions and, without turbulence,
-    of the diameter, each value of which would take turbulence tables of its own."""
+    """Return the machining tolerance for metrics.json: the rms error [m] of positions and diameter."""
     generator = torch.Generator().manual_seed(seed)
-    kind: Kind = "position" if isinstance(criterion, TurbulentMSE) else "both"
-    found = machining_tolerance(criterion, aperture, _GROWTH, quantile=_SUCCESS, kind=kind, generator=generator)
+    found = machining_tolerance(criterion, aperture, _GROWTH, quantile=_SUCCESS, generator=generator)
     return {
-        "error_of": kind,
+        "error_of": found.kind,
         "growth_of_mse": _GROWTH,
         "success_probability": _SUCCESS,
         "rms_error_tolerated": found.rms,
