@@ -189,11 +189,11 @@ def machining_tolerance(
         return result.mean() if quantile is None else result.quantile(quantile)
 
     limit = aperture.subaperture_diameter / 10
-    high = limit / 512
+    high = limit / 64
     while measure(high)[0] < growth:
         if high >= limit:
             return MachiningTolerance(math.inf, math.nan, growth, kind, quantile)
-        high *= 2
+        high *= 4
     rms = float(brentq(lambda size: measure(size)[0] - growth, 0, high, xtol=1e-3 * high, rtol=1e-3))  # type: ignore[arg-type]
     slope = (measure(1.02 * rms)[0] - measure(0.98 * rms)[0]) / (0.04 * rms)
     return MachiningTolerance(rms, measure(rms)[1] / abs(slope), growth, kind, quantile)
