@@ -52,7 +52,9 @@ def test_without_a_star_or_a_mask_nothing_is_written(tmp_path, capsys):
     frames = torch.ones(1, 64, 64)
     Observation(frames, TOLD, GRID, 1.0).save(tmp_path / "sky.npz")
     Observation(frames, FullAperture(1.0), GRID, 1.0).save(tmp_path / "full.npz")
-    for file, message in (("sky.npz", "point source"), ("full.npz", "full pupil")):
+    noise = torch.poisson(torch.full((2, 64, 64), 500.0), generator=torch.Generator().manual_seed(0))
+    Observation(noise, TOLD, GRID, 1.0).save(tmp_path / "noise.npz")  # refused after the first fit only
+    for file, message in (("sky.npz", "point source"), ("noise.npz", "point source"), ("full.npz", "full pupil")):
         assert main(["calibrate", str(tmp_path / file), "--out", str(tmp_path / "run")]) == 1
         assert message in capsys.readouterr().err
         assert not (tmp_path / "run").exists()

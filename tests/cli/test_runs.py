@@ -294,7 +294,8 @@ def test_a_cloud_is_told_by_all_that_a_restoration_leaves(runs, tmp_path, capsys
     dataclasses.replace(stack, frames=dim * stack.frames).save(tmp_path / "cloudy.npz")
     run("restore", tmp_path / "cloudy.npz", "--max-iterations", "2", "--out", tmp_path / "run")
     streams = capsys.readouterr()
-    assert "frames [1] have less than half the light of the others, as through a cloud; --skip" in streams.out
+    assert "frames [1] of those restored, counted from 0, have less than half the light" in streams.out
+    assert "frames [1] have less than half the light" in streams.err
     for name in ("metrics.json", "status.json"):
         assert json.loads((tmp_path / "run" / name).read_text())["clouded_frames"] == [1]
     header = fits.getheader(tmp_path / "run/restored.fits")

@@ -20,6 +20,7 @@ from torchmask.restoration.placed import PlacedSamples, moved_centers
 from torchmask.restoration.placement import (
     distance,
     information,
+    is_misplaced,
     largest_magnification,
     misplacement,
     moved,
@@ -121,7 +122,10 @@ def test_what_frames_tell_of_a_misplaced_mask(step, explain):
     objective, state = explain(noise=0.003)
     told, step = objective.model.pupil.aperture, torch.tensor(step, dtype=torch.float64)
     elsewhere = told.replace(moved_centers(told.centers, -step))
-    found = misplacement(objective.with_changes(model=objective.model.through(elsewhere)), state)
+    away = objective.with_changes(model=objective.model.through(elsewhere))
+    found = misplacement(away, state)
+    assert is_misplaced(away, state, Schedule())
+    assert not is_misplaced(away, state, Schedule.plain())  # the published method knows no other mask than the told one
     slopes = slopes_of_frames(objective.model, state.image, state.z)
     deviations = torch.linalg.inv(information(slopes, objective.precision)).diagonal().sqrt()
     assert deviations.max() < 5e-4

@@ -72,6 +72,7 @@ def test_frames_of_noise_alone_are_not_explained():
     assert verdict_on(1.0, 1.0, contrast=noise).finding is Finding.ONLY_NOISE
     assert not verdict_on(1.0, 1.0, contrast=noise).explained
     assert "nothing but noise" in str(verdict_on(1.0, 1.0, contrast=noise))
+    assert "counts as explained" not in str(verdict_on(1.0, 1.0, contrast=noise))
     assert verdict_on(1.0, 1.0, contrast=noise + 0.01).explained
 
 

@@ -225,7 +225,7 @@ def _first_fit(
         own = torch.cat([own[:PLACE], modes.flatten()])
         rows.append(fit_frame(model, frame, weight, own, shared, kernels))
         if callback is not None:
-            callback(Record("calibration", len(rows), len(data), {}))
+            callback(Record("calibration", len(rows), len(data), {}, preparatory=True))
     return evaluate(model, torch.stack(rows), shared)
 
 

@@ -102,7 +102,8 @@ class Schedule:
 
         The noise variance is the given one from the first iteration, transmissions are the mean light of the frames,
         and there is one start: from zero aberrations for a mask, from small random ones for a full pupil, for which
-        zero is a saddle point. The descent restarts every 1000 iterations as long as those lower the cost.
+        zero is a saddle point. The descent restarts every 1000 iterations as long as those lower the cost. The mask
+        lies as told, unless a restoration is asked to refine its geometry.
         """
         return cls(
             segment=1000,
@@ -116,6 +117,7 @@ class Schedule:
             faint=0.0,
             last_modes=0,
             last_iterations=0,
+            misplaced_gain=math.inf,
         )
 
     @property

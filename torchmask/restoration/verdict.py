@@ -67,10 +67,11 @@ class Verdict:
         return self.chi_square - 1
 
     def __str__(self) -> str:
-        allowed = f"up to {self.limit:.4g} counts as explained"
-        if self.phase_error:
-            allowed += f", since modes left out ({self.phase_error:.2g} rad rms) add about {self.model_error:.2g}"
-        numbers = f"chi-square is {self.chi_square:.4g} over {self.degrees_of_freedom} degrees of freedom; {allowed}"
+        numbers = f"chi-square is {self.chi_square:.4g} over {self.degrees_of_freedom} degrees of freedom"
+        if self.finding is not Finding.ONLY_NOISE:  # whose chi-square explains nothing, however small
+            numbers += f"; up to {self.limit:.4g} counts as explained"
+            if self.phase_error:
+                numbers += f", since modes left out ({self.phase_error:.2g} rad rms) add about {self.model_error:.2g}"
         parts = [f"{_listed(self.frames, self.n_frames)} explained"] if self.frames else []
         parts += [f"check {self.check}"] if self.check else []
         return f"{self.finding.value}: {'; '.join([*parts, numbers])}"
