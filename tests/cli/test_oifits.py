@@ -13,6 +13,7 @@ from torchmask.grid import Grid
 from torchmask.interferometry.fringes import frame_observables
 from torchmask.observation import Observation
 from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.pixel import SquarePixel
 
 fits = pytest.importorskip("astropy.io.fits")
 
@@ -35,11 +36,11 @@ def test_the_file_holds_the_observables_of_the_frames(n_stacks, seen, tmp_path, 
     stacks = [tmp_path / f"stack{number}.npz" for number in range(n_stacks)]
     for path in stacks:
         seen.save(path)
-    given = ("--oifits", "--bandwidth", "1e-8", "--workers", "1", "--out", tmp_path / "run")
+    given = ("--oifits", "--bandwidth", "1e-8", "--pixel-fill", "0.8", "--workers", "1", "--out", tmp_path / "run")
     assert restore(*stacks, *given) == NOT_EXPLAINED  # after two iterations
     files = sorted((tmp_path / "run").rglob("*.oifits"))
     assert len(files) == n_stacks
-    expected = frame_observables(seen)
+    expected = frame_observables(seen, SquarePixel(0.8))
     for file in files:
         assert str(file) in capsys.readouterr().out.replace("\n", "") or n_stacks > 1
         with fits.open(file) as hdus:

@@ -14,6 +14,7 @@ from torchmask.interferometry.observables import Observables
 from torchmask.interferometry.oifits import save_oifits
 from torchmask.observation import Observation
 from torchmask.optics.band import filter_of_header
+from torchmask.optics.pixel import PixelResponse
 
 FILE = "frames.oifits"
 
@@ -28,8 +29,12 @@ class OIFITSOptions:
     """Width of the band for the OIFITS file [m]; None: that of the FILTER in the header."""
 
 
-def measure_frames(observation: Observation, options: OIFITSOptions, sky: float = 0.0) -> Observables | None:
+def measure_frames(
+    observation: Observation, options: OIFITSOptions, sky: float = 0.0, pixel: PixelResponse | None = None
+) -> Observables | None:
     """Return the frames' observables, after subtracting a sky [electrons per pixel]; None if --oifits was not given.
+
+    What the detector's pixels take off the fringes is divided out if their response is given.
 
     Raises ValueError if the width of the band is unknown or invalid, or the mask's fringes overlap too much.
     """
@@ -45,7 +50,8 @@ def measure_frames(observation: Observation, options: OIFITSOptions, sky: float 
     readout = observation.readout_noise
     if readout is not None:
         readout = math.hypot(readout, math.sqrt(sky))  # a subtracted sky leaves its noise
-    return frame_observables(dataclasses.replace(observation, frames=observation.frames - sky, readout_noise=readout))
+    dark = dataclasses.replace(observation, frames=observation.frames - sky, readout_noise=readout)
+    return frame_observables(dark, pixel)
 
 
 def write_frames(

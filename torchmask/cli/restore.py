@@ -130,7 +130,7 @@ def restore_one(files: Sequence[Path], options: Options, star: MaskCalibration |
     if checkpoint is not None and not checkpoint.is_file():
         raise ValueError(f"there is no {checkpoint} to resume from: it is first written at the 100th iteration")
     method = deconvolution(observation, options)
-    observables = measure_frames(observation, options, known_sky(options))
+    observables = measure_frames(observation, options, known_sky(options), pixel_response(options.pixel_fill))
     with new_run("restore", options) as output:
         output.summary.extend(write_frames(output.directory, observables, observation, options))
         state = output.directory / CHECKPOINT
@@ -166,7 +166,8 @@ def restore_several(stacks: Mapping[str, Sequence[Path]], options: Options, star
         try:
             observations[name] = read_calibrated(files, options, star)
             method = deconvolution(observations[name], options)
-            observables[name] = measure_frames(observations[name], options, known_sky(options))
+            pixel = pixel_response(options.pixel_fill)
+            observables[name] = measure_frames(observations[name], options, known_sky(options), pixel)
             methods.append(method)
         except (ValueError, OSError) as error:
             observations.pop(name, None)
