@@ -79,9 +79,9 @@ class StructureFunction:
 
 
 def coherence_distance(r0: float) -> float:
-    """How far [m] a frozen wind carries Kolmogorov turbulence of `r0` [m] until two points have changed by 1 rad rms.
+    """Return how far a frozen wind carries Kolmogorov turbulence of `r0` [m] until it has changed by 1 rad rms [m].
 
-    0.314 r0; over the speed of the wind that is tau0.
+    That is 0.314 r0; divided by the speed of the wind it is tau0.
     """
     return STRUCTURE_CONSTANT ** (-3 / 5) * r0
 

@@ -237,7 +237,8 @@ def load_aperture(options: MaskOptions, telescope: Telescope | None = None) -> A
     try:
         mask = SparseAperture.from_catalog(name, diameter, options.fill_factor, options.mirrored)
     except ValueError as error:
-        raise ValueError(f"--mask {name}: {error}") from error
+        message = str(error).replace("mask_diameter", "--mask-diameter [m]").replace("fill_factor", "--fill-factor")
+        raise ValueError(f"--mask {name}: {message}") from error
     return require_apart(name, mask, options.allow_overlap)
 
 

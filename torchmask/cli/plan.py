@@ -56,7 +56,7 @@ class Options(Instrument, CatalogOptions, InstrumentOptions, RunOptions):
 
 
 def instrument_of(options: Instrument) -> Instrument:
-    """The instrument among the options."""
+    """Return the instrument among the options."""
     return Instrument(**_fields(options))
 
 

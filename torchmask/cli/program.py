@@ -99,7 +99,7 @@ def exit_status(program: str, work: Callable[[], int | None], debug: bool) -> in
 
 @contextmanager
 def _interrupted_by_termination() -> Iterator[None]:
-    """SIGTERM interrupts like Ctrl-C while this lasts; only the main thread may ask for that."""
+    """Let SIGTERM interrupt like Ctrl-C; only the main thread may ask for that, so others change nothing."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -111,7 +111,7 @@ def _interrupted_by_termination() -> Iterator[None]:
 
 
 def parse(options: type[T], command: str, argv: Sequence[str], *, prog: str, description: str | None = None) -> T:
-    """The options of a program, by falling priority: `argv`, the file behind --config, the defaults of `options`.
+    """Return the options of a program: those in `argv`, else of the file behind --config, else the defaults.
 
     Without --config the file is that of the run behind --resume, or what the instrument behind --instrument says, for a
     program that has these options.
@@ -141,9 +141,9 @@ def parse(options: type[T], command: str, argv: Sequence[str], *, prog: str, des
 
 @contextmanager
 def _checked_at_the_end(options: type) -> Iterator[None]:
-    """Groups of options check themselves when they are made, which tyro would call wrong usage.
+    """Hold back the first mistake that a group of options finds in itself until all options are parsed.
 
-    So here the first mistake waits until all is parsed.
+    Groups check themselves when they are made, and tyro would call an error then wrong usage.
     """
     mistakes: list[ValueError] = []
     kinds = {kind for group in _groups(options) for kind in group.__mro__ if "__post_init__" in vars(kind)}
@@ -170,7 +170,7 @@ def _checked_at_the_end(options: type) -> Iterator[None]:
 
 
 def _groups(options: type) -> set[Any]:
-    """The dataclasses that `options` is made of, itself among them."""
+    """Return the dataclasses that `options` is made of, itself among them."""
     found = {options}
     for hint in typing.get_type_hints(options).values():
         if dataclasses.is_dataclass(hint):
@@ -179,5 +179,5 @@ def _groups(options: type) -> set[Any]:
 
 
 def _say(program: str, message: str) -> None:
-    """One line on standard error, whatever the message looks like."""
+    """Print a message on standard error, as one line."""
     print(f"{program}: {' '.join(message.split())}", file=sys.stderr)

@@ -44,8 +44,8 @@ def usable_frames(frames: np.ndarray, valid: np.ndarray, skip: Sequence[int] = (
     clouded = kept[find_clouds(frames[kept], valid[kept])]
     if clouded.size:
         warnings.warn(
-            f"frames {clouded.tolist()} have less than half the light of the others, as through a cloud: name them in "
-            "skip to leave them out",
+            f"frames {clouded.tolist()} have less than half the light of the others, as through a cloud: "
+            "`skip` leaves them out",
             stacklevel=3,
         )
     return kept

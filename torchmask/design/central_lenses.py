@@ -45,6 +45,6 @@ class CentralLenses:
         self.table: SplineTable = SplineTable(factors.by_place, longest, geometry.diameter / _STEPS, dtype, device)
 
     def __call__(self, centers: Tensor) -> Tensor:
-        """Twice the sum over pairs of holes (B, P) for masks with `centers` (B, N, 2) [m]."""
+        """Return twice the sum over pairs of holes (B, P) for masks with `centers` (B, N, 2) [m]."""
         i, j = torch.triu_indices(centers.shape[1], centers.shape[1], 1, device=centers.device)
         return 2 * self.table(centers[:, i] - centers[:, j]).sum(1) @ self.maps

@@ -137,7 +137,7 @@ class AsymptoticMSE(nn.Module):
             return (weight * excess).sum((-3, -2, -1))
 
     def _powers(self, aperture: Aperture) -> tuple[Tensor, Tensor]:
-        """E|OTF|^2 and the sum over lenses of the square of what does not fluctuate of it, (..., H // 2 + 1, W)."""
+        """Return E|OTF|^2 and the sum over lenses of the square of its steady part, both (..., H // 2 + 1, W)."""
         geometry, centers = self._geometry(aperture), aperture.centers
         flat = centers.reshape(math.prod(centers.shape[:-2]), *centers.shape[-2:])
         mean, steady = piston_powers(flat, geometry, self.grid.wavelength)

@@ -64,13 +64,13 @@ class FrequencyPlane(NamedTuple):
         return (y * self.size[1])[..., :, None] + x[..., None, :]
 
     def folded(self, plane: Tensor) -> Tensor:
-        """The half-plane (..., pixels) of planes, row by row, columns in FFT order."""
+        """Return the half-plane (..., pixels) of planes, row by row, columns in FFT order."""
         half = plane.new_zeros(*plane.shape[:-1], self.n_half)
         return half.index_add(half.ndim - 1, self.target, plane[..., self.source])
 
 
 def half_plane(geometry: Geometry) -> Tensor:
-    """Baselines (P, 2) [m] of the frequencies nu_y >= 0, row by row, columns in FFT order."""
+    """Return baselines (P, 2) [m] of the frequencies nu_y >= 0, row by row, columns in FFT order."""
     rows, columns = geometry.grid
     nu_y = torch.arange(rows // 2 + 1, dtype=torch.float64) / rows
     nu_x = torch.fft.fftfreq(columns, dtype=torch.float64)

@@ -62,7 +62,7 @@ class LensPairs:
         self.structure: StructureFunction = seeing.structure(4 * longest + 4 * reach)
 
     def far(self, baselines: Tensor) -> Tensor:
-        """A factor (...) that follows exp(-D), the coherence of far lenses, where that is not small."""
+        """Return a factor (...) that follows exp(-D), the coherence of far lenses, where that is not small."""
         return self._far(*baselines.unbind(-1))
 
     def _far(self, x: Tensor, y: Tensor) -> Tensor:
@@ -101,7 +101,7 @@ class LensPairs:
     def _windows(
         self, lenses: Lenses, pairs: Entries, largest: Tensor, between: Tensor, middle: Tensor, step: Tensor
     ) -> Iterator[tuple[Tensor, tuple[Tensor, Tensor, Tensor, int, int]]]:
-        """Pairs by the size of the window beyond which they share nothing: which they are, the windows' first
+        """Yield pairs by the size of the window beyond which they share nothing: which they are, the windows' first
         pixels, and what the parabolas need."""
         rows, columns = lenses.values.shape[-2:]
         if lenses.scale is not None:  # the lenses of a band are as wide as they are
@@ -132,7 +132,7 @@ class LensPairs:
         n_rows: int,
         n_columns: int,
     ) -> tuple[Tensor, Tensor]:
-        """Corner (S, 2) and values (S, rows, columns) of what pairs share, from their coherence at the nodes."""
+        """Return corner (S, 2) and values (S, rows, columns) of what pairs share, from their coherence at the nodes."""
         size = (n_rows, n_columns)
         first = _at_pixels(lenses, pairs.mask, pairs.first, torch.ones_like(pairs.sign), corner, size)
         second = _at_pixels(lenses, pairs.mask, pairs.second, pairs.sign, corner, size)
@@ -140,7 +140,7 @@ class LensPairs:
         return corner, (first * second).sum(1) * _parabola(nodes, start, self.pixel / step, *size)
 
     def _select(self, lenses: Lenses, baselines: Tensor, centers: Tensor) -> tuple[Entries, Tensor]:
-        """The pairs that share something, and about the most that each gives anywhere."""
+        """Return the pairs that share something, and about the most that each gives anywhere."""
         n, count = centers.shape[1], baselines.shape[1]
         upper = torch.ones(count, count, dtype=torch.bool, device=centers.device).triu(1)
         limit, found = (2 * self.geometry.reach) ** 2, []
@@ -172,7 +172,7 @@ class LensPairs:
         return Entries(rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3], rows[:, 4:], slot), largest
 
     def _largest(self, entries: Entries, lenses: Lenses, baselines: Tensor, centers: Tensor) -> Tensor:
-        """About the most that each entry gives anywhere (E,)."""
+        """Return about the most that each entry gives anywhere (E,)."""
         first = baselines[entries.mask, entries.first]
         second = entries.sign[:, None] * baselines[entries.mask, entries.second]
         separation = self._middles(lenses, centers, entries, 0) - self._middles(lenses, centers, entries, 1)
@@ -192,14 +192,16 @@ class LensPairs:
         return torch.where((lens == 0)[:, None], hole, lenses.middle[entries.mask, lens])
 
     def _kernel(self, bx: Tensor, by: Tensor, sx: Tensor, sy: Tensor, square: Tensor | float = 1.0) -> Tensor:
-        """exp(-Q / 2) (...) to the power `square` of the phases' scale."""
+        """Return exp(-Q / 2) (...) to the power `square` of the phases' scale."""
         structure = self.structure.of_square
         crossed = structure((sx + bx) ** 2 + (sy + by) ** 2) + structure((sx - bx) ** 2 + (sy - by) ** 2)
         return torch.exp(square * (crossed / 2 - structure(bx * bx + by * by) - structure(sx * sx + sy * sy)))
 
     def _coherence(self, first: Tensor, second: Tensor, separation: Tensor, step: Tensor, n: int) -> Tensor:
-        """The mean of exp(-Q / 2) over `far` at n x n baselines around that midway, `step` (E, 2) apart, (E, rows,
-        columns)."""
+        """Return the mean of exp(-Q / 2) over `far`, (E, rows, columns), at n x n baselines around that midway.
+
+        The baselines are `step` (E, 2) apart.
+        """
         nodes = torch.arange(n, dtype=first.dtype, device=first.device) - (n - 1) / 2
         middle = (first + second) / 2
         zero = torch.zeros(n, n, dtype=first.dtype, device=first.device)
@@ -227,8 +229,10 @@ class LensPairs:
         return total / (4 * self._far(bx, by))
 
     def _scale(self, middle: Tensor, bx: Tensor, by: Tensor) -> tuple[Tensor | float, Tensor | float]:
-        """The phases of the light at baselines (E, 3, 3) near `middle` (E, 2), over those at the reference wavelength,
-        and their squares."""
+        """Return the phases of the light over those at the reference wavelength, and their squares.
+
+        The baselines (E, 3, 3) lie near `middle` (E, 2).
+        """
         least, largest = self.scales
         if largest == least:
             return least, least**2
@@ -240,8 +244,10 @@ class LensPairs:
         return scale, scale * scale
 
     def _moments(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """xx, xy and yy (...) [m^2] of the lens at the place (x, y): its width shrinks as 1 - r, its height as that of
-        two discs, r the distance over the hole's diameter."""
+        """Return the moments xx, xy and yy (...) [m^2] of the lens at the place (x, y).
+
+        Its width shrinks as 1 - r, its height as that of two discs; r is the distance over the hole's diameter.
+        """
         x, y = x / self.geometry.reach, y / self.geometry.reach
         r = torch.sqrt(x * x + y * y + 1e-4)
         inside = (1 - r).clamp(min=0.03)  # no lens: it has no weight either
@@ -250,8 +256,10 @@ class LensPairs:
 
 
 def _parabola(nodes: Tensor, start: Tensor, step: Tensor, n_rows: int, n_columns: int) -> Tensor:
-    """The values at 3 x 3 nodes (S, y, x) on patches (S, rows, columns) whose first pixel lies at `start` (S, 2) and
-    the others `step` (S, 2) apart, in units of the nodes' distance: a polynomial in row and column."""
+    """Return values at 3 x 3 nodes (S, y, x), interpolated by a polynomial on patches (S, rows, columns).
+
+    The first pixel lies at `start` (S, 2), the others are `step` (S, 2) apart, in units of the nodes' distance.
+    """
     rows = _coefficients(nodes, start[:, 1:], step[:, 1:])  # (S, 3, x)
     both = _coefficients(rows.transpose(1, 2), start[:, :1], step[:, :1])  # (S, 3 of x, 3 of y)
     row, column = (torch.arange(n, dtype=nodes.dtype, device=nodes.device) for n in (n_rows, n_columns))
@@ -271,8 +279,10 @@ def _coefficients(nodes: Tensor, start: Tensor, step: Tensor) -> Tensor:
 def _at_pixels(
     lenses: Lenses, mask: Tensor, lens: Tensor, sign: Tensor, corner: Tensor, size: tuple[int, int]
 ) -> Tensor:
-    """Lenses (S,) on patches of `size` whose first pixel is `corner` (S, 2), (S, modes, rows, columns); turned by half
-    a turn where their sign is -1."""
+    """Return lenses (S,) on patches of `size` whose first pixel is `corner` (S, 2), (S, modes, rows, columns).
+
+    They are turned by half a turn where their sign is -1.
+    """
     n_modes, rows, columns = lenses.values.shape[-3:]
     padded = torch.nn.functional.pad(lenses.values, (1, 1, 1, 1))
     first, own, sign = corner.long(), lenses.corner[mask, lens].long(), sign[:, None]

@@ -117,7 +117,7 @@ class LensPatches:
         return Lenses(values, root, scale, baseline, turns, corner, sign, middle)
 
     def _lens(self, colour: Colour, baseline: Tensor, turns: Tensor) -> tuple[Tensor, Tensor]:
-        """T (B, L, rows, columns) at one wavelength, and the first pixel of the patch (B, L, 2)."""
+        """Return T (B, L, rows, columns) at one wavelength, and the first pixel of the patch (B, L, 2)."""
         place = (baseline + turns) * colour.scale - turns
         corner = (place.detach() - colour.plan.reach).ceil()
         values = colour.splines.weights(corner - place) @ colour.slices
@@ -125,7 +125,7 @@ class LensPatches:
         return values.unflatten(-1, (len(colour.plan.row), len(colour.plan.column))), corner
 
     def _merged(self, baseline: Tensor, turns: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Values, root, scale and corner of the lenses of all wavelengths together."""
+        """Return values, root, scale and corner of the lenses of all wavelengths together."""
         lenses = [self._lens(colour, baseline, turns) for colour in self.colours]
         corners = torch.stack([corner for _, corner in lenses])
         ends = torch.stack([corner + corner.new_tensor(lens.shape[:1:-1]) for lens, corner in lenses])
@@ -153,6 +153,6 @@ class LensPatches:
 
 
 def _pairs(n: int, device: torch.device) -> Tensor:
-    """The holes (2, L) of each lens: one with itself, which stands for all such, and then all pairs."""
+    """Return the holes (2, L) of each lens: one with itself, which stands for all such, and then all pairs."""
     zero = torch.zeros(2, 1, dtype=torch.long, device=device)
     return torch.cat([zero, torch.triu_indices(n, n, 1, device=device)], 1)

@@ -65,7 +65,7 @@ class MaskTransfer:
         self.far: Tensor = self.pairs.far(self.plane.baselines.to(device)).to(dtype)
 
     def __call__(self, centers: Tensor) -> Tensor:
-        """N^2 E|OTF|^2 (B, H // 2 + 1, W) of masks with `centers` (B, N, 2) [m]."""
+        """Return N^2 E|OTF|^2 (B, H // 2 + 1, W) of masks with `centers` (B, N, 2) [m]."""
         n = centers.shape[1]
         pixels = (1 + n * (n - 1) // 2) * self.patches.n_pixels * self.patches.n_layers
         parts = [self._transfer(chunk) for chunk in centers.split(max(1, _CHUNK // pixels))]
@@ -87,7 +87,7 @@ class MaskTransfer:
         return total
 
     def steady(self, centers: Tensor) -> Tensor:
-        """N^4 times the sum over lenses of the square of what of |OTF|^2 does not fluctuate (B, H // 2 + 1, W)."""
+        """Return N^4 times the sum over lenses of the square of the steady part of |OTF|^2 (B, H // 2 + 1, W)."""
         found = []
         for mask in centers.split(1):
             lenses = self.patches(mask)
@@ -100,7 +100,7 @@ class MaskTransfer:
         return self._coherence(steady=True)(self.plane.baselines).to(self.factors)
 
     def _parts(self, lenses: Lenses, power: Tensor) -> Tensor:
-        """What lenses give with themselves, in parts of which each has a factor (B, parts, L, rows, columns)."""
+        """Return what lenses give with themselves, in parts that have a factor each (B, parts, L, rows, columns)."""
         places = self._places(lenses, *lenses.root.shape[-2:])
         return torch.stack([power * function for function in lens_functions(lenses.root, *places)], 1)
 

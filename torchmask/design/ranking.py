@@ -199,7 +199,7 @@ def rank_masks(
 def _lay_out(
     patterns: Sequence[Pattern], mask_diameter: float, fill_factor: float, rules: MaskRules, allow_overlap: bool
 ) -> tuple[list[tuple[str, Layout, SparseAperture]], dict[str, str]]:
-    """The masks that can be ranked, and why the others cannot."""
+    """Return the masks that can be ranked, and why the others cannot."""
     masks, left_out, constraints = [], {}, rules.constraints()
     for pattern in patterns:
         built = pattern.scaled(mask_diameter)

@@ -118,7 +118,7 @@ class _Trials:
         self.rounds = 0
 
     def tell(self, shortfall: float) -> None:
-        """One round of one trial is done; `shortfall` in mask diameters."""
+        """Count one more round of a trial, and report it; `shortfall` is in mask diameters."""
         self.rounds += 1
         if self.callback is not None:
             first = self.rounds <= _ROUNDS

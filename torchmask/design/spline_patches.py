@@ -42,7 +42,7 @@ class SplinePatches:
         return axes[0], axes[1]
 
     def slices(self, values: Tensor) -> Tensor:
-        """The matrix (slices, R rows columns) of functions known on the lattice, `values` (R, Y, X)."""
+        """Return the matrix (slices, R rows columns) of functions known on the lattice, `values` (R, Y, X)."""
         coefficients = torch.stack([torch.from_numpy(spline_filter(one.numpy(), order=3)) for one in values])
         # no spline reaches beyond the support: pixels there are in a patch or not, as its offset is
         for axis, nodes, reach in zip((-1, -2), self.lattice(), self.reach, strict=True):
@@ -69,7 +69,7 @@ class SplinePatches:
 
 
 def cubic_basis(t: Tensor) -> Tensor:
-    """The four cubic B-splines that are not zero at t in [0, 1] of a step, (..., 4)."""
+    """Return the four cubic B-splines that are not zero at t in [0, 1] of a step, (..., 4)."""
     rest = 1 - t
     inner = (4 - 6 * t**2 + 3 * t**3) / 6
     return torch.stack([rest**3 / 6, inner, (4 - 6 * rest**2 + 3 * rest**3) / 6, t**3 / 6], -1)

@@ -51,7 +51,7 @@ class TurbulentMSE(AsymptoticMSE):
     wind : float or (float, float)
         Its speed [m/s], all directions being equally likely, or its velocity (vx, vy).
     pixel : PixelResponse, optional
-        Of the detector, such as `SquarePixel()`; None for pixels that are points.
+        Response of the detector's pixels, such as `SquarePixel()`; None for pixels that are points.
     wavelengths, weights : sequence of float, optional
         Of a broad band [m] and the share of the light at each (None: equal), such as those of `Band.top_hat`; without
         them, all light has the wavelength of the grid, to which r0 belongs in any case. Seven do for a width of 20 %.
@@ -155,7 +155,7 @@ class TurbulentMSE(AsymptoticMSE):
         return (weight / (power[..., None, :, :] + ratio)).sum((-3, -2, -1))
 
     def expected_power(self, aperture: Aperture) -> Tensor:
-        """E|OTF|^2 (..., H, W) in FFT order, 1 at zero frequency, of everything but the pixels.
+        """Return E|OTF|^2 (..., H, W) in FFT order, 1 at zero frequency, of everything but the pixels.
 
         Raises ValueError where r0 is None.
         """
@@ -178,7 +178,7 @@ class TurbulentMSE(AsymptoticMSE):
         return mean, steady.reshape(mean.shape)
 
     def _half_power(self, aperture: Aperture) -> Tensor:
-        """E|OTF|^2 (..., H // 2 + 1, W) at nu_y >= 0."""
+        """Return E|OTF|^2 (..., H // 2 + 1, W) at nu_y >= 0."""
         if not isinstance(aperture, Aperture):
             raise TypeError(f"aperture is a {type(aperture).__name__}: make a SparseAperture of the centres")
         centers = aperture.centers
@@ -209,15 +209,15 @@ class TurbulentMSE(AsymptoticMSE):
         return MaskTransfer(self._geometry(aperture), self.seeing, band, self.grid.wavelength, longest, dtype, device)
 
     def _pupil_power(self, aperture: Aperture) -> Tensor:
-        """E|OTF|^2 of a full pupil (H // 2 + 1, W)."""
+        """Return E|OTF|^2 of a full pupil (H // 2 + 1, W)."""
         return self._between(aperture, mean_square_otf)
 
     def _pupil_steady(self, aperture: Aperture) -> Tensor:
-        """The square of what of |OTF|^2 of a full pupil does not fluctuate (H // 2 + 1, W)."""
+        """Return the square of the steady part of |OTF|^2 of a full pupil (H // 2 + 1, W)."""
         return self._between(aperture, lambda *known: steady_square_otf(*known) ** 2)
 
     def _between(self, aperture: Aperture, function: Callable[..., Tensor]) -> Tensor:
-        """A function of a full pupil, by its integral at some frequencies; over T it is smooth in between.
+        """Return a function of a full pupil, by its integral at some frequencies; over T it is smooth in between.
 
         Thin vanes take as much of it as of T^2.
         """

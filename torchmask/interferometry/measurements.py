@@ -95,7 +95,7 @@ class Measurements(Brief):
         return 1 / float(self._lengths().min())
 
     def _lengths(self) -> Tensor:
-        """Moduli of the spatial frequencies of all baselines [cycles per radian]."""
+        """Return moduli of the spatial frequencies of all baselines [cycles per radian]."""
         every = torch.cat([self.frequencies, self.triangle_frequencies.flatten(0, 1)])
         return torch.linalg.vector_norm(every, dim=1)
 

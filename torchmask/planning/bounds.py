@@ -78,11 +78,11 @@ def myopic_bound(
     n_modes : int
         Zernike modes per sub-aperture, Noll 1 (piston) to this, drawn and to be found.
     r0, outer_scale : float
-        Of the von Karman turbulence, the aberrations' prior, at the wavelength of the grid [m].
+        Fried parameter, at the wavelength of the grid, and outer scale of the turbulence [m], the aberrations' prior.
     oversampling : int
-        Of the pupil.
+        Oversampling of the pupil.
     generator : torch.Generator, optional
-        Of the aberrations.
+        Source of the random aberrations.
 
     Raises
     ------
@@ -128,7 +128,7 @@ def myopic_bound(
 def _otfs_and_slopes(
     aperture: Aperture, grid: Grid, basis: AberrationBasis, z: Tensor, oversampling: int
 ) -> tuple[Tensor, Tensor]:
-    """OTFs (T, H, W) at parameters (T, K), and their derivatives (T, K, H, W)."""
+    """Return OTFs (T, H, W) at parameters (T, K), and their derivatives (T, K, H, W)."""
     otf, phase = OTF(aperture, grid, oversampling), ZernikePhase(aperture, grid, basis.n_modes, oversampling)
 
     def transfer(parameters: Tensor) -> Tensor:
@@ -146,7 +146,7 @@ def _otfs_and_slopes(
 
 
 def _half_plane(grid: Grid) -> Tensor:
-    """Weights (H, W) by which real fields are known from half of their spectrum: 2, 1, or 0 for what repeats it."""
+    """Return the weights (H, W) of a half spectrum of real fields: 2, 1, or 0 for what repeats the other half."""
     rows, columns = grid.shape
     weights = torch.zeros(rows, columns, dtype=torch.float64)
     weights[:, : columns // 2 + 1] = 2.0
@@ -157,14 +157,14 @@ def _half_plane(grid: Grid) -> Tensor:
 
 
 def _columns(spectra: Tensor, weights: Tensor) -> Tensor:
-    """Spectra (..., H, W) of real fields as real vectors (..., L), whose products are those of the spectra."""
+    """Return spectra (..., H, W) of real fields as real vectors (..., L), whose products are those of the spectra."""
     chosen = weights > 0
     flat = spectra[..., chosen] * weights[chosen].sqrt()
     return torch.cat([flat.real, flat.imag], dim=-1)
 
 
 def _common_tilts(aperture: Aperture, grid: Grid, basis: AberrationBasis, n_frames: int, oversampling: int) -> Tensor:
-    """Parameters (T K, 2) that tilt all frames alike, or (T K, 0) where the modes hold no tilt."""
+    """Return parameters (T K, 2) that tilt all frames alike, or (T K, 0) where the modes hold no tilt."""
     samples = aperture.samples(grid, oversampling)
     phase = ZernikePhase(aperture, grid, basis.n_modes, oversampling)
     lit = samples.weights > 0
@@ -177,7 +177,7 @@ def _common_tilts(aperture: Aperture, grid: Grid, basis: AberrationBasis, n_fram
 
 
 def _without(covariance: Tensor, directions: Tensor) -> Tensor:
-    """The covariance once the components along `directions` (n, m) are known."""
+    """Return the covariance once the components along `directions` (n, m) are known."""
     if not directions.shape[1]:
         return covariance
     spread = covariance @ directions

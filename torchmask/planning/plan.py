@@ -38,7 +38,7 @@ def plan_observation(
     seed: int = 0,
     callback: Callback | None = None,
 ) -> ObservationPlan:
-    """The predicted error of an observation over the number of holes, their size and the exposure, and its least point.
+    """Return the predicted error over the number of holes, their size and the exposure, and where it is least.
 
     The error is `TurbulentMSE` with the photons, the sky, the frames and the read-out noise that follow from the
     instrument at each point. It supposes that every transfer function is known; what restorations that had to find the
@@ -63,11 +63,11 @@ def plan_observation(
     constraints : sequence of Constraint
         Rules of the searches; the central obstruction and the vanes of the telescope are among them already.
     n_frequencies : int
-        Of the criterion's grid, per side.
+        Frequencies of the criterion's grid, per side.
     budget : int
         Evaluations of each search.
     seed : int
-        Of the searches.
+        Random seed of the searches.
     callback : callable, optional
         Gets a Record after each search and each point.
 
@@ -145,14 +145,14 @@ def _whole(values: Sequence[int]) -> tuple[int, ...]:
 
 
 def _bands(instrument: Instrument, widths: Sequence[float]) -> list[Instrument]:
-    """The instrument with each band, on one grid: errors on different pixels cannot be compared."""
+    """Return the instrument with each band, on one grid: errors on different pixels cannot be compared."""
     scale = instrument.with_width(max(widths)).pixel_scale / ARCSEC
     known = replace(instrument, camera=replace(instrument.camera, pixel_scale=scale))
     return [known.with_width(width) for width in widths]
 
 
 def _exposed(instrument: Instrument, lengths: Sequence[float], left_out: list[str]) -> list[Instrument]:
-    """The instrument at each exposure for which there is time."""
+    """Return the instrument at each exposure for which there is time."""
     found = []
     for exposure in lengths:
         try:
@@ -176,7 +176,7 @@ def _search(
     left_out: list[str],
     callback: Callback | None,
 ) -> dict[tuple[int, float], Aperture]:
-    """A mask for each number of holes and hole diameter, where one can be built."""
+    """Return a mask for each number of holes and hole diameter, where one can be built."""
     diameter, masks = instrument.telescope.diameter, {}
     for step, (n, hole) in enumerate(points, 1):
         fill, most = n * (hole / diameter) ** 2, largest_fill_factor(n)
@@ -203,7 +203,7 @@ def _measure(
     n_frequencies: int,
     callback: Callback | None,
 ) -> list[Choice]:
-    """The predicted error at every point; masks with holes of one size share what is known of the turbulence."""
+    """Return the predicted error at every point; masks with holes of one size share what is known of the turbulence."""
     choices, n_steps, measured = [], len(exposed) * len(masks), success_map()
     for instrument in exposed:
         criterion = None

@@ -91,7 +91,7 @@ class ObservationPlan:
         return self.masks[self.best.n_subapertures, self.best.hole_diameter]
 
     def axis(self, name: str) -> list[Choice]:
-        """The points that differ from the best one in `name` alone, in order."""
+        """Return the points that differ from the best one in `name` alone, in order."""
         others = [other for other in AXES if other != name]
         best = self.best
         line = [c for c in self.choices if all(getattr(c, other) == getattr(best, other) for other in others)]
@@ -104,7 +104,7 @@ class ObservationPlan:
         return found if best.width in (None, found.width) else found.with_width(best.width)
 
     def at_edge(self, name: str) -> bool:
-        """Whether the best point is the first or last along an axis, so that the optimum may lie beyond."""
+        """Return whether the best point is the first or last along an axis, so that the optimum may lie beyond."""
         line = self.axis(name)
         return len(line) > 1 and getattr(self.best, name) in (getattr(line[0], name), getattr(line[-1], name))
 

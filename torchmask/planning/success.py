@@ -43,7 +43,7 @@ class BlindOutlook:
     outside: tuple[str, ...] = ()
 
     def mse(self, relative_mse: float, above_floor: float) -> float:
-        """What a relative error predicted for known PSFs becomes, of which a mask can avoid `above_floor`.
+        """Return what a relative error predicted for known PSFs becomes, of which a mask can avoid `above_floor`.
 
         That part grows by the square of the cost, where it is above 1: a score is an amplitude. No more than 1 is
         returned, the error of knowing nothing.
@@ -91,7 +91,7 @@ class SuccessMap:
             raise ValueError("each cell needs at least one restoration, no more successes than those, a positive cost")
 
     def outlook(self, d_over_r0: float, n_photons: float, n_frames: float) -> BlindOutlook:
-        """Chance and cost at one point.
+        """Return chance and cost at one point.
 
         Between the lattice's points the chance is linear and the cost geometric, in the logarithms of photons and
         frames and in d / r0, so that at its points they are what was measured and between two of them they lie between
@@ -153,7 +153,7 @@ def success_map() -> SuccessMap:
 
 
 def _interpolate(table: np.ndarray, places: Sequence[float]) -> float:
-    """The multilinear interpolation of a table at fractional indices inside it."""
+    """Return the multilinear interpolation of a table at fractional indices inside it."""
     for place in places:
         first = min(int(place), len(table) - 2)
         table = table[first] + (place - first) * (table[first + 1] - table[first])

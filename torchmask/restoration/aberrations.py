@@ -89,7 +89,7 @@ class AberrationBasis(nn.Module):
         return AberrationBasis(mixing, self.n_modes, self.n_common, moving)
 
     def coefficients(self, z: Tensor) -> Tensor:
-        """Zernike coefficients (..., N, J) [rad rms] of the parameters (..., K), in the middle of the frame."""
+        """Return Zernike coefficients (..., N, J) [rad rms] of the parameters (..., K), in the middle of the frame."""
         return (z @ self.mixing.to(z).T).unflatten(-1, (self.n_subapertures, self.n_modes))
 
     def change(self, z: Tensor) -> Tensor | None:
@@ -230,7 +230,7 @@ def estimated_basis(aperture: Aperture, n_modes: int, covariance: Tensor) -> Abe
 
 
 def whitening(aperture: Aperture, n_modes: int, r0: float, outer_scale: float, drift: float | None = None) -> Tensor:
-    """L (N J, K) with L L^T the von Karman covariance of all modes, less the piston common to all sub-apertures.
+    """Return L (N J, K) with L L^T the von Karman covariance of all modes, less the piston common to all sub-apertures.
 
     Coefficients a = L z, sub-aperture by sub-aperture, follow von Karman statistics if z is white noise. The mean
     piston cannot be seen; without it K = N J - 1. r0 and outer_scale in m, L in rad. With a `drift` [m] it is the

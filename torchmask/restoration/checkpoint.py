@@ -123,7 +123,7 @@ class Checkpoint:
         settings: Sequence[object],
         known: Sequence[Tensor | None],
     ) -> Checkpoint | None:
-        """The file at `path`, if there is to be one, of a restoration with these settings."""
+        """Return the file at `path`, if there is to be one, of a restoration with these settings."""
         return None if path is None else cls(Path(path), fingerprint_of(objective, settings, known))
 
     def save(self, progress: Progress) -> None:

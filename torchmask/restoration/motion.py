@@ -48,7 +48,7 @@ class Setting:
         return cls(model.pupil.aperture, model.aberrations, moving if is_free else None, finer if is_free else None)
 
     def awaits_motion(self, state: State) -> bool:
-        """Whether the aberrations change during the exposure, and the state does not have the change yet."""
+        """Return whether aberrations change during the exposure, and the state does not have the change yet."""
         return self.moving is not None and state.modes is Modes.STILL
 
     def in_motion(self, state: State, seed: int, change: Tensor | None = None) -> State:

@@ -105,7 +105,7 @@ def first_state(
 
 
 def has_tournament(objective: MyopicObjective, traits: Traits) -> bool:
-    """Whether a restoration begins with a tournament of candidates.
+    """Return whether a restoration begins with a tournament of candidates.
 
     Zero is a saddle point for a full pupil: a symmetric pupil does not show the sign of the even modes.
     """

@@ -138,8 +138,8 @@ def _what_to_check(finding: Finding, n_lost: int, n_frames: int, at_rest: bool) 
     if few and at_rest:
         return "those frames for clouds and tracking errors, or leave them out"
     setting = (
-        "the mask (which one, how it lies), wavelength and pixel scale, gain and read-out noise, and that all frames "
-        "show one object"
+        "the mask (which one, how it lies), wavelength and pixel scale, gain and read-out noise, dead and hot "
+        "pixels, and that all frames show one object"
     )
     return (
         setting if at_rest else f"again after more iterations, since this search was stopped early, and then {setting}"

@@ -20,7 +20,7 @@ _POINTS: dict[str, Any] = {"color": drawing.COLORS[0], "marker": "o", "capsize":
 
 @drawing.styled
 def companion_figure(found: CompanionMap, limits: DetectionLimits) -> Figure:
-    """How significant a companion is at each place around the star, east to the left, and the limits beside it.
+    """Draw how significant a companion is at each place around the star, east to the left, and the limits beside it.
 
     `found` is a map on a square raster, as `map_companions` makes it by default. The star is the cross, the circle
     stands around the most significant companion.

@@ -16,9 +16,10 @@ if TYPE_CHECKING:
 
 @drawing.styled
 def plan_figure(plan: ObservationPlan) -> Figure:
-    """The predicted error of blind restorations over number and size of holes, the exposure for each number, and width.
+    """Draw the predicted error of blind restorations over number and size of holes, exposure and band width.
 
-    Each panel is at the best of all else; those of one mask or one width are left out. A ring marks the best point.
+    The exposure has a curve for each number of holes. Each panel is at the best of all else; those of one mask or one
+    width are left out. A ring marks the best point.
     """
     several, widths = len(plan.masks) > 1, plan.axis("width")
     panels = [1.25] * several + [1.5] + [1.2] * (len(widths) > 1)

@@ -20,7 +20,7 @@ _MARKS = {
 
 @drawing.styled
 def ranking_figure(ranking: Ranking) -> Figure:
-    """The masks as a list, each as built and laid afresh on one line, and their error against the number of holes."""
+    """Draw the masks in order, each as built and laid afresh on one line, and their error over the number of holes."""
     best: dict[str, float] = {}
     for row in ranking.rows:
         best[row.mask] = min(row.relative_mse, best.get(row.mask, row.relative_mse))
