@@ -108,8 +108,8 @@ def findings(cells: Sequence[Mapping[str, Any]]) -> list[str]:
 @styled
 def figure(cells: Sequence[Mapping[str, Any]], options: Options) -> Figure:
     """The score against the field, over the isoplanatic one, and against the share in height."""
-    sheet = new_figure(10.5, 3.5)
-    axes = sheet.subplots(1, 3)
+    sheet = new_figure(5.2, 8.6)
+    axes = sheet.subplots(3, 1)
     by_field = sorted((c for c in cells if c["share"] == 0.5 and c["field"] > 0), key=lambda cell: cell["field"])
     varied = sorted(
         (c for c in cells if c["share"] in options.shares and is_varied(c, options)), key=lambda c: c["share"]

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 INSTRUMENTS = {"mask": "mask", "full": "full pupil"}
 CONFIDENCE = 0.95
+_COLUMNS = 3  # of the figure, so that its text is legible on a phone
 
 
 def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -106,27 +107,39 @@ def markdown(setting: str, found: Sequence[str], cells: Sequence[Mapping[str, An
 
 @styled
 def figure(cells: Sequence[Mapping[str, Any]]) -> Figure:
-    """Scores against photons, one column per strength of turbulence, and the ratio below."""
+    """Scores against photons, one panel per strength of turbulence, each with the ratio below."""
     from matplotlib.ticker import LogLocator, NullLocator
 
     strengths = list(dict.fromkeys(cell["d_over_r0"] for cell in cells))
-    sheet = new_figure(1.2 + 2.7 * len(strengths), 5.4)
-    axes = sheet.subplots(2, len(strengths), sharex=True, sharey="row", squeeze=False, height_ratios=[1.5, 1])
-    for strength, (top, bottom) in zip(strengths, axes.T, strict=True):
+    columns = min(_COLUMNS, len(strengths))
+    lines = math.ceil(len(strengths) / columns)
+    sheet = new_figure(1.0 + 2.1 * columns, 0.7 + 4.4 * lines)
+    axes = sheet.subplots(2 * lines, columns, sharex=True, squeeze=False, height_ratios=[1.5, 1] * lines)
+    tops, bottoms = axes[::2].ravel(), axes[1::2].ravel()
+    for strength, top, bottom in zip(strengths, tops, bottoms, strict=False):
         panel(top, bottom, [cell for cell in cells if cell["d_over_r0"] == strength])
         top.set(title=f"D/r$_0$ = {strength:g}", xscale="log", yscale="log")
-        bottom.set(yscale="log", xlabel="photons per frame through the mask")
-    for ax in axes[:, 0]:
-        ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
-        ax.yaxis.set_major_formatter("{x:g}")
-        ax.yaxis.set_minor_locator(NullLocator())
-    # The row shares one axis, which must hold the bars of all its panels.
+        bottom.set(yscale="log", xlabel="photons through the mask")
+        bottom.tick_params(labelbottom=True)
+    # Panels of one kind have one scale, which must hold the bars of them all.
     seen = [cell[key] for cell in cells for key in ("ratio", "ratio_low", "ratio_high") if 0 < cell[key] < math.inf]
-    axes[1, 0].set_ylim(0.8 * min([*seen, 1.0]), 1.25 * max([*seen, 1.0]))
-    axes[0, 0].set_ylabel("score (0 is perfect)")
-    axes[1, 0].set_ylabel("score, mask / full pupil")
+    ratios = (0.8 * min([*seen, 1.0]), 1.25 * max([*seen, 1.0]))
+    scores = [top.get_ylim() for top in tops[: len(strengths)]]
+    for kind, label, limits in (
+        (tops, "score (0 is perfect)", (min(low for low, _ in scores), max(high for _, high in scores))),
+        (bottoms, "mask / full pupil", ratios),
+    ):
+        for ax in kind:
+            ax.set_ylim(limits)
+            ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
+            ax.yaxis.set_major_formatter("{x:g}")
+            ax.yaxis.set_minor_locator(NullLocator())
+        for ax in kind[::columns]:
+            ax.set_ylabel(label)
+    for unused in (*tops[len(strengths) :], *bottoms[len(strengths) :]):
+        unused.set_visible(False)
     handles, labels = axes[0, 0].get_legend_handles_labels()
-    sheet.legend(handles, labels, loc="outside upper left", ncols=min(4, 2 * len(strengths)))
+    sheet.legend(handles, labels, loc="outside upper left", ncols=2)
     return sheet
 
 
@@ -145,7 +158,7 @@ def panel(top: Axes, bottom: Axes, cells: Sequence[Mapping[str, Any]]) -> None:
     bottom.axhspan(1e-9, 1, color=COLORS[0], alpha=0.07, linewidth=0)
     bottom.axhline(1, color=FAINT, linewidth=0.8)
     bottom.errorbar(photons, ratio, bars, color="#222222", marker="o", **style)
-    bottom.text(0.03, 0.04, "the mask wins", color=COLORS[0], fontsize=7, transform=bottom.transAxes)
+    bottom.text(0.03, 0.04, "the mask wins", color=COLORS[0], fontsize=8, transform=bottom.transAxes)
 
 
 def _bars(values: np.ndarray, low: Sequence[float], high: Sequence[float]) -> np.ndarray:

@@ -118,23 +118,31 @@ def images_figure(images: dict[str, np.ndarray], marks: Sequence[dict[str, float
     """Images (n, n) with north up, as fractions of their peak, with what was fitted as circles."""
     from matplotlib.colors import LogNorm
 
-    figure = new_figure(3.2 * len(images) + 0.6, 3.6)
+    figure = new_figure(3.0 * len(images) + 0.6, 3.7)
     axes = figure.subplots(1, len(images), squeeze=False)[0]
     for ax, (title, image) in zip(axes, images.items(), strict=True):
         shown = np.clip(image / image.max(), 1e-4, 1)
         drawn = ax.imshow(shown, cmap="magma", norm=LogNorm(1e-4, 1), extent=(half, -half, -half, half))
         ax.set(title=title, xlabel="east [arcsec]", ylabel="north [arcsec]" if ax is axes[0] else "")
         draw_marks(ax, marks)
-    figure.colorbar(drawn, ax=axes, label="fraction of the peak", shrink=0.85)
+    figure.colorbar(drawn, ax=axes, label="fraction of the peak, logarithmic", shrink=0.85)
+    explain_marks(figure, axes[0])
     return figure
 
 
 def draw_marks(ax: Axes, marks: Sequence[dict[str, float]]) -> None:
-    """Circles around what was fitted."""
+    """Draw circles around what was fitted."""
     for mark in marks:
         angle, away = math.radians(mark["position_angle"]), mark["separation"] / 1000
         place = (away * math.sin(angle), away * math.cos(angle))
-        ax.plot(*place, "o", color=COLORS[2], markersize=13, fillstyle="none")
+        ax.plot(*place, "o", color=COLORS[2], markersize=13, fillstyle="none", label="companion of the fit")
+
+
+def explain_marks(figure: Figure, ax: Axes) -> None:
+    """Explain the circles in a legend above the panels, where there are any."""
+    handles, labels = ax.get_legend_handles_labels()
+    if handles:
+        figure.legend(handles[:1], labels[:1], loc="outside upper right")
 
 
 @styled
@@ -142,8 +150,8 @@ def search_figure(
     offsets: Tensor, maps: dict[str, Tensor], limits: DetectionLimits, marks: Sequence[dict[str, float]] = ()
 ) -> Figure:
     """Contrast over the limit at its separation wherever a companion was looked for; what exceeds it; the limit."""
-    figure = new_figure(2.7 * len(maps) + 3.9, 3.4)
-    axes = figure.subplots(1, len(maps) + 1, width_ratios=[1.0] * len(maps) + [1.1])
+    figure = new_figure(7.0, 0.4 + 3.1 * math.ceil((len(maps) + 1) / 2))
+    axes = figure.subplots(math.ceil((len(maps) + 1) / 2), 2, squeeze=False).flat[: len(maps) + 1]
     east, north = (offsets / ARCSEC).T.numpy()
     line = np.unique(np.concatenate([east, north]).round(6))
     columns, rows = (np.searchsorted(line, along.round(6)) for along in (east, north))
@@ -154,9 +162,10 @@ def search_figure(
         plane[rows, columns] = ratio.numpy()
         drawn = ax.pcolormesh(line, line, plane, cmap="RdBu_r", vmin=-most, vmax=most)
         draw_marks(ax, marks)
-        ax.set(title=title, xlabel="east [arcsec]", ylabel="north [arcsec]" if ax is axes[0] else "", aspect="equal")
+        ax.set(title=title, xlabel="east [arcsec]", ylabel="north [arcsec]", aspect="equal")
         ax.invert_xaxis()
-    figure.colorbar(drawn, ax=list(axes[:-1]), label="contrast / limit", shrink=0.85)
+        figure.colorbar(drawn, ax=ax, label="contrast / limit", shrink=0.85)
+    explain_marks(figure, axes[0])
     ax, away = axes[-1], np.hypot(east, north)
     for color, (title, contrast) in zip((COLORS[1], FAINT, COLORS[4]), maps.items(), strict=False):
         ax.plot(away, contrast.numpy(), ".", linestyle="none", markersize=2.5, color=color, label=title)
@@ -164,7 +173,7 @@ def search_figure(
     largest = max(float(contrast.max()) for contrast in maps.values())
     ax.set(xlabel="separation [arcsec]", ylabel="contrast", yscale="log", ylim=(1e-4, 30 * largest))
     ax.set_title("what is found, and the limit")
-    ax.legend(loc="upper left", markerscale=3)
+    ax.legend(loc="upper left", markerscale=3, fontsize=7.5)
     return figure
 
 

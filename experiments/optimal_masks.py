@@ -100,7 +100,7 @@ def gallery(rows: Sequence[dict[str, Any]], masks: Sequence[SparseAperture]) -> 
     """Each mask above its u-v coverage."""
     columns = min(6, len(rows))
     lines = math.ceil(len(rows) / columns)
-    sheet = new_figure(1.75 * columns + 0.2, 3.85 * lines + 0.5)
+    sheet = new_figure(1.15 * columns + 0.2, 2.85 * lines + 0.5)
     axes = sheet.subplots(2 * lines, columns, squeeze=False)
     for ax in axes.flat:
         ax.set_axis_off()
@@ -109,11 +109,11 @@ def gallery(rows: Sequence[dict[str, Any]], masks: Sequence[SparseAperture]) -> 
         draw_mask(axes[2 * line, column], mask)
         axes[2 * line, column].set_title(f"N = {row['n_subapertures']}", loc="center", fontweight="bold", pad=3)
         draw_coverage(axes[2 * line + 1, column], mask)
-        text = f"{row['relative_mse']:.4f}\n{row['above_floor']:.4f} above floor"
+        text = f"{row['relative_mse']:.4f}\n({row['above_floor']:.4f})"
         axes[2 * line + 1, column].text(0.5, -0.02, text, transform=axes[2 * line + 1, column].transAxes, **CAPTION)
     sheet.get_layout_engine().set(h_pad=0.07)  # type: ignore[union-attr]
-    title = f"Optimal masks at N d²/D² = {masks[0].fill_factor:g}: holes, u-v coverage and relative MSE"
-    sheet.suptitle(title, x=0.012, ha="left", fontsize=11)
+    title = f"Holes, u-v coverage, relative MSE and (above the floor), N d²/D² = {masks[0].fill_factor:g}"
+    sheet.suptitle(title, x=0.012, ha="left", fontsize=9.5)
     return sheet
 
 

@@ -82,8 +82,9 @@ def markdown(setting: str, found: Sequence[str], rows: Sequence[dict[str, Any]])
 @styled
 def figure(d_over_r0: float, rows: Sequence[dict[str, Any]]) -> Figure:
     """MTF of the full pupil and of the mask, and contrast against redundancy."""
-    sheet = new_figure(11.5, 3.9)
-    full, masked, walk = sheet.subplots(1, 3)
+    sheet = new_figure(7.0, 6.8)
+    panels = sheet.subplot_mosaic([["full", "masked"], ["walk", "walk"]])
+    full, masked, walk = (panels[name] for name in ("full", "masked", "walk"))
     mtf_panel(full, "full pupil", rows)
     limit = sorted((row for row in rows if row["pupil"] == "full pupil"), key=lambda row: row["baseline"])
     x = [row["baseline"] / DIAMETER for row in limit]

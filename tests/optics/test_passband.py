@@ -10,11 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from speclite import filters
 
+from torchmask.instrument.instrument import VEGA_IN_AB
 from torchmask.optics.band import Band
 from torchmask.optics.passband import Passband
 
 
-@pytest.mark.parametrize("name", ["bessell-V", "sdss2010-r", "twomass-Ks"])
+@pytest.mark.parametrize("name", ["bessell-V", "sdss2010-r", "panstarrs-y"])
 def test_photons_of_magnitude_zero_are_speclites(name):
     curve = filters.load_filter(name)
     theirs = curve.convolve_with_function(filters.ab_reference_flux, photon_weighted=True)
@@ -22,6 +23,20 @@ def test_photons_of_magnitude_zero_are_speclites(name):
     # derivative of the integrand, 2 / wavelength^2 where the response is straight
     error = float((np.diff(curve.wavelength).max() / curve.wavelength.min()) ** 2)
     assert Passband.find(name).ab_photons == pytest.approx(theirs.to_value("1 / (s m2)"), rel=max(error, 1e-6))
+
+
+@pytest.mark.parametrize(
+    ("band", "flux", "width", "wavelength"),
+    [("J", 3.129e-13, 0.1624, 1.235), ("H", 1.133e-13, 0.2509, 1.662), ("Ks", 4.283e-14, 0.2619, 2.159)],
+)
+def test_2mass_bands_pass_the_photons_of_vega(band, flux, width, wavelength):
+    """Cohen, Wheaton & Megeath, Astron. J. 126, 1090 (2003), table 2: W / (cm^2 um) at magnitude 0, um and um.
+
+    Zero points are known to 2 %, and Vega in AB is quoted to 0.01 mag.
+    """
+    name = f"twomass-{band}"
+    photons = 1e4 * flux * width * wavelength * 1e-6 / (constants.h * constants.c).value
+    assert Passband.find(name).ab_photons * 10 ** (-0.4 * VEGA_IN_AB[name]) == pytest.approx(photons, rel=0.03)
 
 
 def test_an_even_band_passes_the_photons_of_the_closed_form():

@@ -14,13 +14,15 @@ from torchmask.io import extra
 _AB_ZERO = 3631e-26  # W / (m^2 Hz) of AB magnitude 0: Oke & Gunn, Astrophys. J. 266, 713 (1983), as 3631 Jy
 _LIGHT = (1e-8, 1e-2)  # m
 _FILES = (".txt", ".dat", ".csv")
+_RELATIVE = 1e-3  # a named curve that peaks below has a unit of its own: 2MASS's peak at 4e-5 to 8e-5
 
 
 @dataclass(frozen=True)
 class Passband:
     """A transmission curve given at some wavelengths [m], linear in between and zero outside.
 
-    Depending on its source it may include the atmosphere or a camera.
+    Depending on its source it may include the atmosphere or a camera. The curves of 2MASS, which are published in a unit
+    of their own, are scaled to a peak of 1.
 
     Raises ValueError if the sequences differ in length or have fewer than 2 values, wavelengths do not increase, or the
     transmission is negative somewhere or positive nowhere.
@@ -143,4 +145,6 @@ def _named_curve(name: str) -> Passband:
         else:
             known = f"they are GROUP-BAND, such as bessell-V, with the groups {', '.join(filters.filter_group_names)}"
         raise ValueError(f"there is no filter {name!r}: {known}; or give a file ({', '.join(_FILES)})") from error
-    return Passband(tuple((1e-10 * curve.wavelength).tolist()), tuple(curve.response.tolist()))
+    peak = float(curve.response.max())
+    response = curve.response / (peak if peak < _RELATIVE else 1.0)
+    return Passband(tuple((1e-10 * curve.wavelength).tolist()), tuple(response.tolist()))

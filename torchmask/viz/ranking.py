@@ -25,8 +25,9 @@ def ranking_figure(ranking: Ranking) -> Figure:
     for row in ranking.rows:
         best[row.mask] = min(row.relative_mse, best.get(row.mask, row.relative_mse))
     places = {name: place for place, name in enumerate(sorted(best, key=lambda name: best[name]), 1)}
-    figure = drawing.new_figure(11, 2.6 + 0.17 * len(places))
-    listing, against = figure.subplots(1, 2, width_ratios=[1.1, 1])
+    length = 1.0 + 0.17 * len(places)
+    figure = drawing.new_figure(6.4, length + 3.6)
+    listing, against = figure.subplots(2, 1, height_ratios=[length, 3.4])
     for layout, (color, marker, label) in _MARKS.items():
         rows = ranking.of(layout)
         if rows:
