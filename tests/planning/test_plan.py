@@ -281,6 +281,7 @@ def test_the_command_writes_plan_mask_and_instrument(quick, tmp_path, capsys):
     known += " --width 2e-8 --exposure 4e-3 --n-frames 20 --n-subapertures 3 --hole-diameters 0.15"
     known += " --exposures 0.002 0.004 --n-frequencies 32 --budget 64"
     assert main(["plan", *known.split(), "--out", str(tmp_path / "plan")]) == 0
+    assert "design the final mask with: torchmask design --instrument" in capsys.readouterr().out
     numbers = json.loads((tmp_path / "plan/plan.json").read_text())
     assert numbers["best"] in numbers["map"]
     assert numbers["best"]["blind_mse"] >= numbers["best"]["relative_mse"] >= numbers["best_known"]["relative_mse"]

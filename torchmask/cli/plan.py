@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -98,6 +99,17 @@ def run(options: Options) -> None:
             save_json(output.directory / "mask.json", plan.mask, best.mean_wavelength)
             output.logger.figure("plan_mask", mask_figure(plan.mask))
         output.summary.extend([*str(plan).split("\n\n", 1)[0].splitlines(), table])
+        if options.mask is None:
+            output.summary.append(f"design the final mask with: {_design_command(plan.mask, output.directory)}")
+
+
+def _design_command(mask: Aperture, folder: Path) -> str:
+    """Return the command that searches a mask of as many holes of this size."""
+    fill_factor = mask.n_subapertures * (mask.subaperture_diameter / mask.mask_diameter) ** 2
+    file = shlex.quote(str(folder / "instrument.json"))
+    return (
+        f"torchmask design --instrument {file} --n-subapertures {mask.n_subapertures} --fill-factor {fill_factor:.4g}"
+    )
 
 
 def _with_blind_mse(choice: Choice) -> dict[str, Any]:

@@ -34,7 +34,7 @@ class DesignSpace(MaskRules):
     fill_factor: tuple[float, ...] = (0.15,)
     """Fill factors N d^2 / D^2, the collecting area of holes of diameter d in a mask of diameter D."""
     n_photons: tuple[float, ...] = (1e7,)
-    """Electrons per frame at `reference_fill_factor`; at others they are in proportion to N d^2."""
+    """Electrons per frame at the reference fill factor; at others they are in proportion to N d^2."""
     n_frames: tuple[int, ...] = (20,)
     """Numbers of exposures, K."""
     diameter_over_r0: tuple[float, ...] = (7.0,)
@@ -42,7 +42,7 @@ class DesignSpace(MaskRules):
     seed: tuple[int, ...] = (0,)
     """Random seeds of the search."""
     reference_fill_factor: float = 0.15
-    """Fill factor to which `n_photons` refers."""
+    """Fill factor to which the numbers of photons refer."""
     max_hole_over_r0: float = 1.5
     """Largest hole diameter, in units of r0."""
     mask_diameter: float = 1.0
@@ -64,11 +64,11 @@ class DesignSpace(MaskRules):
     outer_scale: float = 20.0
     """Outer scale of the turbulence [m]."""
     n_draws: int = 16
-    """Number of random stacks of K exposures for the mean of `wiener_mse` and its standard error."""
+    """Number of random stacks of K exposures for the mean Wiener MSE and its standard error."""
     method: str = "hybrid"
-    """Search method, as for `search_mask`."""
+    """Search method, hybrid or cma, as of `torchmask design`."""
     budget: int | None = None
-    """Evaluations of the criterion in a search, as for `search_mask`."""
+    """Evaluations of the criterion in a search; None: as many as `torchmask design` takes."""
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:

@@ -21,8 +21,8 @@ _RELATIVE = 1e-3  # a named curve that peaks below has a unit of its own: 2MASS'
 class Passband:
     """A transmission curve given at some wavelengths [m], linear in between and zero outside.
 
-    Depending on its source it may include the atmosphere or a camera. The curves of 2MASS, which are published in a unit
-    of their own, are scaled to a peak of 1.
+    Depending on its source it may include the atmosphere or a camera. The curves of 2MASS, which are published in a
+    unit of their own, are scaled to a peak of 1.
 
     Raises ValueError if the sequences differ in length or have fewer than 2 values, wavelengths do not increase, or the
     transmission is negative somewhere or positive nowhere.
