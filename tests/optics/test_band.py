@@ -10,6 +10,12 @@ from hypothesis import strategies as st
 from torchmask.optics.band import FILTERS, Band, Filter, filter_of_header
 
 
+@pytest.mark.parametrize("width", [-10e-9, 0.0, 1.2e-6, math.nan])
+def test_an_impossible_width_is_named(width):
+    with pytest.raises(ValueError, match=r"m wide around 5\.5e-07 m: its width must be positive"):
+        Band.top_hat(550e-9, width)
+
+
 @pytest.mark.parametrize("n", [1, 3, 8])
 def test_a_top_hat_is_gauss_and_legendre(n):
     band = Band.top_hat(550e-9, 80e-9, n)

@@ -83,7 +83,7 @@ class Band:
 
     @classmethod
     def top_hat(cls, wavelength: float, width: float, n_wavelengths: int = 5) -> Band:
-        """Return the top-hat band of `width` [m] around `wavelength` [m]. Raises the errors of `of_curve`.
+        """Return the top-hat band of `width` [m] around `wavelength` [m]. Raises the errors of `Passband.top_hat`.
 
         Examples
         --------

@@ -42,7 +42,15 @@ class Passband:
 
     @classmethod
     def top_hat(cls, wavelength: float, width: float) -> Passband:
-        """Return a transmission of 1 over `width` [m] around `wavelength` [m]."""
+        """Return a transmission of 1 over `width` [m] around `wavelength` [m].
+
+        Raises ValueError unless the width is positive and less than twice the wavelength.
+        """
+        if not 0 < width < 2 * wavelength:
+            raise ValueError(
+                f"the band is {width:.3g} m wide around {wavelength:.3g} m: its width must be positive and less than "
+                "twice the wavelength"
+            )
         return cls((wavelength - width / 2, wavelength + width / 2), (1.0, 1.0))
 
     @classmethod
