@@ -48,20 +48,20 @@ class Options(ObservingOptions):
 
 
 def height_of(options: Options, field: float) -> float:
-    """The height [m] at which half of the turbulence makes the scene `field` times theta0 wide."""
+    """Return the height [m] at which half of the turbulence makes the scene `field` times theta0 wide."""
     r0, grid = DIAMETER / options.d_over_r0, Grid.nyquist(DIAMETER, WAVELENGTH, options.n_pixels)
     at_1_m = Layers.from_fractions(r0, WAVELENGTH, [0.0, 1.0], [0.5, 0.5]).theta0(WAVELENGTH)
     return field * at_1_m / (SIZE * options.n_pixels * grid.pixel_scale)
 
 
 def setting(height: float, share: float, field: float | None) -> dict[str, Any]:
-    """A task's layers, and what it is held against: the same screens at the pupil."""
+    """Return a task's layers, and what it is held against: the same screens at the pupil."""
     heights, shares = ((0.0, height), (1 - share, share)) if share < 1 else ((height,), (1.0,))
     return {"layers": (heights, shares), "share": share, "field": field}
 
 
 def settings_of(options: Options) -> list[dict[str, Any]]:
-    """What is simulated: both sweeps, and for each share the same turbulence at the pupil, of field 0."""
+    """Return what is simulated: both sweeps, and for each share the same turbulence at the pupil, of field 0."""
     sweep = [setting(height_of(options, field), 0.5, field) for field in options.fields]
     height = height_of(options, options.share_field)
     varied = [setting(height, share, options.share_field * (share / 0.5) ** 0.6) for share in options.shares]
@@ -70,7 +70,7 @@ def settings_of(options: Options) -> list[dict[str, Any]]:
 
 
 def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """One cell for each instrument, share and field, with its ratio to the isoplanatic score."""
+    """Return one cell for each instrument, share and field, with its ratio to the isoplanatic score."""
     cells = []
     for which, share, field in dict.fromkeys((row["instrument"], row["share"], row["field"]) for row in rows):
         alike = [row for row in rows if (row["instrument"], row["share"]) == (which, share)]
@@ -80,7 +80,7 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def limit(cells: Sequence[Mapping[str, Any]]) -> str:
-    """Up to which field one PSF is enough, and from which on it is not, as far as the error bars tell."""
+    """Return up to which field one PSF is enough, and from which on it is not, as far as the error bars tell."""
     enough = [cell["field"] for cell in cells if cell["ratio_high"] <= ENOUGH]
     beyond = [cell["field"] for cell in cells if cell["ratio_low"] > ENOUGH]
     first = f"is enough up to {max(enough):g} theta0" if enough else "is not shown to be enough at any field"
@@ -88,7 +88,7 @@ def limit(cells: Sequence[Mapping[str, Any]]) -> str:
 
 
 def findings(cells: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Where an isoplanatic restoration stops being enough, for each instrument."""
+    """Return where an isoplanatic restoration stops being enough, for each instrument."""
     lines = []
     for which, name in INSTRUMENTS.items():
         own = sorted(
@@ -107,7 +107,7 @@ def findings(cells: Sequence[Mapping[str, Any]]) -> list[str]:
 
 @styled
 def figure(cells: Sequence[Mapping[str, Any]], options: Options) -> Figure:
-    """The score against the field, over the isoplanatic one, and against the share in height."""
+    """Draw the score against the field, over the isoplanatic one, and against the share in height."""
     sheet = new_figure(5.2, 8.6)
     axes = sheet.subplots(3, 1)
     by_field = sorted((c for c in cells if c["share"] == 0.5 and c["field"] > 0), key=lambda cell: cell["field"])
@@ -131,7 +131,7 @@ def figure(cells: Sequence[Mapping[str, Any]], options: Options) -> Figure:
 
 
 def is_varied(cell: Mapping[str, Any], options: Options) -> bool:
-    """Whether a cell lies at the height of the sweep over shares."""
+    """Return whether a cell lies at the height of the sweep over shares."""
     return abs(cell["field"] - options.share_field * (cell["share"] / 0.5) ** 0.6) < 1e-9
 
 
@@ -156,7 +156,7 @@ def run(options: Options) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The exit status."""
+    """Return the exit status."""
     return run_script("anisoplanatism", run, Options, __doc__, argv)
 
 

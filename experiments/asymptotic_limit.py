@@ -175,7 +175,7 @@ def masks(options: Options, callback: Callback) -> dict[str, SparseAperture]:
 
 
 def tasks(options: Options, mask: SparseAperture) -> list[dict[str, Any]]:
-    """The draws of both models for one mask, in batches of about equal time."""
+    """Return the draws of both models for one mask, in batches of about equal time."""
     shared = ("frames", "n_photons", "exponent", "n_pixels", "oversampling", "d_over_r0")
     common = {name: getattr(options, name) for name in shared} | {
         "centers": mask.centers.tolist(),
@@ -191,7 +191,7 @@ def tasks(options: Options, mask: SparseAperture) -> list[dict[str, Any]]:
 
 
 def compare(options: Options, callback: Callback) -> list[dict[str, Any]]:
-    """A row for each mask, model and K: MSE_a, the mean of the draws and its standard error, both relative."""
+    """Return a row for each mask, model and K: MSE_a, the mean of the draws and its standard error, both relative."""
     keywords = options.keywords(callback)
     batches = {name: tasks(options, mask) for name, mask in masks(options, callback).items()}
     flat = [(name, task) for name, own in batches.items() for task in own]
@@ -251,7 +251,7 @@ def run(options: Options) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The exit status."""
+    """Return the exit status."""
     return run_script("asymptotic_limit", run, Options, __doc__, argv)
 
 

@@ -44,7 +44,7 @@ def findings(d_over_r0: float, rows: Sequence[dict[str, Any]]) -> list[str]:
 
 
 def markdown(setting: str, found: Sequence[str], rows: Sequence[dict[str, Any]]) -> str:
-    """The numbers, for readers, below the setting and the findings."""
+    """Return the report as Markdown: the setting, the findings and the table."""
     lines = [
         "# The Wiener MSE of K exposures against its asymptotic limit",
         "",
@@ -66,7 +66,7 @@ def markdown(setting: str, found: Sequence[str], rows: Sequence[dict[str, Any]])
 
 @styled
 def figure(d_over_r0: float, rows: Sequence[dict[str, Any]]) -> Figure:
-    """The errors against K, and by how much they exceed the limit; where they do not, there is no point below."""
+    """Draw the errors against K, and by how much they exceed the limit; where they do not, there is no point below."""
     frames = [row["n_frames"] for row in rows]
     names = list(dict.fromkeys(row["mask"] for row in rows))
     sheet = new_figure(4.1 * len(names), 5.4)
@@ -93,7 +93,7 @@ def figure(d_over_r0: float, rows: Sequence[dict[str, Any]]) -> Figure:
 
 
 def panel(top: Axes, bottom: Axes, rows: Sequence[dict[str, Any]]) -> None:
-    """One mask: MSE above, excess below."""
+    """Draw one mask: MSE above, excess below."""
     for model, color, marker in zip(MODELS, COLORS, "os", strict=False):
         own = [row for row in rows if row["model"] == model]
         k = [row["n_frames"] for row in own]

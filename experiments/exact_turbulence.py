@@ -89,7 +89,7 @@ def _covariance(points: Tensor, seeing: Seeing) -> Tensor:
 
 
 def _otf(samples: PupilSamples, grid: Grid, phase: Tensor | None = None) -> Tensor:
-    """The autocorrelation (..., H, W) of the pupil's samples, 1 at 0 for an ideal pupil."""
+    """Return the autocorrelation (..., H, W) of the pupil's samples, 1 at 0 for an ideal pupil."""
     weights = samples.weights.to(torch.complex128)
     field = (weights if phase is None else weights * phasor(phase)).flatten(-2)
     pupil = torch.zeros(*field.shape[:-1], math.prod(samples.raster), dtype=field.dtype)

@@ -58,7 +58,7 @@ def run(options: Options) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The exit status."""
+    """Return the exit status."""
     return run_script("exposure", run, Options, __doc__, argv)
 
 

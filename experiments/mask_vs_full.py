@@ -56,7 +56,7 @@ TRUE_MODES = {"mask": 36, "full": 351}  # by which the true aberrations are give
 
 
 def instrument(task: Mapping[str, Any]) -> Aperture:
-    """The mask, or the full pupil that reaches as far."""
+    """Return the mask, or the full pupil that reaches as far."""
     mask = SparseAperture(task["centers"], task["subaperture_diameter"], DIAMETER)
     return mask if task["instrument"] == "mask" else FullAperture(mask.extent)
 
@@ -89,7 +89,7 @@ def fit_modes(observation: Observation, n_modes: int) -> Tensor:
 
 
 def measure(task: dict[str, Any]) -> dict[str, Any]:
-    """The task of one restoration: `start` counts the starts of a myopic one, "truth" gives it the aberrations.
+    """Return the task of one restoration: `start` counts the starts of a myopic one, "truth" gives it the aberrations.
 
     The starting aberrations of a full pupil belong to the place of a frame in the stack, so the frames turned round by
     some places have another start each.
@@ -118,7 +118,7 @@ def measure(task: dict[str, Any]) -> dict[str, Any]:
 
 
 def choose_mask(options: MaskSearchOptions, callback: Callback) -> SparseAperture:
-    """The mask of --mask, or the one that a search finds for the reference case."""
+    """Return the mask of --mask, or the one that a search finds for the reference case."""
     if options.mask is not None:
         mask = load_mask(options.mask)
         if mask.shape != Disc() or not math.isclose(mask.mask_diameter, DIAMETER, rel_tol=1e-6):
@@ -140,7 +140,7 @@ def choose_mask(options: MaskSearchOptions, callback: Callback) -> SparseApertur
 
 
 def sweep(options: Options, mask: SparseAperture, callback: Callback) -> list[dict[str, Any]]:
-    """One row per draw (scene, seed, photons, D/r0) and instrument."""
+    """Return one row per draw (scene, seed, photons, D/r0) and instrument."""
     common = {name: getattr(options, name) for name in ("n_frames", "n_pixels", "iterations", "readout_noise")}
     common |= {"outer_scale": options.outer_scale, "torchmask": torchmask.__version__}
     common |= {"centers": mask.centers.tolist(), "subaperture_diameter": mask.subaperture_diameter}
@@ -201,7 +201,7 @@ def run(options: Options) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The exit status."""
+    """Return the exit status."""
     return run_script("mask_vs_full", run, Options, __doc__, argv)
 
 

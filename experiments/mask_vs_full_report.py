@@ -21,7 +21,7 @@ _COLUMNS = 3  # of the figure, so that its text is legible on a phone
 
 
 def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """One row per D/r0 and photons: geometric means over draws, and the paired ratio mask / full.
+    """Return one row per D/r0 and photons: geometric means over draws, and the paired ratio mask / full.
 
     The interval is Student's, of the mean logarithm; `verdict` is the instrument it leaves no doubt about, if any.
     """
@@ -54,7 +54,7 @@ def interval(logs: np.ndarray, confidence: float) -> tuple[float, float]:
 
 
 def findings(cells: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Where the mask wins, where not, and why, in sentences made from the numbers."""
+    """Return where the mask wins, where not, and why, in sentences made from the numbers."""
     lines = []
     for cell in cells:
         verdict = {
@@ -79,7 +79,7 @@ def findings(cells: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def markdown(setting: str, found: Sequence[str], cells: Sequence[Mapping[str, Any]]) -> str:
-    """The numbers, for readers, below the setting and the findings."""
+    """Return the report as Markdown: the setting, the findings and the table."""
     lines = [
         "# Mask against full pupil",
         "",
@@ -107,7 +107,7 @@ def markdown(setting: str, found: Sequence[str], cells: Sequence[Mapping[str, An
 
 @styled
 def figure(cells: Sequence[Mapping[str, Any]]) -> Figure:
-    """Scores against photons, one panel per strength of turbulence, each with the ratio below."""
+    """Draw scores against photons, one panel per strength of turbulence, each with the ratio below."""
     from matplotlib.ticker import LogLocator, NullLocator
 
     strengths = list(dict.fromkeys(cell["d_over_r0"] for cell in cells))
@@ -144,7 +144,7 @@ def figure(cells: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 def panel(top: Axes, bottom: Axes, cells: Sequence[Mapping[str, Any]]) -> None:
-    """One strength of turbulence: scores and floors above, the paired ratio below."""
+    """Draw one strength of turbulence: scores and floors above, the paired ratio below."""
     photons = [cell["n_photons"] for cell in cells]
     style: dict[str, Any] = {"markersize": 4, "capsize": 2, "linewidth": 1.2}
     for (which, label), color, marker in zip(INSTRUMENTS.items(), COLORS, "os", strict=False):

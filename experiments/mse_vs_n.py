@@ -46,7 +46,7 @@ class Options(SearchedMaskOptions):
 
 
 def curve(options: Options, still: DesignTable, turbulent: DesignTable) -> list[dict[str, Any]]:
-    """A row for each N: the best of the searches, their scatter, and the turbulence at the best."""
+    """Return a row for each N: the best of the searches, their scatter, and the turbulence at the best."""
     rows = []
     for n in options.n_subapertures:
         found = [row for row in still.rows if row.n_subapertures == n]
@@ -83,7 +83,7 @@ def rises(rows: Sequence[dict[str, Any]]) -> list[tuple[int, int, float, float]]
 
 
 def reached(rows: Sequence[dict[str, Any]], share: float) -> int:
-    """The smallest N that has made `share` of the drop from the first N to the lowest MSE."""
+    """Return the smallest N that has made `share` of the drop from the first N to the lowest MSE."""
     errors = [row["relative_mse"] for row in rows]
     goal = max(errors[0] - share * (errors[0] - min(errors)), min(errors))  # but for rounding
     return next(row["n_subapertures"] for row, value in zip(rows, errors, strict=True) if value <= goal)
@@ -128,7 +128,7 @@ def findings(options: Options, rows: Sequence[dict[str, Any]]) -> list[str]:
 
 
 def judge_eleven(options: Options, rows: Sequence[dict[str, Any]], begin: int, end: int) -> str:
-    """What N = 11 gives up, and what it spares."""
+    """Return what N = 11 gives up, and what it spares."""
     first, last = rows[0], rows[-1]
     own = next(row for row in rows if row["n_subapertures"] == 11)
     share = (first["relative_mse"] - own["relative_mse"]) / (first["relative_mse"] - last["relative_mse"])
@@ -146,7 +146,7 @@ def judge_eleven(options: Options, rows: Sequence[dict[str, Any]], begin: int, e
 
 
 def markdown(options: Options, rows: Sequence[dict[str, Any]]) -> str:
-    """The numbers, for readers."""
+    """Return the report as Markdown."""
     lines = [
         "# Relative MSE against the number of holes",
         "",
@@ -173,7 +173,7 @@ def markdown(options: Options, rows: Sequence[dict[str, Any]]) -> str:
 
 @styled
 def figure(options: Options, rows: Sequence[dict[str, Any]]) -> Figure:
-    """The curve, all searches, the floor and the turbulence; below, what each further hole gains."""
+    """Draw the curve, all searches, the floor and the turbulence; below, what each further hole gains."""
     sheet = new_figure(6.4, 5.4)
     top, bottom = sheet.subplots(2, 1, sharex=True, height_ratios=[2.2, 1])
     n = [row["n_subapertures"] for row in rows]
@@ -226,7 +226,7 @@ def run(options: Options) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The exit status."""
+    """Return the exit status."""
     return run_script("mse_vs_n", run, Options, __doc__, argv)
 
 

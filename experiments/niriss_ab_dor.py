@@ -85,7 +85,7 @@ class Options(ExperimentOptions):
 
 
 def read(folder: Path, star: str, crop: int) -> tuple[Exposures, Grid]:
-    """The exposures of a star, cut out around it, with the pixels' directions on the sky."""
+    """Return the exposures of a star, cut out around it, with the pixels' directions on the sky."""
     paths = sorted(folder.glob(f"{star}_*.fits"))
     if not paths:
         raise ValueError(f"{folder} has no {star}_*.fits: give the folder of the exposures with --data")
@@ -148,7 +148,7 @@ def characterise(
     start: Tensor,
     callback: Callback,
 ) -> tuple[CompanionFit, dict[str, Any]]:
-    """The companion near `start`, its errors, and whether the two halves of the exposures agree on it."""
+    """Return the companion near `start`, its errors, and whether the two halves of the exposures agree on it."""
     fit = fit_companion(known.model, target, start, alone.parameters, callback=label_stage(callback, "companion"))
     wrong, recovered = injection_errors(
         known.model, known.exposures, known.star, fit.companion, options.n_injections, options.step, callback
@@ -179,7 +179,7 @@ def characterise(
 
 
 def restore(options: Options, pose: Pose, grid: Grid, exposures: Exposures, callback: Callback) -> RestorationResult:
-    """The image, without being told that there is a star or a companion."""
+    """Return the image, without being told that there is a star or a companion."""
     # Its coarser pupil samples narrow the image of a hole, as larger holes would: the nominal size fits.
     pose = dataclasses.replace(pose, hole=Pose.hole)
     method = MyopicDeconvolution(
@@ -267,7 +267,7 @@ def run(options: Options) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The exit status."""
+    """Return the exit status."""
     return run_script("niriss_ab_dor", run, Options, __doc__, argv)
 
 

@@ -64,7 +64,7 @@ class PipelineAffine:
     sy: float = -7.270e-3
 
     def geometry(self) -> MaskGeometry:
-        """The same map as `MaskGeometry`: x along the columns, from the design to where the mask lies.
+        """Return the same map as `MaskGeometry`: x along the columns, from the design to where the mask lies.
 
         The pipeline first reverses x of the design and turns it by 90 degrees, which, with its axes in the order (y,
         x), turns the design by 180 degrees: that no image shows.
@@ -74,7 +74,7 @@ class PipelineAffine:
 
 
 def read_star(options: Options) -> Observation:
-    """The exposures as one stack, each cut out around its star. Raises ValueError if there is none."""
+    """Return the exposures as one stack, each cut out around its star. Raises ValueError if there is none."""
     paths = sorted(options.data.glob(f"{options.star}_*.fits"))[: options.exposures]
     if not paths:
         raise ValueError(f"{options.data} has no {options.star}_*.fits: give the folder of the exposures with --data")
@@ -138,7 +138,7 @@ def run(options: Options) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The exit status."""
+    """Return the exit status."""
     return run_script("niriss_calibration", run, Options, __doc__, argv)
 
 

@@ -33,7 +33,7 @@ class Pose:
 
 
 def placed_mask(pose: Pose, grid: Grid, to_pixels: Tensor) -> SparseAperture:
-    """The mask on the detector's axes, whose pixels are a little oblong."""
+    """Return the mask on the detector's axes, whose pixels are a little oblong."""
     mask = SparseAperture.from_catalog(MASK, mirrored=pose.mirrored)
     angle = math.radians(pose.rotation)
     turn = torch.tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]], dtype=torch.float64)
@@ -51,7 +51,7 @@ def effective_wavelengths(pose: Pose, n: int) -> list[float]:
 def find_pose(
     make_model: Callable[[Pose, Exposures], CompanionModel], exposures: Exposures, callback: Callback
 ) -> tuple[Pose, list[dict[str, Any]]]:
-    """The pose of lowest chi-square, and all that were tried.
+    """Return the pose of lowest chi-square, and all that were tried.
 
     On two exposures of a single star on different pixels. A mask turned by 180 degrees makes the same image with
     aberrations of opposite parity, so x mirrored and y mirrored are the same to these data.

@@ -70,7 +70,7 @@ def findings(target: str, calibrator: str, results: dict[str, Any]) -> list[str]
 
 
 def table(results: dict[str, Any]) -> Table:
-    """The companion from all exposures and from each half."""
+    """Return the companion from all exposures and from each half."""
     sheet = Table("exposures", "separation [mas]", "position angle [deg]", "magnitude difference", "chi-square")
     for row in [results["companion"], *results["halves"]]:
         values = [
@@ -82,7 +82,7 @@ def table(results: dict[str, Any]) -> Table:
 
 
 def _centroid(image: Tensor, row: int, column: int) -> tuple[float, Tensor]:
-    """Light of 3 x 3 pixels, and its centre (y, x)."""
+    """Return the light of 3 x 3 pixels, and its centre (y, x)."""
     box = image[row - 1 : row + 2, column - 1 : column + 2]
     offsets = torch.arange(-1, 2, dtype=torch.float64)
     place = torch.stack([(box.sum(1) * offsets).sum(), (box.sum(0) * offsets).sum()]) / box.sum().clamp(min=1e-30)
@@ -90,7 +90,7 @@ def _centroid(image: Tensor, row: int, column: int) -> tuple[float, Tensor]:
 
 
 def brightest_beside(image: Tensor, to_pixels: Tensor, most: float = 0.7) -> dict[str, Any]:
-    """The brightest source beside the star in a restored image, up to a separation [arcsec]."""
+    """Return the brightest source beside the star in a restored image, up to a separation [arcsec]."""
     row, column = divmod(int(image.argmax()), image.shape[1])
     flux, star = _centroid(image, row, column)
     rest = image.clone()
@@ -104,7 +104,7 @@ def brightest_beside(image: Tensor, to_pixels: Tensor, most: float = 0.7) -> dic
 
 
 def upright(image: Tensor, star: Sequence[float], to_pixels: Tensor, half: float = 0.7, n: int = 141) -> np.ndarray:
-    """An image with north up and east left, `half` arcsec to each side of the star, in its nearest pixels."""
+    """Return an image with north up and east left, `half` arcsec to each side of the star, in its nearest pixels."""
     from scipy.ndimage import map_coordinates
 
     line = np.linspace(-half, half, n) * ARCSEC
@@ -115,7 +115,7 @@ def upright(image: Tensor, star: Sequence[float], to_pixels: Tensor, half: float
 
 @styled
 def images_figure(images: dict[str, np.ndarray], marks: Sequence[dict[str, float]], half: float = 0.7) -> Figure:
-    """Images (n, n) with north up, as fractions of their peak, with what was fitted as circles."""
+    """Draw images (n, n) with north up, as fractions of their peak, with what was fitted as circles."""
     from matplotlib.colors import LogNorm
 
     figure = new_figure(3.0 * len(images) + 0.6, 3.7)
@@ -149,7 +149,7 @@ def explain_marks(figure: Figure, ax: Axes) -> None:
 def search_figure(
     offsets: Tensor, maps: dict[str, Tensor], limits: DetectionLimits, marks: Sequence[dict[str, float]] = ()
 ) -> Figure:
-    """Contrast over the limit at its separation wherever a companion was looked for; what exceeds it; the limit."""
+    """Draw contrast over the limit at its separation wherever a companion was looked for, and contrast and limit."""
     figure = new_figure(7.0, 0.4 + 3.1 * math.ceil((len(maps) + 1) / 2))
     axes = figure.subplots(math.ceil((len(maps) + 1) / 2), 2, squeeze=False).flat[: len(maps) + 1]
     east, north = (offsets / ARCSEC).T.numpy()
@@ -179,7 +179,7 @@ def search_figure(
 
 @styled
 def exposures_figure(exposures: Exposures, fit: CompanionFit, radius: float) -> Figure:
-    """The first exposure, the model of it, and what is left, in units of the peak."""
+    """Draw the first exposure, the model of it, and what is left, in units of the peak."""
     from matplotlib.colors import LogNorm
 
     peak = float(fit.images[0].max())

@@ -57,7 +57,7 @@ class Options(SearchedMaskOptions):
 
 
 def predict(task: Mapping[str, Any]) -> dict[str, Any]:
-    """The relative error for known PSFs and the floor, at each flux of a task, whose masks have holes of one size."""
+    """Return the relative error for known PSFs and the floor, at each flux of a task with holes of one size."""
     grid = Grid.nyquist(DIAMETER, WAVELENGTH, task["n_pixels"])
     kept, errors, floors = None, [], []
     for photons, centers in zip(task["photons"], task["centers"], strict=True):
@@ -71,7 +71,7 @@ def predict(task: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def measure(options: Options, callback: Callback) -> list[dict[str, Any]]:
-    """A row for each strength, flux and N, with the error for known PSFs and for unknown ones."""
+    """Return a row for each strength, flux and N, with the error for known PSFs and for unknown ones."""
     table = design_table(design_space(options, n_photons=options.photons), options.sweep, **options.keywords(callback))
     common = {name: getattr(options, name) for name in ("photons", "n_frames", "n_pixels", "exponent")}
     keys, tasks = list(itertools.product(options.strengths, options.n_subapertures)), []
@@ -117,7 +117,7 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def markdown(options: Options, cells: Sequence[Mapping[str, Any]]) -> str:
-    """The numbers, for readers."""
+    """Return the report as Markdown."""
     lines = [
         "# The number of holes",
         "",
@@ -162,7 +162,7 @@ def run(options: Options) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The exit status."""
+    """Return the exit status."""
     return run_script("number_of_holes", run, Options, __doc__, argv)
 
 

@@ -71,7 +71,7 @@ class ObservingOptions(MaskSearchOptions):
 
 
 def smoke(options: Any, **few: Any) -> Any:
-    """The options of a run that only shows that it runs."""
+    """Return the options of a run that only shows that it runs."""
     tiny: dict[str, Any] = {"seeds": (0, 1), "n_frames": 2, "n_pixels": 32, "iterations": 4}
     tiny |= {"n_subapertures": 5, "budget": 200, "d_over_r0": 3.0, "instruments": ("mask",)}
     return dataclasses.replace(options, **tiny, **few)
@@ -133,7 +133,7 @@ def measure(task: Mapping[str, Any]) -> dict[str, Any]:
 def observe(
     options: ObservingOptions, stage: str, settings: Iterable[Mapping[str, Any]], callback: Callback
 ) -> list[dict[str, Any]]:
-    """A row with `score` and `seconds` for each of the settings, instrument and seed, with one mask for all."""
+    """Return a row with `score` and `seconds` for each of the settings, instrument and seed, with one mask for all."""
     mask = choose_mask(options, callback)
     names = ("d_over_r0", "outer_scale", "n_photons", "readout_noise", "n_frames", "n_pixels", "iterations")
     common = {name: getattr(options, name) for name in names} | {"torchmask": torchmask.__version__}
@@ -200,14 +200,14 @@ def page(
     columns: Mapping[str, str],
     note: str = "",
 ) -> str:
-    """A page of Markdown: what all rows share, what was found, and the table."""
+    """Return a page of Markdown: what all rows share, what was found, and the table."""
     lines = [f"# {title}", "", setting_of(options), *([note] if note else []), ""]
     lines += [*(f"- {line}" for line in found), "", *table(cells, columns)]
     return "\n".join(lines) + "\n"
 
 
 def curves(ax: Axes, cells: Sequence[Mapping[str, Any]], key: str, value: str = "score") -> None:
-    """One line with error bars for each instrument."""
+    """Draw one line with error bars for each instrument."""
     ends = ("low", "high") if value == "score" else (f"{value}_low", f"{value}_high")
     for (which, label), color, marker in zip(INSTRUMENTS.items(), COLORS, "os", strict=False):
         own = [cell for cell in cells if cell["instrument"] == which]

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 def best_of_seeds(table: DesignTable) -> list[Design]:
-    """The best row of each N."""
+    """Return the best row of each N."""
     best: dict[int, Design] = {}
     for row in table.rows:
         known = best.get(row.n_subapertures)
@@ -44,7 +44,7 @@ def best_of_seeds(table: DesignTable) -> list[Design]:
 
 
 def numbers(table: DesignTable) -> list[dict[str, Any]]:
-    """What is written for each N."""
+    """Return the row that is written for each N."""
     rows = []
     for row in best_of_seeds(table):
         report = analyse_redundancy(table.aperture(row))
@@ -70,7 +70,7 @@ def numbers(table: DesignTable) -> list[dict[str, Any]]:
 
 
 def markdown(options: SearchedMaskOptions, rows: Sequence[dict[str, Any]]) -> str:
-    """The numbers, for readers."""
+    """Return the report as Markdown."""
     lines = [
         "# Optimal masks",
         "",
@@ -97,7 +97,7 @@ def markdown(options: SearchedMaskOptions, rows: Sequence[dict[str, Any]]) -> st
 
 @styled
 def gallery(rows: Sequence[dict[str, Any]], masks: Sequence[SparseAperture]) -> Figure:
-    """Each mask above its u-v coverage."""
+    """Draw each mask above its u-v coverage."""
     columns = min(6, len(rows))
     lines = math.ceil(len(rows) / columns)
     sheet = new_figure(1.15 * columns + 0.2, 2.85 * lines + 0.5)
@@ -121,7 +121,7 @@ CAPTION: dict[str, Any] = {"ha": "center", "va": "top", "fontsize": 8, "color": 
 
 
 def draw_mask(ax: Axes, mask: SparseAperture) -> None:
-    """The holes in their disc."""
+    """Draw the holes in their disc."""
     from matplotlib.patches import Circle
 
     ax.add_patch(Circle((0, 0), mask.mask_diameter / 2, facecolor=PALE, edgecolor=FAINT, linewidth=0.6))
@@ -132,7 +132,7 @@ def draw_mask(ax: Axes, mask: SparseAperture) -> None:
 
 
 def draw_coverage(ax: Axes, mask: SparseAperture) -> None:
-    """A disc of the hole's cut-off around each baseline, darker where they overlap."""
+    """Draw a disc of the hole's cut-off around each baseline, darker where they overlap."""
     from matplotlib.patches import Circle
 
     difference = (mask.centers[:, None] - mask.centers).reshape(-1, 2)
@@ -159,7 +159,7 @@ def run(options: SearchedMaskOptions) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The exit status."""
+    """Return the exit status."""
     return run_script("optimal_masks", run, SearchedMaskOptions, __doc__, argv)
 
 

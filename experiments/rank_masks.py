@@ -37,7 +37,7 @@ def run(options: Options) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The exit status."""
+    """Return the exit status."""
     return run_script("rank_masks", run, Options, __doc__, argv)
 
 

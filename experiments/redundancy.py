@@ -74,7 +74,7 @@ def check(options: Options) -> None:
 
 
 def pupils(options: Options, grid: Grid) -> dict[str, tuple[Aperture, Sequence[tuple[Shift, int | None]]]]:
-    """Each pupil with the baselines to look at, and how many pairs of holes share each of them."""
+    """Return each pupil with the baselines to look at, and how many pairs of holes share each of them."""
     step = grid.period / options.n_pixels
     radius = math.floor(DIAMETER / step)
     axis = range(0, int(0.93 * radius), max(1, radius // 32))
@@ -97,7 +97,7 @@ def pupils(options: Options, grid: Grid) -> dict[str, tuple[Aperture, Sequence[t
 
 
 def raster_of(aperture: Aperture, grid: Grid) -> Tensor:
-    """The amplitude of a pupil on its raster."""
+    """Return the amplitude of a pupil on its raster."""
     samples = aperture.samples(grid)
     raster = torch.zeros(samples.raster, dtype=samples.weights.dtype)
     raster.view(-1).index_add_(0, samples.index.flatten(), samples.weights.flatten())
@@ -105,7 +105,7 @@ def raster_of(aperture: Aperture, grid: Grid) -> Tensor:
 
 
 def expected_power(pupil: Tensor, shift: Shift, grid: Grid, r0: float, outer_scale: float) -> float:
-    """Mean of |OTF|^2 over perfect OTF squared at the baseline B = `shift`, for any pupil under Gaussian phases.
+    """Return the mean |OTF|^2 over the perfect one at the baseline B = `shift`, for any pupil under Gaussian phases.
 
     The OTF at B sums phasors of phi(x) - phi(x + B) over the pupil. Two of them, x apart by u, have the mean product
     exp(-D(B) - D(u) + D(u + B) / 2 + D(u - B) / 2), with D the structure function, and the autocorrelation of the
@@ -127,7 +127,7 @@ def expected_power(pupil: Tensor, shift: Shift, grid: Grid, r0: float, outer_sca
 
 
 def contrasts(otf: OTF, shifts: Sequence[Shift], frames: Iterable[Tensor]) -> dict[str, Tensor]:
-    """OTFs at the baselines over those without turbulence: their rms and their mean, with standard errors."""
+    """Return OTFs at the baselines over those without turbulence: their rms and their mean, with standard errors."""
     rows, columns = torch.tensor(shifts).T
     perfect = otf()[rows, columns].real
     drawn = torch.cat([otf(phase)[:, rows, columns] for phase in frames]) / perfect
@@ -144,7 +144,7 @@ def contrasts(otf: OTF, shifts: Sequence[Shift], frames: Iterable[Tensor]) -> di
 
 
 def compare(options: Options, callback: Callback) -> list[dict[str, Any]]:
-    """A row for each pupil and baseline: contrast of short and long exposures, drawn and in closed form."""
+    """Return a row for each pupil and baseline: contrast of short and long exposures, drawn and in closed form."""
     grid = Grid.nyquist(DIAMETER, WAVELENGTH, options.n_pixels)
     r0, outer_scale = DIAMETER / options.d_over_r0, options.outer_scale * DIAMETER
     rows = []
@@ -174,7 +174,7 @@ def draw(
     generator: torch.Generator,
     callback: Callback,
 ) -> dict[str, Tensor]:
-    """Contrasts of one pupil under von Karman screens, those of the row under random pistons too."""
+    """Draw contrasts of one pupil under von Karman screens, those of the row under random pistons too."""
     turbulence = TurbulencePhase(DIAMETER / options.d_over_r0, options.outer_scale * DIAMETER)
     otf = OTF(aperture, grid, options.oversampling)
     samples = otf.samples()
@@ -219,7 +219,7 @@ def run(options: Options) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The exit status."""
+    """Return the exit status."""
     return run_script("redundancy", run, Options, __doc__, argv)
 
 

@@ -20,7 +20,7 @@ _LOWEST = 1e-3  # MTF that is drawn
 
 
 def deviation(rows: Sequence[dict[str, Any]], key: str) -> float:
-    """The largest difference between drawn and closed form, in standard errors.
+    """Return the largest difference between drawn and closed form, in standard errors.
 
     Without what hardly varies between exposures, such as the fringe of a single pair of holes under pistons: there the
     sampling of the pupil would be all that is seen.
@@ -54,7 +54,7 @@ def findings(d_over_r0: float, n_frames: int, rows: Sequence[dict[str, Any]]) ->
 
 
 def markdown(setting: str, found: Sequence[str], rows: Sequence[dict[str, Any]]) -> str:
-    """The numbers, for readers, below the setting and the findings."""
+    """Return the report as Markdown: the setting, the findings and the table."""
     lines = [
         "# What turbulence leaves of the fringes",
         "",

@@ -46,7 +46,7 @@ class Options(ObservingOptions):
 
 
 def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """One cell for each instrument and number of modes; `ratio` is the error of the full pupil over the mask's."""
+    """Return a cell for each instrument and number of modes; `ratio` is the error of the full pupil over the mask's."""
     mask = [row for row in rows if row["instrument"] == "mask"]
     keys = dict.fromkeys((row["instrument"], row["modes"]) for row in rows)
     return [
@@ -57,7 +57,7 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def findings(cells: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The best number of modes, and what the mask gains over it and over three."""
+    """Return the best number of modes, and what the mask gains over it and over three."""
     full = [cell for cell in cells if cell["instrument"] == "full"]
     best = min(full, key=lambda cell: cell["score"])
     lines = [f"The full pupil is best with {optimum(full, 'modes')} modes: a score of {best['score']:.3f}."]
@@ -110,7 +110,7 @@ def run(options: Options) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The exit status."""
+    """Return the exit status."""
     return run_script("rival_modes", run, Options, __doc__, argv)
 
 

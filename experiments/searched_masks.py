@@ -32,7 +32,7 @@ class SearchedMaskOptions(SweepOptions):
 
 
 def design_space(options: SearchedMaskOptions, **changes: Any) -> DesignSpace:
-    """One search for each N and seed, without turbulence unless `changes` bring it."""
+    """Return one search for each N and seed, without turbulence unless `changes` bring it."""
     settings: dict[str, Any] = {
         "n_subapertures": options.n_subapertures,
         "fill_factor": (options.fill_factor,),

@@ -82,12 +82,12 @@ class Options(SweepOptions):
 
 
 def of_mask(mask: SparseAperture) -> dict[str, Any]:
-    """What a task says of its mask."""
+    """Return what a task says of its mask."""
     return {"centers": mask.centers.tolist(), "subaperture_diameter": mask.subaperture_diameter}
 
 
 def scene_of(draw: int, shape: tuple[int, int], n_photons: float) -> Tensor:
-    """The packaged satellite in a random attitude (even draws), or a spotted ball (odd draws)."""
+    """Return the packaged satellite in a random attitude (even draws), or a spotted ball (odd draws)."""
     generator = torch.Generator().manual_seed(1000 + draw)
     if draw % 2 == 0:
         pitch, yaw, roll = (360 * torch.rand(3, generator=generator) - 180).tolist()
@@ -142,7 +142,7 @@ def measure(task: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def measure_given(task: Mapping[str, Any]) -> dict[str, Any]:
-    """The score of the library's restoration where the true aberrations are given, by many modes of each hole.
+    """Return the score of the library's restoration where the true aberrations are given, by many modes of each hole.
 
     Unlike the true PSFs, which end at the edge of the field, it knows of the light that leaves it.
     """
@@ -159,7 +159,7 @@ def measure_given(task: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def restore_known(observation: Observation) -> Tensor:
-    """The object (H, W) where the true PSFs are known: what the library minimises over it, with circular convolution.
+    """Return the object (H, W) that minimises the library's cost for the true PSFs, with circular convolution.
 
     The frames enter by two sums over them, so that the time does not depend on their number.
     """
@@ -186,7 +186,7 @@ def restore_known(observation: Observation) -> Tensor:
 
 
 def choose_masks(options: Options, callback: Callback) -> list[SparseAperture]:
-    """A searched mask for each draw."""
+    """Return a searched mask for each draw."""
     holes = [HOLES[draw % len(HOLES)] for draw in range(max(options.draws))]
     space = DesignSpace(
         n_subapertures=tuple(sorted(set(holes))),
@@ -202,7 +202,7 @@ def choose_masks(options: Options, callback: Callback) -> list[SparseAperture]:
 
 
 def restore(options: Options, masks: Sequence[SparseAperture], callback: Callback) -> list[dict[str, Any]]:
-    """A row for each restoration; all combinations of one draw come before the next draw."""
+    """Return a row for each restoration; all combinations of one draw come before the next draw."""
     draws = [
         {"draw": draw, "n_frames": n_frames, "n_photons": photons, "d_over_r0": size}
         for draw in range(max(options.draws))
@@ -240,7 +240,7 @@ def bound(task: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def bounds(options: Options, mask: SparseAperture, callback: Callback) -> dict[tuple[Any, ...], float]:
-    """The factor of `bound` by frames, photons and d/r0, for the sizes that the figure shows."""
+    """Return the factor of `bound` by frames, photons and d/r0, for the sizes that the figure shows."""
     keys = list(itertools.product(options.frames, options.photons, shown(options)))
     tasks = [dict(zip(KEYS, key, strict=True)) | {"n_pixels": options.n_pixels} | of_mask(mask) for key in keys]
     found = run_tasks(bound, tasks, options.sweep / "tasks", stage="bound", **options.keywords(callback))
@@ -248,12 +248,12 @@ def bounds(options: Options, mask: SparseAperture, callback: Callback) -> dict[t
 
 
 def shown(options: Options) -> list[float]:
-    """The d/r0 of the figure's rows."""
+    """Return the d/r0 of the figure's rows."""
     return sorted({options.d_over_r0[len(options.d_over_r0) // 3], options.d_over_r0[-1]})
 
 
 def table_of(options: Options, cells: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """What `torchmask.planning.success` reads."""
+    """Return what `torchmask.planning.success` reads."""
     axes = dict(zip(KEYS, map(sorted, (options.frames, options.photons, options.d_over_r0)), strict=True))
     shape = tuple(map(len, axes.values()))
     tables = {
@@ -263,7 +263,7 @@ def table_of(options: Options, cells: Sequence[Mapping[str, Any]]) -> dict[str, 
 
 
 def setting(options: Options, cells: Sequence[Mapping[str, Any]]) -> str:
-    """What all restorations share."""
+    """Return what all restorations share."""
     holes = sorted(set(itertools.islice(itertools.cycle(HOLES), max(options.draws))))
     few, many = min(options.draws), max(options.draws)
     return (
@@ -291,7 +291,7 @@ def run(options: Options) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The exit status."""
+    """Return the exit status."""
     return run_script("success_map", run, Options, __doc__, argv)
 
 

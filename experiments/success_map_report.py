@@ -17,7 +17,7 @@ KEYS = ("n_frames", "n_photons", "d_over_r0")
 
 
 def summarise(rows: Sequence[Mapping[str, Any]], factors: Mapping[tuple[Any, ...], float]) -> list[dict[str, Any]]:
-    """A cell for each combination of frames, photons and d/r0."""
+    """Return a cell for each combination of frames, photons and d/r0."""
     cells = []
     for key in sorted({tuple(row[name] for name in KEYS) for row in rows}):
         own = [row for row in rows if tuple(row[name] for name in KEYS) == key]
@@ -32,7 +32,7 @@ def summarise(rows: Sequence[Mapping[str, Any]], factors: Mapping[tuple[Any, ...
 
 
 def markdown(setting: str, cells: Sequence[Mapping[str, Any]]) -> str:
-    """The numbers, for readers."""
+    """Return the report as Markdown."""
     strengths = sorted({cell["d_over_r0"] for cell in cells})
     lines = ["# Where blind restorations succeed", "", setting, ""]
     lines += [

@@ -33,7 +33,7 @@ class Trade:
     where: str
 
     def summarise(self, rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-        """One cell for each instrument and amount."""
+        """Return one cell for each instrument and amount."""
         keys = dict.fromkeys((row["instrument"], row[self.key]) for row in rows)
         return [
             {"instrument": which, self.key: amount, "kept": self.kept(amount)}
@@ -42,7 +42,7 @@ class Trade:
         ]
 
     def findings(self, cells: Sequence[Mapping[str, Any]]) -> list[str]:
-        """The optimum of each instrument."""
+        """Return the optimum of each instrument."""
         lines = []
         for which, name in INSTRUMENTS.items():
             own = [cell for cell in cells if cell["instrument"] == which]

@@ -118,7 +118,7 @@ def linear_restorations(data: dict[str, Tensor], n_train: int, cutoff: float) ->
 
 
 def turned(images: Tensor, targets: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """The same pairs turned by a random multiple of 90 degrees, and perhaps mirrored: eight times the stacks."""
+    """Return the same pairs turned by a random multiple of 90 degrees, and perhaps mirrored: eight times the stacks."""
     quarter, mirror = (int(torch.randint(n, (), generator=generator)) for n in (4, 2))
     both = torch.rot90(torch.cat([images, targets], dim=1), quarter, dims=(-2, -1))
     both = both.flip(-1) if mirror else both
@@ -126,7 +126,7 @@ def turned(images: Tensor, targets: Tensor, generator: torch.Generator) -> tuple
 
 
 def power_error(estimate: Tensor, target: Tensor) -> Tensor:
-    """Mean over the batch of the squared error, as a share of the target's power."""
+    """Return the mean over the batch of the squared error, as a share of the target's power."""
     return (((estimate - target) ** 2).sum((1, 2, 3)) / (target**2).sum((1, 2, 3))).mean()
 
 
@@ -163,14 +163,14 @@ def train(
 
 
 def scores(images: Tensor, targets: Tensor, cutoff: float) -> list[float]:
-    """The library's score of each image (B, H, W)."""
+    """Return the library's score of each image (B, H, W)."""
     return [relative_error(image, target[0], cutoff) for image, target in zip(images, targets, strict=True)]
 
 
 def compare(
     restored: Tensor, held_out: tuple[Tensor, Tensor], cutoff: float, log: Callable[[str, float], None]
 ) -> dict[str, float]:
-    """Mean scores on the held-out stacks, and the share of them on which the network beats its input."""
+    """Return the mean scores on the held-out stacks, and the share of them on which the network beats its input."""
     images = {"mean frame": held_out[0][:, 1], "Wiener": held_out[0][:, 0], "network": restored}
     each = {name: scores(values, held_out[1], cutoff) for name, values in images.items()}
     table = {name: sum(values) / len(values) for name, values in each.items()}
@@ -237,7 +237,7 @@ def run(options: Options) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The exit status."""
+    """Return the exit status."""
     return run_script("train_restorer", run, Options, __doc__, argv)
 
 

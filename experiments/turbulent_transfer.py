@@ -146,7 +146,7 @@ def cases(options: Options, grid: Grid) -> Iterator[Case]:
 
 
 def conditions(options: Options, case: Case) -> tuple[Seeing, Band | None]:
-    """The turbulence and the light of one case."""
+    """Return the turbulence and the light of one case."""
     exposure = options.exposure_tau0 * Seeing(case.r0, wind=math.hypot(*_WIND)).tau0
     outer_scale = math.inf if options.outer_scale is None else options.outer_scale * DIAMETER
     seeing = Seeing(case.r0, outer_scale, exposure, _WIND if exposure > 0 else 0.0)
@@ -171,7 +171,7 @@ def draw(options: Options, case: Case, grid: Grid) -> Drawn:
 
 
 def compare(case: Case, grid: Grid, drawn: Drawn, seeing: Seeing, band: Band | None) -> Compared:
-    """The closed form for one turbulence beside exposures that were drawn."""
+    """Return the closed form for one turbulence beside exposures that were drawn."""
     wavelengths, shares = (None, None) if band is None else (band.wavelengths, band.shares)
     psds = PowerLawPSD(1.5, 1e5), NoisePSD(1e5)  # of any object: only E|OTF|^2 is asked for
     power, still = (
@@ -189,7 +189,7 @@ def compare(case: Case, grid: Grid, drawn: Drawn, seeing: Seeing, band: Band | N
 
 
 def markdown(options: Options, rows: Sequence[dict[str, Any]]) -> str:
-    """The numbers, for readers."""
+    """Return the report as Markdown."""
     lines = [
         "# E|OTF|^2 in closed form and drawn",
         "",
@@ -262,7 +262,7 @@ def run(options: Options) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The exit status."""
+    """Return the exit status."""
     return run_script("turbulent_transfer", run, Options, __doc__, argv)
 
 

@@ -40,7 +40,7 @@ class Options(RunOptions):
     target: str | None = None
     """Name of the target, for files with several."""
     closures_only: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Ignore the squared visibilities, unlike which closure phases do not need a calibrated contrast."""
+    """Ignore the squared visibilities, since closure phases alone need no calibrated contrast."""
     least_arcsec: float | None = None
     """Smallest separation to try [arcsec]; None: half the period of the finest fringe."""
     most_arcsec: float | None = None
