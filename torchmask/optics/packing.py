@@ -94,9 +94,10 @@ def hole_diameter(n_subapertures: int, mask_diameter: float, fill_factor: float)
     largest = largest_fill_factor(int(n_subapertures))
     if not 0 < fill_factor <= largest * (1 + 1e-12):
         stated = math.floor(largest * 1e5) / 1e5
+        known = "the best packing known" if n_subapertures <= len(_RATIOS) else "more than any packing reaches"
         raise ValueError(
             f"fill_factor is {fill_factor}: {n_subapertures} round holes in a disc need N d^2/D^2 above 0 and at most "
-            f"{stated:.5f}, which is {'the best packing known' if n_subapertures <= len(_RATIOS) else 'a bound'}"
+            f"{stated:.5f}, which is {known}"
         )
     return mask_diameter * math.sqrt(fill_factor / n_subapertures)
 
