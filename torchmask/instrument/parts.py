@@ -100,7 +100,7 @@ class Source:
 
     def __post_init__(self) -> None:
         if (self.magnitude is None) == (self.photon_rate is None):
-            raise ValueError("source: give its magnitude, or its photon_rate [1 / (s m^2)], and not both")
+            raise ValueError("source: give either its magnitude or its photon_rate [1 / (s m^2)], and not both")
         if self.magnitude is not None and not math.isfinite(self.magnitude):
             raise ValueError(f"source.magnitude is {self.magnitude}: it must be finite")
         require("source.photon_rate", self.photon_rate, ", in photons / (s m^2)")
