@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from observing import ObservingOptions, check, observe, page, smoke
-from trade import Trade, figure
+from trade import Trade, figure, predictions
 
 from torchmask.cli.program import run_script
 from torchmask.cli.run import new_run
@@ -65,7 +65,7 @@ def run(options: Options) -> None:
             kept=lambda width: kept_contrast(width, options.d_over_r0),
             where="on the baseline D",
         )
-        cells = trade.summarise(rows)
+        cells = trade.summarise(rows, predictions(options, "band", settings, output.callback))
         found = trade.findings(cells)
         text = page(
             options,

@@ -7,6 +7,7 @@ wavelengths of a band, are drawn together from their covariance, by its Cholesky
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -45,22 +46,47 @@ def drawn_mean_square(
     oversampling: int = 1,
     generator: torch.Generator | None = None,
 ) -> Drawn:
-    """|OTF|^2 of one aperture under turbulence whose wind is a vector or 0, on average over `n_draws` exposures.
+    """Return |OTF|^2 of one aperture, on average over exposures drawn as by `drawn_powers`."""
+    total, squares = torch.zeros(grid.shape, dtype=torch.float64), torch.zeros(grid.shape, dtype=torch.float64)
+    how = {"n_draws": n_draws, "n_instants": n_instants, "oversampling": oversampling}
+    for power in drawn_powers(aperture, grid, seeing, band, **how, generator=generator):
+        total, squares = total + power.sum(0), squares + (power**2).sum(0)
+    mean = total / n_draws
+    perfect = perfect_power(aperture, grid, band, oversampling=oversampling)
+    return Drawn(mean, ((squares / n_draws - mean**2) / n_draws).sqrt(), perfect)
+
+
+def perfect_power(aperture: Aperture, grid: Grid, band: Band | None = None, *, oversampling: int = 1) -> Tensor:
+    """|OTF|^2 (H, W) of the samples of an aperture without turbulence."""
+    band, samples = _sampled(aperture, grid, band, oversampling)
+    total = torch.zeros(grid.shape, dtype=torch.complex128)
+    for own, share in zip(samples, band.shares, strict=True):
+        total += share * _otf(own, grid)
+    return total.abs() ** 2
+
+
+def drawn_powers(
+    aperture: Aperture,
+    grid: Grid,
+    seeing: Seeing,
+    band: Band | None = None,
+    *,
+    n_draws: int,
+    n_instants: int = 1,
+    oversampling: int = 1,
+    generator: torch.Generator | None = None,
+) -> Iterator[Tensor]:
+    """Return |OTF|^2 of `n_draws` exposures of one aperture under turbulence whose wind is a vector or 0, some at a time.
 
     An exposure is the mean of `n_instants`, the pupil sampled for a field `oversampling` times as wide as the grid.
     """
-    band = Band.of([grid.wavelength]) if band is None else band
-    grids = [Grid(grid.n_pixels, grid.pixel_scale, wavelength) for wavelength in band.wavelengths]
-    samples = [aperture.samples(own, oversampling) for own in grids]
+    band, samples = _sampled(aperture, grid, band, oversampling)
     open_ = [own.weights > 0 for own in samples]
     wind = torch.tensor(seeing.wind if isinstance(seeing.wind, tuple) else (seeing.speed, 0.0), dtype=torch.float64)
     times = (torch.arange(n_instants, dtype=torch.float64) + 0.5) / n_instants * seeing.exposure
     places = [(own.offsets + aperture.centers[:, None])[inside] for own, inside in zip(samples, open_, strict=True)]
     covariance = _covariance(torch.cat([place - time * wind for time in times for place in places]), seeing)
     factor = torch.linalg.cholesky(covariance + 1e-9 * torch.eye(len(covariance), dtype=torch.float64))
-    perfect = sum(share * _otf(own, grid) for own, share in zip(samples, band.shares, strict=True))
-    assert isinstance(perfect, Tensor)
-    total, squares = torch.zeros(grid.shape, dtype=torch.float64), torch.zeros(grid.shape, dtype=torch.float64)
     for first in range(0, n_draws, _FRAMES):
         count = min(_FRAMES, n_draws - first)
         phases = (factor @ torch.randn(len(factor), count, dtype=torch.float64, generator=generator)).T
@@ -71,10 +97,14 @@ def drawn_mean_square(
                 phase = torch.zeros(count, *inside.shape, dtype=torch.float64)
                 phase[:, inside] = next(pieces) * grid.wavelength / wavelength
                 otf += share / n_instants * _otf(own, grid, phase)
-        power = otf.abs() ** 2
-        total, squares = total + power.sum(0), squares + (power**2).sum(0)
-    mean = total / n_draws
-    return Drawn(mean, ((squares / n_draws - mean**2) / n_draws).sqrt(), perfect.abs() ** 2)
+        yield otf.abs() ** 2
+
+
+def _sampled(aperture: Aperture, grid: Grid, band: Band | None, oversampling: int) -> tuple[Band, list[PupilSamples]]:
+    """Return the band, and the samples of the pupil at each of its wavelengths."""
+    band = Band.of([grid.wavelength]) if band is None else band
+    grids = [Grid(grid.n_pixels, grid.pixel_scale, wavelength) for wavelength in band.wavelengths]
+    return band, [aperture.samples(own, oversampling) for own in grids]
 
 
 def _covariance(points: Tensor, seeing: Seeing) -> Tensor:

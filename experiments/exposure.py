@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from observing import ObservingOptions, check, observe, page, smoke
-from trade import Trade, figure
+from trade import Trade, figure, predictions
 
 from torchmask.cli.program import run_script
 from torchmask.cli.run import new_run
@@ -50,7 +50,7 @@ def run(options: Options) -> None:
         settings = [{"exposure": t, "n_photons": options.n_photons * t} for t in options.exposures]
         rows = observe(options, "exposure", settings, output.callback)
         trade = Trade("exposure", "T/tau0", "exposure T / tau$_0$", kept_contrast, "by two independent points")
-        cells = trade.summarise(rows)
+        cells = trade.summarise(rows, predictions(options, "exposure", settings, output.callback))
         found = trade.findings(cells)
         text = page(options, "Exposure time", found, cells, trade.columns, "The light is that in tau0.")
         output.report("exposure", {"cells": cells, "rows": rows}, text, figure(trade, cells))

@@ -134,10 +134,7 @@ def observe(
     options: ObservingOptions, stage: str, settings: Iterable[Mapping[str, Any]], callback: Callback
 ) -> list[dict[str, Any]]:
     """Return a row with `score` and `seconds` for each of the settings, instrument and seed, with one mask for all."""
-    mask = choose_mask(options, callback)
-    names = ("d_over_r0", "outer_scale", "n_photons", "readout_noise", "n_frames", "n_pixels", "iterations")
-    common = {name: getattr(options, name) for name in names} | {"torchmask": torchmask.__version__}
-    common |= {"centers": mask.centers.tolist(), "subaperture_diameter": mask.subaperture_diameter}
+    common = shared(options, callback)
     draws = [
         {**setting, "instrument": which, "seed": seed}
         for setting, which, seed in itertools.product(settings, options.instruments, options.seeds)
@@ -146,6 +143,14 @@ def observe(
         measure, [common | draw for draw in draws], options.sweep / "tasks", stage=stage, **options.keywords(callback)
     )
     return [draw | dict(result) for draw, result in zip(draws, results, strict=True)]
+
+
+def shared(options: ObservingOptions, callback: Callback) -> dict[str, Any]:
+    """Return what all tasks share, with the mask."""
+    mask = choose_mask(options, callback)
+    names = ("d_over_r0", "outer_scale", "n_photons", "readout_noise", "n_frames", "n_pixels", "iterations")
+    common = {name: getattr(options, name) for name in names} | {"torchmask": torchmask.__version__}
+    return common | {"centers": mask.centers.tolist(), "subaperture_diameter": mask.subaperture_diameter}
 
 
 def scores(rows: Sequence[Mapping[str, Any]], reference: Sequence[Mapping[str, Any]] = ()) -> dict[str, float]:

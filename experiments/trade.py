@@ -1,15 +1,26 @@
-"""Code shared by `exposure` and `band`: the trade of more light against less contrast, for each instrument."""
+"""Code shared by `exposure` and `band`: the trade of more light against less contrast, restored and predicted."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import itertools
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from mask_vs_full import instrument
+from mask_vs_full_options import DIAMETER, WAVELENGTH
 from mask_vs_full_report import INSTRUMENTS
-from observing import curves, optimum, scores
+from observing import SIZE, WIND, ObservingOptions, curves, optimum, scores, shared
 
+from torchmask.atmosphere.seeing import Seeing
+from torchmask.design.sweep import run_tasks
+from torchmask.design.turbulent import TurbulentMSE
+from torchmask.grid import Grid
+from torchmask.optics.band import Band
+from torchmask.record import Callback
+from torchmask.spectra import NoisePSD, PowerLawPSD
 from torchmask.viz.style import FAINT, new_figure, styled
 
 if TYPE_CHECKING:
@@ -32,11 +43,13 @@ class Trade:
     kept: Callable[[float], float]
     where: str
 
-    def summarise(self, rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-        """Return one cell for each instrument and amount."""
+    def summarise(
+        self, rows: Sequence[Mapping[str, Any]], predicted: Mapping[tuple[str, float], float]
+    ) -> list[dict[str, Any]]:
+        """Return one cell for each instrument and amount, with the score that `predictions` give."""
         keys = dict.fromkeys((row["instrument"], row[self.key]) for row in rows)
         return [
-            {"instrument": which, self.key: amount, "kept": self.kept(amount)}
+            {"instrument": which, self.key: amount, "kept": self.kept(amount), "predicted": predicted[which, amount]}
             | scores([row for row in rows if (row["instrument"], row[self.key]) == (which, amount)])
             for which, amount in keys
         ]
@@ -50,14 +63,54 @@ class Trade:
                 best = min(own, key=lambda cell: cell["score"])
                 lines.append(
                     f"The {name} is best at {self.name} = {optimum(own, self.key)}, with a score of "
-                    f"{best['score']:.3f}; {best['kept']:.3f} of V^2 is kept {self.where} there."
+                    f"{best['score']:.3f}; {best['kept']:.3f} of V^2 is kept {self.where} there. "
+                    f"Between the amounts the best is {between(own, self.key, 'score'):.2g}, and that predicted "
+                    f"{between(own, self.key, 'predicted'):.2g}."
                 )
         return lines
 
     @property
     def columns(self) -> dict[str, str]:
         """Heads of the table beside instrument and score."""
-        return {self.key: self.name, "kept": f"V^2 kept {self.where}"}
+        return {self.key: self.name, "kept": f"V^2 kept {self.where}", "predicted": "predicted score"}
+
+
+def between(cells: Sequence[Mapping[str, Any]], key: str, value: str) -> float:
+    """Return the amount of least `value` by a parabola over its logarithm, or the least at an end."""
+    order = sorted(cells, key=lambda cell: cell[key])
+    least = min(range(len(order)), key=lambda k: order[k][value])
+    if least in (0, len(order) - 1):
+        return order[least][key]
+    near = order[least - 1 : least + 2]
+    curve = np.polynomial.Polynomial.fit([math.log(cell[key]) for cell in near], [cell[value] for cell in near], 2)
+    return math.exp(float(curve.deriv().roots()[0]))
+
+
+def predict(task: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the score of `observing.measure` that TurbulentMSE predicts for known PSFs and an object of a power law."""
+    aperture, mask = instrument(task), instrument({**task, "instrument": "mask"})
+    side, r0 = task["n_pixels"], DIAMETER / task["d_over_r0"]
+    grid = Grid.nyquist(DIAMETER, WAVELENGTH, 2 * side, task.get("oversampling", 1.0))
+    photons = float(task["n_photons"] * aperture.area / mask.area)
+    exposure = task.get("exposure", 0.0) * Seeing(r0, wind=WIND).tau0
+    band = Band.top_hat(WAVELENGTH, task["band"] * WAVELENGTH, 5) if "band" in task else Band.of([WAVELENGTH])
+    criterion = TurbulentMSE(
+        *(grid, PowerLawPSD(1.5, photons, 1 / (SIZE * side)), NoisePSD(photons, task["readout_noise"], side**2)),
+        *(task["n_frames"], r0, task["outer_scale"] * DIAMETER, exposure, WIND if exposure else 0.0),
+        *(band.wavelengths, band.shares),
+    )
+    floor = criterion.floor(DIAMETER)
+    return {"predicted": math.sqrt(float((criterion(aperture) - floor) / (criterion.object_psd.mean() - floor)))}
+
+
+def predictions(
+    options: ObservingOptions, key: str, settings: Iterable[Mapping[str, Any]], callback: Callback
+) -> dict[tuple[str, float], float]:
+    """Return the predicted score for each instrument and amount."""
+    common, cases = shared(options, callback), list(itertools.product(options.instruments, settings))
+    tasks = [common | dict(setting) | {"instrument": which} for which, setting in cases]
+    found = run_tasks(predict, tasks, options.sweep / "tasks", stage="predicted", **options.keywords(callback))
+    return {(which, setting[key]): row["predicted"] for (which, setting), row in zip(cases, found, strict=True)}
 
 
 @styled

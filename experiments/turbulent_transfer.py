@@ -109,8 +109,10 @@ class Compared(NamedTuple):
         }
 
 
-def check(options: Options, grid: Grid) -> None:
+def check(options: Options) -> None:
     """Raise ValueError for what could not be drawn."""
+    if not 0 <= options.width < 1:
+        raise ValueError(f"width is {options.width}: it must be at least 0 and less than 1, over the wavelength")
     if options.n_draws < 2:
         raise ValueError(f"n_draws is {options.n_draws}: a standard error needs at least 2")
     for ratio in (*options.hole_over_r0, *options.pupil_over_r0):
@@ -119,6 +121,7 @@ def check(options: Options, grid: Grid) -> None:
     many = (options.n_instants if options.exposure_tau0 > 0 else 1) * (
         options.n_wavelengths if options.width > 0 else 1
     )
+    grid = grid_of(options)
     for case in cases(options, grid):
         samples = many * int((case.aperture.samples(grid, case.oversampling).weights > 0).sum())
         if samples > _MOST:
@@ -126,6 +129,11 @@ def check(options: Options, grid: Grid) -> None:
                 f"{case.name} have {samples} samples in all instants and wavelengths, more than the {_MOST} whose "
                 "covariance is drawn from: lower --samples-per-hole, --n-instants, --n-wavelengths or the sizes"
             )
+
+
+def grid_of(options: Options) -> Grid:
+    """Return the grid, whose pixels sample the shortest wavelength of the band."""
+    return Grid.nyquist(DIAMETER, WAVELENGTH, options.n_pixels, 1 / (1 - options.width / 2))
 
 
 def cases(options: Options, grid: Grid) -> Iterator[Case]:
@@ -248,8 +256,8 @@ def run(options: Options) -> None:
     if options.smoke:
         tiny = {"n_subapertures": (4,), "hole_over_r0": (0.8,), "n_pixels": 24, "n_draws": 100}
         options = dataclasses.replace(options, **tiny)
-    grid = Grid.nyquist(DIAMETER, WAVELENGTH, options.n_pixels)
-    check(options, grid)
+    check(options)
+    grid = grid_of(options)
     with new_run("turbulent_transfer", options) as output:
         found = []
         for case in cases(options, grid):

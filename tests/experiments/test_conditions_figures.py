@@ -1,6 +1,7 @@
 """The experiments on field, exposure, band and modes: their closed forms, what they conclude, and tiny runs."""
 
 import json
+import math
 
 import anisoplanatism
 import band
@@ -8,8 +9,14 @@ import exposure
 import observing
 import pytest
 import rival_modes
+import trade
 
 from torchmask.atmosphere.layers import Layers
+from torchmask.design.criterion import AsymptoticMSE
+from torchmask.grid import Grid
+from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.band import Band
+from torchmask.spectra import NoisePSD, PowerLawPSD
 
 SCRIPTS = {"anisoplanatism": anisoplanatism, "exposure": exposure, "band": band, "rival_modes": rival_modes}
 
@@ -51,9 +58,39 @@ def test_the_optimum_names_what_is_not_told_from_it():
     assert observing.optimum(cells, "x") == "2 (not told from 4)"
 
 
+def test_the_best_amount_between_those_tried():
+    def of(best, amounts):
+        return [{"x": x, "score": 0.2 + 0.1 * math.log(x / best) ** 2} for x in amounts]
+
+    assert trade.between(of(1.4, (4.0, 0.5, 1.0, 2.0)), "x", "score") == pytest.approx(1.4, rel=1e-9)
+    assert trade.between(of(3.0, (0.5, 1.0, 2.0)), "x", "score") == 2.0  # none beyond is known
+
+
+def test_a_predicted_score_is_that_of_the_criterion_for_the_same_light(monkeypatch):
+    centers, told = [[0.0, 0.4], [0.3, -0.2], [-0.3, -0.2]], []
+
+    def note(grid, signal, noise, n_frames, *turbulence):
+        told.append(turbulence)
+        return AsymptoticMSE(grid, signal, noise, n_frames)
+
+    monkeypatch.setattr(trade, "TurbulentMSE", note)  # its tables would take seconds
+    task = {"centers": centers, "subaperture_diameter": 0.2, "n_pixels": 16, "d_over_r0": 3.0, "outer_scale": 20.0}
+    task |= {"readout_noise": 1.5, "n_frames": 4, "n_photons": 1e5, "exposure": 0.5, "band": 0.1, "instrument": "mask"}
+    psds = PowerLawPSD(1.5, 1e5, 1 / 8), NoisePSD(1e5, 1.5, 16**2)
+    criterion = AsymptoticMSE(Grid.nyquist(1.0, 550e-9, 32), *psds, 4)
+    floor = criterion.relative_floor(1.0)
+    seen = (float(criterion.relative(SparseAperture(centers, 0.2, 1.0))) - floor) / (1 - floor)
+    assert trade.predict(task)["predicted"] == pytest.approx(math.sqrt(seen), rel=1e-9)
+    ((r0, outer_scale, exposure, wind, wavelengths, shares),) = told
+    assert (r0, outer_scale, wind) == (1 / 3, 20.0, observing.WIND)
+    assert exposure == pytest.approx(0.5 * 0.314 * r0 / wind, rel=1e-3)  # tau0 = 0.314 r0 / wind
+    assert (wavelengths, shares) == (Band.top_hat(550e-9, 55e-9, 5).wavelengths, Band.top_hat(550e-9, 55e-9, 5).shares)
+
+
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_a_tiny_run_writes_numbers_table_picture_and_log(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(trade, "predict", lambda task: {"predicted": 0.5})  # takes seconds, and has a test of its own
     assert SCRIPTS[name].main(["--smoke", "--workers", "1", "--out", "run"]) == 0
     result = json.loads((tmp_path / f"run/{name}.json").read_text())
     assert all(0 < row["score"] < 10 for row in result["rows"])

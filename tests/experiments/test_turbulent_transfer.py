@@ -1,10 +1,11 @@
 """The closed form of E|OTF|^2 beside draws: a tiny run, and a subset of the comparison with the claim as tolerance."""
 
+import dataclasses
 import json
 
 import pytest
 import turbulent_transfer
-from turbulent_transfer import DIAMETER, WAVELENGTH, Options, cases, check, compare, conditions, draw
+from turbulent_transfer import DIAMETER, WAVELENGTH, Options, cases, check, compare, conditions, draw, grid_of
 
 from torchmask.atmosphere.seeing import Seeing
 from torchmask.grid import Grid
@@ -37,10 +38,20 @@ def test_a_tiny_run_writes_picture_numbers_and_table(tmp_path):
     assert (tmp_path / "run" / "turbulent_transfer.png").stat().st_size > 10_000
 
 
+def test_every_wavelength_of_a_band_is_sampled():
+    options = dataclasses.replace(OPTIONS, width=0.2, n_draws=2, samples_per_hole=4)
+    grid = grid_of(options)
+    for case in cases(options, grid):
+        drawn = draw(options, case, grid)
+        assert float(drawn.mean[0, 0]) == pytest.approx(float(drawn.perfect[0, 0]), rel=1e-9)  # all light is there
+
+
 def test_impossible_requests_are_refused():
     with pytest.raises(ValueError, match="at least 2"):
-        check(Options(n_draws=1), GRID)
+        check(Options(n_draws=1))
     with pytest.raises(ValueError, match="must be positive"):
-        check(Options(hole_over_r0=(0.0,)), GRID)
+        check(Options(hole_over_r0=(0.0,)))
     with pytest.raises(ValueError, match="lower --samples-per-hole"):
-        check(Options(exposure_tau0=1.0, width=0.1), GRID)
+        check(Options(exposure_tau0=1.0, width=0.1))
+    with pytest.raises(ValueError, match="width is 1"):
+        check(Options(width=1.0))
