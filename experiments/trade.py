@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from mask_vs_full import instrument
 from mask_vs_full_options import DIAMETER, WAVELENGTH
 from mask_vs_full_report import INSTRUMENTS
@@ -25,6 +26,9 @@ from torchmask.viz.style import FAINT, new_figure, styled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+_NOTHING = 1e-12  # of the object's power
 
 
 @dataclass(frozen=True)
@@ -94,13 +98,15 @@ def predict(task: Mapping[str, Any]) -> dict[str, Any]:
     photons = float(task["n_photons"] * aperture.area / mask.area)
     exposure = task.get("exposure", 0.0) * Seeing(r0, wind=WIND).tau0
     band = Band.top_hat(WAVELENGTH, task["band"] * WAVELENGTH, 5) if "band" in task else Band.of([WAVELENGTH])
+    signal = PowerLawPSD(1.5, photons, 1 / (SIZE * side))(grid)
+    nu_y, nu_x = grid.frequencies(signal.dtype)
+    signal[torch.hypot(nu_y, nu_x) >= grid.cutoff(DIAMETER)] *= _NOTHING  # no score counts what lies beyond
     criterion = TurbulentMSE(
-        *(grid, PowerLawPSD(1.5, photons, 1 / (SIZE * side)), NoisePSD(photons, task["readout_noise"], side**2)),
+        *(grid, signal, NoisePSD(photons, task["readout_noise"], side**2)),
         *(task["n_frames"], r0, task["outer_scale"] * DIAMETER, exposure, WIND if exposure else 0.0),
         *(band.wavelengths, band.shares),
     )
-    floor = criterion.floor(DIAMETER)
-    return {"predicted": math.sqrt(float((criterion(aperture) - floor) / (criterion.object_psd.mean() - floor)))}
+    return {"predicted": math.sqrt(float(criterion.relative(aperture)))}
 
 
 def predictions(
