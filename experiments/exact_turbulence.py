@@ -76,7 +76,7 @@ def drawn_powers(
     oversampling: int = 1,
     generator: torch.Generator | None = None,
 ) -> Iterator[Tensor]:
-    """Return |OTF|^2 of `n_draws` exposures of one aperture under turbulence whose wind is a vector or 0, some at a time.
+    """Return |OTF|^2 of `n_draws` exposures of one aperture under turbulence, wind a vector or 0, some at a time.
 
     An exposure is the mean of `n_instants`, the pupil sampled for a field `oversampling` times as wide as the grid.
     """

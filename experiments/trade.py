@@ -91,7 +91,7 @@ def between(cells: Sequence[Mapping[str, Any]], key: str, value: str) -> float:
 
 
 def predict(task: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the score of `observing.measure` that TurbulentMSE predicts for known PSFs and an object of a power law."""
+    """Return the score of `observing.measure` that TurbulentMSE predicts for known PSFs and a power-law object."""
     aperture, mask = instrument(task), instrument({**task, "instrument": "mask"})
     side, r0 = task["n_pixels"], DIAMETER / task["d_over_r0"]
     grid = Grid.nyquist(DIAMETER, WAVELENGTH, 2 * side, task.get("oversampling", 1.0))
