@@ -17,15 +17,14 @@ GRID = Grid.nyquist(1.0, 550e-9, 24)
 MASK = SparseAperture([[0.0, 0.3], [0.0, 0.0], [0.3, 0.3], [0.3, 0.0]], 0.2, 1.0)  # pairs share baselines
 
 
-def test_a_tiny_run_writes_numbers_and_table(tmp_path):
+def test_a_tiny_run_writes_numbers_and_table(tmp_path, monkeypatch):
+    monkeypatch.setattr(jensen, "pupils", lambda *_: [("4 holes", MASK, 2, 40)])  # a full pupil takes seconds
     assert jensen.main(["--smoke", "--out", str(tmp_path / "run")]) == 0
     rows = json.loads((tmp_path / "run/jensen.json").read_text())["rows"]
-    assert [(row["pupil"], row["n_frames"]) for row in rows] == [
-        (pupil, frames) for pupil in ("4 holes", "full pupil") for frames in (2, 4)
-    ]
+    assert [row["n_frames"] for row in rows] == [2, 4]
     assert all(row["alone"] < row["with_term"] and row["standard_error"] > 0 for row in rows)
     table = (tmp_path / "run/jensen.md").read_text().splitlines()
-    assert len([line for line in table if line.startswith("|")]) == 2 + 2
+    assert len([line for line in table if line.startswith("|")]) == 2 + 1
 
 
 def test_pistons_alone_are_predicted(seeded, monkeypatch):
