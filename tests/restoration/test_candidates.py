@@ -186,13 +186,19 @@ def restore(stack, schedule=None, **known):
 
 
 @pytest.mark.slow
-def test_candidates_explain_more_than_a_single_start(stack):
-    one = Schedule(candidates=())
-    many, aberrations = restore(stack), restore(stack, known_object=stack.object)
-    single, lonely = restore(stack, one), restore(stack, one, known_object=stack.object)
-    assert float(many.chi_square.mean()) < 0.7 * float(single.chi_square.mean())
-    assert float(aberrations.chi_square.mean()) < 0.85 * float(lonely.chi_square.mean())
-    assert relative_error(many.object, stack.object, 0.5) < 0.8 * relative_error(single.object, stack.object, 0.5)
+def test_candidates_explain_more_than_a_single_start():
+    """By the mean logarithm of the chi-squares of twelve frames, with the object known.
+
+    A single start loses frames in other minima. Its mean is larger by 1.9 with a standard error of 0.7, so three of
+    these are hardly more than the difference. With an unknown object, candidates leave 0.68 of its chi-square (log
+    scatter 0.33 over eight stacks) and 0.86 of its error, which takes too many stacks to be tested here.
+    """
+    logs = []
+    for schedule in (None, Schedule(candidates=())):
+        stacks = [exposures(seed) for seed in (6, 7, 8)]
+        found = [restore(seen, schedule, known_object=seen.object) for seen in stacks]
+        logs.append(float(torch.cat([result.chi_square for result in found]).log().mean()))
+    assert logs[0] < logs[1]
 
 
 @pytest.mark.slow
