@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -42,14 +42,12 @@ def drawn_mean_square(
     band: Band | None = None,
     *,
     n_draws: int,
-    n_instants: int = 1,
     oversampling: int = 1,
-    generator: torch.Generator | None = None,
+    **others: Any,
 ) -> Drawn:
-    """Return |OTF|^2 of one aperture, on average over exposures drawn as by `drawn_powers`."""
+    """Return |OTF|^2 of one aperture, on average over exposures of `drawn_powers`, which takes the `others`."""
     total, squares = torch.zeros(grid.shape, dtype=torch.float64), torch.zeros(grid.shape, dtype=torch.float64)
-    how = {"n_draws": n_draws, "n_instants": n_instants, "oversampling": oversampling}
-    for power in drawn_powers(aperture, grid, seeing, band, **how, generator=generator):
+    for power in drawn_powers(aperture, grid, seeing, band, n_draws=n_draws, oversampling=oversampling, **others):
         total, squares = total + power.sum(0), squares + (power**2).sum(0)
     mean = total / n_draws
     perfect = perfect_power(aperture, grid, band, oversampling=oversampling)

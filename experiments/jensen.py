@@ -200,7 +200,7 @@ def run(options: Options) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The exit status."""
+    """Return the exit status."""
     return run_script("jensen", run, Options, __doc__, argv)
 
 

@@ -7,6 +7,7 @@ from torchmask.restoration.aberrations import turbulent_basis
 from torchmask.restoration.checkpoint import Ending, Status
 from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.judge import Judge
+from torchmask.restoration.model_error import LeftOut, expected_error, fitted_parameters
 from torchmask.restoration.motion import Setting
 from torchmask.restoration.placed import moved_centers
 from torchmask.restoration.placement import moved
@@ -72,3 +73,7 @@ def test_the_last_descent_is_held_to_the_modes_of_the_search(explain, five_holes
     assert after.phase_error == pytest.approx(before.phase_error, rel=1e-6)
     # five modes more in each of five holes, less what their prior holds
     assert 0 < before.degrees_of_freedom - after.degrees_of_freedom <= 25 * len(objective.frames)
+    left_out = LeftOut.of(five_holes, n_modes + 5, TRAITS.r0, TRAITS.outer_scale)
+    fitted = expected_error(at_end, there, left_out).fitted
+    assert fitted_parameters(at_end, there) == pytest.approx(fitted, rel=1e-9)
+    assert after.degrees_of_freedom == round(objective.frames.numel() - fitted * len(objective.frames))

@@ -105,11 +105,9 @@ def run(options: Options) -> None:
 
 def _design_command(mask: Aperture, folder: Path) -> str:
     """Return the command that searches a mask of as many holes of this size."""
-    fill_factor = mask.n_subapertures * (mask.subaperture_diameter / mask.mask_diameter) ** 2
     file = shlex.quote(str(folder / "instrument.json"))
-    return (
-        f"torchmask design --instrument {file} --n-subapertures {mask.n_subapertures} --fill-factor {fill_factor:.4g}"
-    )
+    size = f"--n-subapertures {mask.n_subapertures} --fill-factor {mask.fill_factor:.4g}"
+    return f"torchmask design --instrument {file} {size}"
 
 
 def _with_blind_mse(choice: Choice) -> dict[str, Any]:

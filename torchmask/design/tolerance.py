@@ -229,7 +229,6 @@ class _Workshop:
     def errors(self, position_rms: float, diameter_rms: float) -> MachiningErrors:
         """Return the distribution of the MSE at this size of the errors [m]."""
         centers = self.aperture.centers + position_rms * self.position
-        nominal = float(self.criterion(self.aperture))
         if diameter_rms == 0:
             mse = self.criterion(self.aperture.replace(centers=centers))
         else:
@@ -240,11 +239,16 @@ class _Workshop:
                 own = torch.from_numpy(nearest == node).to(centers.device)
                 moved = self.criterion(self._of_size(node).replace(centers=centers[own]))
                 mse[own] *= moved / float(self._of_diameter(_DIAMETERS[node]))
-        return MachiningErrors(position_rms, diameter_rms, nominal, mse)
+        return MachiningErrors(position_rms, diameter_rms, self._nominal, mse)
 
     def _of_size(self, node: int) -> SparseAperture:
         diameter = self.aperture.subaperture_diameter * (1 + float(_DIAMETERS[node]))
         return self.aperture.replace(subaperture_diameter=diameter)
+
+    @cached_property
+    def _nominal(self) -> float:
+        """The MSE of the mask as designed."""
+        return float(self.criterion(self.aperture))
 
     @cached_property
     def _of_diameter(self) -> CubicSpline:

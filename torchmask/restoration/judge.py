@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import NamedTuple
 
 from torchmask.restoration.calibration import fit_of_frames
 from torchmask.restoration.checkpoint import Ending, Status
 from torchmask.restoration.frames import FrameStack
-from torchmask.restoration.model_error import NO_MODEL_ERROR, LeftOut, ModelError, expected_error
+from torchmask.restoration.model_error import NO_MODEL_ERROR, LeftOut, ModelError, expected_error, fitted_parameters
 from torchmask.restoration.motion import Setting
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.schedule import Schedule
-from torchmask.restoration.state import Modes, State
+from torchmask.restoration.state import State
 from torchmask.restoration.traits import Traits
 from torchmask.restoration.verdict import Tolerance, Verdict, judge
 
@@ -31,7 +32,6 @@ class Judge:
     def __init__(self, setting: Setting, stack: FrameStack, traits: Traits, schedule: Schedule) -> None:
         least = schedule.missed * stack.change if traits.many_minima else 0.0  # allows for its usual minima
         self.setting: Setting = setting
-        self._beyond: dict[int, LeftOut] = {}  # by the number of modes of the basis
         self.traits: Traits = traits
         self.alike: float = schedule.alike
         self.contrast: float = stack.contrast
@@ -66,15 +66,11 @@ class Judge:
         The last descent is too short to bring all its modes to rest, so the fit is not held to what they could explain;
         the degrees of freedom count them nonetheless.
         """
-        error = expected_error(objective, state, self._left_out(objective.model.aberrations.n_modes))
-        if state.modes is not Modes.FINER:
-            return error
         first = self.setting.in_first_modes(state)
-        objective = self.setting.objective_at(objective, first)
-        before = expected_error(objective, first, self._left_out(objective.model.aberrations.n_modes))
-        return before._replace(fitted=error.fitted)
+        error = expected_error(self.setting.objective_at(objective, first), first, self._left_out)
+        return error if first is state else error._replace(fitted=fitted_parameters(objective, state))
 
-    def _left_out(self, n_modes: int) -> LeftOut:
-        if n_modes not in self._beyond:
-            self._beyond[n_modes] = LeftOut.of(self.setting.told, n_modes, self.traits.r0, self.traits.outer_scale)
-        return self._beyond[n_modes]
+    @cached_property
+    def _left_out(self) -> LeftOut:
+        n_modes = self.setting.still.n_modes
+        return LeftOut.of(self.setting.told, n_modes, self.traits.r0, self.traits.outer_scale)

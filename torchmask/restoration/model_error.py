@@ -85,6 +85,21 @@ class LeftOut:
         return self.own.turbulence_strength(self.own.parameters_of(coefficients)) or 1.0
 
 
+def fitted_parameters(objective: MyopicObjective, state: State) -> float:
+    """Return `fitted` of `ModelError` alone, for which nothing is simulated."""
+
+    @torch.no_grad()  # needed here too, as no_grad applies to one thread only
+    def of_frame(number: int) -> float:
+        part = slice(number, number + 1)
+        frame, own = objective.of_frames(part), state.of_frames(part)
+        tangents, held = _tangents(frame, own, frame.model(own.image, own.z), frame.precision.sqrt())
+        gram = tangents @ tangents.T
+        return float(torch.linalg.solve(gram + held.diag(), gram).trace())
+
+    chosen = _some_frames(state)
+    return sum(objective.parallel(of_frame, chosen)) / len(chosen)
+
+
 def expected_error(objective: MyopicObjective, state: State, left_out: LeftOut) -> ModelError:
     """Return the expected model error of a good fit such as `state`; it is the same for every call."""
     model, rest = objective.model, left_out.rest
@@ -92,7 +107,7 @@ def expected_error(objective: MyopicObjective, state: State, left_out: LeftOut) 
     strength = left_out.strength(objective, state)
     field, kind = model.window.field, {"dtype": model.dtype, "device": model.device}
     high = SampledPupil(model.pupil.aperture, field, model.band, rest, **kind).samples()
-    chosen = sorted({round(t) for t in np.linspace(0, len(state.z) - 1, _FRAMES)})
+    chosen = _some_frames(state)
     generator = torch.Generator().manual_seed(0)
     drawn = torch.randn(len(chosen), rest.n_parameters, dtype=torch.float64, generator=generator, device="cpu")
     phases = high.phase(math.sqrt(strength) * drawn.to(model.device))
@@ -106,6 +121,11 @@ def expected_error(objective: MyopicObjective, state: State, left_out: LeftOut) 
     excess, fitted = (sum(values) / len(tried) for values in zip(*tried, strict=True))
     variance = strength * float(rest.mixing.square().sum()) / rest.n_subapertures
     return ModelError(excess, fitted, math.sqrt(variance))
+
+
+def _some_frames(state: State) -> list[int]:
+    """Return at most `_FRAMES` frames, spread over the stack."""
+    return sorted({round(t) for t in np.linspace(0, len(state.z) - 1, _FRAMES)})
 
 
 def _excess_of_frame(frame: MyopicObjective, state: State, phase: Tensor) -> tuple[float, float]:
