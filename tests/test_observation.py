@@ -47,12 +47,13 @@ def test_everything_survives_the_file(tmp_path, mask):
         valid=frames_of(3, 3) > 0.1,
         errors=frames_of(3, 4),
         header={"OBJECT": "satellite", "CRPIX1": 5.0, "EQUINOX": 2000},
+        frame_numbers=(4, 5, 9),
     )
     whole.save(tmp_path / "a.npz")
     back = Observation.load(tmp_path / "a.npz")
     for name in ARRAYS:
         assert torch.equal(getattr(back, name), getattr(whole, name)), name
-    for name in ("grid", "readout_noise", "r0", "outer_scale", "n_photons", "header"):
+    for name in ("grid", "readout_noise", "r0", "outer_scale", "n_photons", "header", "frame_numbers"):
         assert getattr(back, name) == getattr(whole, name), name
     assert torch.equal(back.aperture.centers, mask.centers)
     for name in ("subaperture_diameter", "mask_diameter", "shape"):
@@ -64,6 +65,8 @@ def test_some_frames_come_with_what_belongs_to_them(mask):
     per_frame |= {"valid": frames_of(4, 3) > 0.5, "transmission": torch.rand(4)}
     whole = Observation(frames_of(4), mask, GRID, 1.5, object=frames_of(1)[0], header={"OBJECT": "x"}, **per_frame)
     part = whole.take([3, 1])
+    assert (whole.frame_numbers, part.frame_numbers) == ((0, 1, 2, 3), (3, 1))
+    assert part.take([1]).frame_numbers == (1,)
     for name in ("frames", *per_frame):
         assert torch.equal(getattr(part, name), getattr(whole, name)[[3, 1]]), name
     assert part.object is whole.object

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,10 +14,11 @@ import torch
 from torch import Tensor
 
 from torchmask.grid import Grid
-from torchmask.io import extra, load_npz, save_npz
+from torchmask.io import load_npz, save_npz
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.bad_pixels import fill_bad_pixels
 from torchmask.optics.records import aperture_record, read_aperture
+from torchmask.optics.sky import pixel_matrix
 from torchmask.record import Brief
 
 _NEEDED_NUMBERS = ("subaperture_diameter", "mask_diameter", "pixel_scale", "wavelength")
@@ -33,11 +32,6 @@ _ARRAYS = ("object", "psfs", "phases", "valid", "errors", "transmission")
 _TRUE = "true_"  # prefix of the true aperture's entries in a file
 
 PHASE_OVERSAMPLING = 4  # oversampling of the pupil samples on which phases are stored
-
-_CELESTIAL = re.compile(
-    r"WCSAXES|CRPIX[12]|CRVAL[12]|CTYPE[12]|CUNIT[12]|CDELT[12]|CROTA[12]|CD[12]_[12]|PC[12]_[12]|P[VS][12]_\d+"
-    r"|LONPOLE|LATPOLE|RADESYS|EQUINOX|[AB]P?_(ORDER|DMAX|\d+_\d+)"
-)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -61,6 +55,8 @@ class Observation(Brief):
     background : true sky [electrons per pixel and frame]
     transmission : (T,) true transmission of each frame, 1 on average
     header : FITS cards that belong to the frames: sky coordinates, target, telescope, filter, date
+    frame_numbers : number of each frame in the files it was read from, counted from 0 through all of them; 0 to T - 1
+        by default
 
     In real observations the truth (object, psfs, phases, r0, outer_scale, n_photons, background, transmission,
     true_aperture) is None.
@@ -91,6 +87,7 @@ class Observation(Brief):
     true_aperture: Aperture | None = None
     background: float | None = None
     transmission: Tensor | None = None
+    frame_numbers: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         if self.frames.ndim != 3 or self.frames.shape[-2:] != self.grid.shape or not len(self.frames):
@@ -101,6 +98,7 @@ class Observation(Brief):
         noise = self.readout_noise
         if noise is not None and not (math.isfinite(noise) and noise >= 0):
             raise ValueError(f"readout_noise is {noise}: it must be finite and not negative, in electrons rms")
+        object.__setattr__(self, "frame_numbers", number_frames(self.frame_numbers, len(self.frames)))
         shapes = {"object": self.grid.shape, "psfs": self.frames.shape, "errors": self.frames.shape}
         shapes["transmission"] = (len(self.frames),)
         if self.phases is not None:
@@ -128,13 +126,18 @@ class Observation(Brief):
         return None if matrix is None else torch.from_numpy(matrix)
 
     def take(self, frames: Sequence[int] | np.ndarray) -> Observation:
-        """Return the observation reduced to these frames, numbered from 0."""
+        """Return the observation reduced to frames at these positions, from 0; `frame_numbers` keeps their numbers."""
         chosen = torch.as_tensor(np.asarray(frames, dtype=np.int64), device=self.frames.device)
         per_frame = ["frames", "psfs", "phases", "errors", "transmission"]
         if self.valid is not None and self.valid.ndim == 3:
             per_frame.append("valid")
         parts = {name: getattr(self, name) for name in per_frame}
-        return replace(self, **{name: part[chosen] for name, part in parts.items() if part is not None})
+        numbers = tuple(self.frame_numbers[position] for position in chosen.tolist())
+        return replace(
+            self,
+            frame_numbers=numbers,
+            **{name: part[chosen] for name, part in parts.items() if part is not None},
+        )
 
     def save(self, path: str | Path) -> None:
         """Write the observation to a new compressed .npz file, which `load` reads.
@@ -146,6 +149,7 @@ class Observation(Brief):
             "frames": self.frames,
             "pixel_scale": grid.pixel_scale,
             "wavelength": grid.wavelength,
+            "frame_numbers": np.array(self.frame_numbers),
             **aperture_record(self.aperture),
         }
         if self.true_aperture is not None:
@@ -186,18 +190,33 @@ class Observation(Brief):
             name: torch.from_numpy(stored[name]) for name in _ARRAYS if name in stored
         }
         optional |= {name: number[name] for name in _OPTIONAL_NUMBERS if name in number}
+        if "frame_numbers" in stored:
+            optional["frame_numbers"] = tuple(stored["frame_numbers"].tolist())
         if "header" in stored:
             optional["header"] = json.loads(str(stored["header"]))
         return cls(frames, aperture, grid, number.get("readout_noise"), **optional)
 
 
-def check_frames(frames: Tensor | np.ndarray, valid: Tensor | np.ndarray | None, grid: Grid) -> tuple[Tensor, Tensor]:
+def number_frames(numbers: Sequence[int], n_frames: int) -> tuple[int, ...]:
+    """Return the numbers of `n_frames` frames: those given, or 0, 1, ... if none are.
+
+    Raises ValueError unless there are as many numbers as frames.
+    """
+    if len(numbers) not in (0, n_frames):
+        raise ValueError(f"frame_numbers has {len(numbers)} numbers for {n_frames} frames: give one for each frame")
+    return tuple(numbers) or tuple(range(n_frames))
+
+
+def check_frames(
+    frames: Tensor | np.ndarray, valid: Tensor | np.ndarray | None, grid: Grid, numbers: Sequence[int] = ()
+) -> tuple[Tensor, Tensor]:
     """Return frames (T, H, W) in float64 with their invalid pixels filled in, and `valid` as (T, H, W).
 
     Pixels that are not valid have no weight in later fits, but means and Fourier transforms need values for them, which
     `fill_bad_pixels` provides.
 
-    Raises ValueError if a shape is wrong, a valid pixel is not finite, or a frame has no light.
+    Raises ValueError if a shape is wrong, a valid pixel is not finite, or a frame has no light. The message names
+    frames by `numbers`, or from 0 if none are given.
     """
     frames = frames if isinstance(frames, Tensor) else torch.as_tensor(frames)  # which also moves to a default device
     if frames.ndim != 3 or tuple(frames.shape[1:]) != grid.shape or not len(frames):
@@ -217,14 +236,13 @@ def check_frames(frames: Tensor | np.ndarray, valid: Tensor | np.ndarray | None,
             )
         valid = valid.expand(frames.shape)
         frames = fill_bad_pixels(frames, valid)
+    named = torch.tensor(number_frames(numbers, len(frames)), device=frames.device)
     bad = ~torch.isfinite(frames).flatten(1).all(1)
     if bool(bad.any()):
-        raise ValueError(
-            f"frames {bad.nonzero().flatten().tolist()} hold values that are not finite: mark those pixels in `valid`"
-        )
+        raise ValueError(f"frames {named[bad].tolist()} hold values that are not finite: mark those pixels in `valid`")
     dark = frames.mean((1, 2)) <= 0
     if bool(dark.any()):
-        raise ValueError(f"frames {dark.nonzero().flatten().tolist()} hold no light: leave them out")
+        raise ValueError(f"frames {named[dark].tolist()} hold no light: leave them out")
     return frames, valid
 
 
@@ -234,40 +252,3 @@ def _read_aperture(stored: Mapping[str, Any], prefix: str) -> Aperture:
         name: array.item() if array.size == 1 else array.tolist() for name, array in own.items() if array.ndim < 2
     }
     return read_aperture(values | {"centers": torch.from_numpy(own["centers"])})
-
-
-def pixel_matrix(header: Any) -> np.ndarray | None:
-    """Return the matrix (2, 2) that converts pixels (x, y) to (east, north) [rad], or None if the header has none.
-
-    It is read from CD, PC and CDELT, or CROTA and CDELT. Sky axes in reverse order, DEC before RA, are swapped.
-    """
-    with extra("data"):
-        from astropy.io.fits import Header
-        from astropy.wcs import WCS
-
-    if not any(name in header for name in ("CD1_1", "CD1_2", "CDELT1")):
-        return None
-    cards = Header()
-    for name, value in celestial_cards(header).items():
-        cards[name] = value
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # astropy warns when it corrects old-fashioned cards
-            wcs = WCS(cards, naxis=2)
-            if not all(str(unit) for unit in wcs.wcs.cunit):  # plain pixel coordinates, not the sky
-                return None
-            scale = [unit.to("rad") for unit in wcs.wcs.cunit]
-            matrix = np.diag(scale) @ wcs.pixel_scale_matrix
-            if wcs.wcs.lng > wcs.wcs.lat >= 0:
-                matrix = matrix[::-1].copy()
-    except (ValueError, TypeError, AttributeError, MemoryError):  # senseless cards, units that are not angles
-        return None
-    return matrix if np.isfinite(matrix).all() and np.linalg.det(matrix) != 0 else None
-
-
-def celestial_cards(header: Any) -> dict[str, Any]:
-    """Return the cards of a header's two sky axes."""
-    cards = {name: header[name] for name in header if _CELESTIAL.fullmatch(name)}
-    if "WCSAXES" in cards:
-        cards["WCSAXES"] = 2  # without a cube's third axis
-    return cards

@@ -291,15 +291,17 @@ def test_files_of_several_kinds_are_not_mixed(tmp_path, capsys):
 def test_a_cloud_is_told_by_all_that_a_restoration_leaves(runs, tmp_path, capsys):
     stack = Observation.load(runs / "simulate/stack.npz")
     dim = torch.tensor([1.0, 0.2, 1.0])[:, None, None]
-    dataclasses.replace(stack, frames=dim * stack.frames).save(tmp_path / "cloudy.npz")
-    run("restore", tmp_path / "cloudy.npz", "--max-iterations", "2", "--out", tmp_path / "run")
+    cloudy = dataclasses.replace(stack, frames=dim * stack.frames).take([0, 0, 1, 2])
+    dataclasses.replace(cloudy, frame_numbers=()).save(tmp_path / "cloudy.npz")
+    run("restore", tmp_path / "cloudy.npz", "--skip", "0", "--max-iterations", "2", "--out", tmp_path / "run")
     streams = capsys.readouterr()
-    assert "frames [1] of those restored, counted from 0, have less than half the light" in streams.out
-    assert "frames [1] have less than half the light" in streams.err
+    for told in (streams.out, streams.err):
+        assert "frames [2] have less than half the light of the others, as through a cloud: " in told
     for name in ("metrics.json", "status.json"):
-        assert json.loads((tmp_path / "run" / name).read_text())["clouded_frames"] == [1]
+        assert json.loads((tmp_path / "run" / name).read_text())["clouded_frames"] == [2]
     header = fits.getheader(tmp_path / "run/restored.fits")
-    assert (header["NCLOUD"], header["CLOUDED"]) == (1, "1")
+    assert (header["NCLOUD"], header["CLOUDED"]) == (1, "2")
+    assert RestorationResult.load(tmp_path / "run/restored.npz").frame_numbers == (1, 2, 3)
     assert json.loads((runs / "restore/metrics.json").read_text())["clouded_frames"] == []
     clear = fits.getheader(runs / "restore/restored.fits")
     assert clear["NCLOUD"] == 0

@@ -58,7 +58,10 @@ def test_frames_of_a_stack_are_skipped_and_those_without_light_left_out(tmp_path
     with pytest.warns(UserWarning, match=r"frames \[4\] hold no light"):
         seen = read_stack([tmp_path / "a.npz"], StackOptions(skip=(1,)))
     assert torch.equal(seen.frames, frames[[0, 2, 3, 5]])
-    with pytest.raises(ValueError, match="--skip names frame 6, but the stack has 6"):
+    assert seen.frame_numbers == (0, 2, 3, 5)
+    seen.save(tmp_path / "part.npz")
+    assert read_stack([tmp_path / "part.npz"], StackOptions(skip=(3,))).frame_numbers == (0, 2, 5)
+    with pytest.raises(ValueError, match="--skip names frame 6, but the stack has 6 frames, with numbers from 0 to 5"):
         read_stack([tmp_path / "a.npz"], StackOptions(skip=(6,)))
 
 

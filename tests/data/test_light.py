@@ -63,8 +63,8 @@ def test_a_closed_shutter_is_seen_with_or_without_a_bias(sky, bias):
     assert kept == [0, 1, 3, 4, 5, 6, 8, 9, 10, 11]
     if bias:
         assert said == [
-            "frames [2, 7] show nothing of what the others show, as with a closed shutter: they are left out, and the "
-            "10 that remain are then numbered from 0"
+            "frames [2, 7] show nothing of what the others show, as with a closed shutter: they are left out, and "
+            "10 remain"
         ]
 
 
@@ -126,10 +126,18 @@ def test_skip_counts_from_0_and_names_what_is_not_there():
     frames = observe()
     assert usable(frames, (0, 11, 11))[0] == list(range(1, 11))
     for skip, message in (
-        ((12,), "skip names frame 12, but the stack has 12 frames, counted"),
+        ((12,), "skip names frame 12, but the stack has 12 frames, with numbers from 0 to 11"),
         ((-1,), "skip names frame -1"),
     ):
         with pytest.raises(ValueError, match=message):
             usable_frames(frames, everywhere(frames), skip)
+    numbers = range(20, 44, 2)
+    assert usable_frames(frames, everywhere(frames), (20, 42), numbers).tolist() == list(range(1, 11))
+    with pytest.raises(ValueError, match=r"skip names frame 21, .* numbers from 20 to 42"):
+        usable_frames(frames, everywhere(frames), (21,), numbers)
+    frames[3] = -frames[3]
+    with pytest.warns(UserWarning, match=r"frames \[26\] hold no light"):
+        usable_frames(frames, everywhere(frames), (), numbers)
+    frames[3] = -frames[3]
     with pytest.raises(ValueError, match="skip leaves none of the 12 frames"):
         usable_frames(frames, everywhere(frames), range(12))

@@ -25,6 +25,21 @@ def test_result_survives_the_disk(restored, tmp_path):
         assert words in restored.summary()
 
 
+def test_frames_have_the_numbers_that_they_are_given(restored):
+    chi_square = torch.ones(8)
+    chi_square[6] = 3.0
+    verdict = dataclasses.replace(restored.verdict, frames=(2, 6), n_frames=8)
+    seen = dataclasses.replace(restored, chi_square=chi_square, verdict=verdict)
+    told = seen.with_frame_numbers(range(10, 18))
+    assert "frames 12, 16 are not explained" in told.summary()
+    assert "worst frame 16: 3.000" in told.summary()
+    assert told.verdict.to_json()["frames"] == (12, 16)
+    back = told.with_frame_numbers(range(8))
+    assert (back.verdict, back.frame_numbers) == (verdict, tuple(range(8)))
+    with pytest.raises(ValueError, match="frame_numbers has 7 numbers for 8 frames"):
+        seen.with_frame_numbers(range(7))
+
+
 def result_of_version_0_1(n_frames=2):
     """The arrays that 0.1.0 wrote, as numpy writes them: gains and a weight of total variation."""
     frames = np.random.default_rng(0).random((n_frames, 8, 8))

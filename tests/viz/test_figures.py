@@ -183,6 +183,8 @@ def test_frames_keep_their_values_and_share_a_scale():
     assert {ax.images[0].norm.vmax for ax in figure.axes if ax.images} == {np.percentile(frames[:3].double(), 99.9)}
     assert figure.axes[0].get_xlabel() == "x [mas]"
     assert viz.frames_figure(frames).axes[0].get_xlabel() == "x [pixels]"
+    assert [ax.get_title("left") for ax in figure.axes[:4]] == ["frame 0", "frame 1", "frame 2", "mean of 6"]
+    assert viz.frames_figure(frames, numbers=[3, 5, 6, 7, 8, 9]).axes[1].get_title("left") == "frame 5"
     rendered(viz.frames_figure(torch.zeros(1, 4, 4)))
 
 

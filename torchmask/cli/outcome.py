@@ -67,6 +67,7 @@ def log_outcome(
         f"{prefix}restored",
         restored_figure(
             *(result.object, observation.frames, result.residuals, scale),
+            first_frame=observation.frame_numbers[0],
             deviation=result.object_std,
             sky=sky,
         ),
@@ -84,8 +85,5 @@ def log_outcome(
 def summarise_outcome(result: RestorationResult, table: Mapping[str, Any]) -> str:
     """Return the text to print: a warning of clouds, and the summary of the result, which ends in its verdict."""
     clouded = table["clouded_frames"]
-    told = (
-        f"frames {clouded} of those restored, counted from 0, have less than half the light of the others, as through "
-        "a cloud; the warning at the beginning has the numbers for --skip\n"
-    )
+    told = f"frames {clouded} have less than half the light of the others, as through a cloud: --skip leaves them out\n"
     return (told if clouded else "") + result.summary()

@@ -93,10 +93,12 @@ def restored_figure(
     deviation: Any | None = None,
     unit: str = "electrons",
     sky: Any | None = None,
+    first_frame: int = 0,
 ) -> Figure:
     """Draw a restored image (H, W) beside the first and the mean of `frames` (T, H, W) and the rms of `residuals`.
 
-    If `deviation` (H, W) is given, the standard deviation of the image is drawn too.
+    `first_frame` is the number of the first frame. If `deviation` (H, W) is given, the standard deviation of the image
+    is drawn too.
 
     Light is shown with a square-root stretch, each image up to its own 99.5th percentile [`unit` per pixel]. Residuals
     (T, H, W) are in units of the noise, so that noise alone gives 1. `pixel_scale` [rad] labels the axes with angles;
@@ -106,7 +108,7 @@ def restored_figure(
     lights = {title: restored}
     if frames is not None:
         stack = as_array(frames)
-        lights = {"first frame": stack[0], f"mean of {len(stack)} frames": stack.mean(0), **lights}
+        lights = {f"frame {first_frame}": stack[0], f"mean of {len(stack)} frames": stack.mean(0), **lights}
     panels = len(lights) + (residuals is not None) + (deviation is not None)
     figure, axes = drawing.row_of_axes([1.3] * panels, height=3.2)
     angle, extent = drawing.sky_extent((restored.shape[0], restored.shape[1]), pixel_scale)

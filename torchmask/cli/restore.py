@@ -143,7 +143,7 @@ def restore_one(files: Sequence[Path], options: Options, star: MaskCalibration |
             n_samples=options.n_samples,
             checkpoint=state,
             callback=output.callback,
-        )
+        ).with_frame_numbers(observation.frame_numbers)
         if star is not None and options.star is not None:
             write_calibration(output, star, [options.star], observation.grid.wavelength)
         table = write_outcome(output.directory, observation, result, history(files, result, options))

@@ -58,7 +58,7 @@ class StackOptions(MaskOptions, FITSOptions):
     readout_noise: float | None = None
     """Read-out noise [electrons rms per pixel and frame]; None: from the file, or else measured on the frames."""
     skip: tuple[int, ...] = ()
-    """Frames to leave out, counted from 0 through all files of a stack."""
+    """Numbers of frames to leave out, counted from 0 through all files of a stack."""
     errors: bool = True
     """Weight pixels by the standard deviations in the file (FITS extension ERR), if it has them."""
 
@@ -81,10 +81,15 @@ def read_stack(files: Sequence[Path], options: StackOptions) -> Observation:
     if options.wavelength is not None:
         require_wavelength(options.wavelength)
     observation = _read(files, options)
+    numbers = observation.frame_numbers
+    try:
+        frames, valid = check_frames(observation.frames, observation.valid, observation.grid, numbers)
+    except ValueError as error:
+        raise ValueError(f"{files[0]}: {error}") from error
     if not options.errors or observation.errors is None:
         return dataclasses.replace(observation, errors=None)
     try:
-        check_errors(observation.errors, *check_frames(observation.frames, observation.valid, observation.grid))
+        check_errors(observation.errors, frames, valid, numbers)
     except ValueError as error:
         raise ValueError(f"{files[0]}: {error}; or give --no-errors to weight all pixels equally") from error
     return observation
@@ -117,7 +122,8 @@ def _usable(observation: Observation, path: Path, options: StackOptions) -> Obse
     frames = observation.frames
     valid = torch.isfinite(frames) if observation.valid is None else observation.valid.expand_as(frames)
     try:
-        return observation.take(usable_frames(frames.numpy(), valid.numpy(), options.skip))
+        kept = usable_frames(frames.numpy(), valid.numpy(), options.skip, observation.frame_numbers)
+        return observation.take(kept)
     except ValueError as error:
         raise ValueError(f"{path}: {_as_option(str(error))}") from error
 

@@ -19,8 +19,9 @@ from torchmask.data.fits import read_fits
 from torchmask.design.manufacture import load_mask
 from torchmask.grid import ARCSEC
 from torchmask.io import atomic_write, load_npz, read_json
-from torchmask.observation import Observation, pixel_matrix
+from torchmask.observation import Observation
 from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.sky import pixel_matrix
 from torchmask.restoration.result import RestorationResult
 from torchmask.tracking import read_metrics
 from torchmask.viz import figures as viz
@@ -164,7 +165,9 @@ def _stack_view(observation: Observation) -> View:
     return View(
         "\n".join(lines),
         {
-            "": viz.frames_figure(frames, pixel_scale=grid.pixel_scale, sky=observation.sky_matrix),
+            "": viz.frames_figure(
+                frames, pixel_scale=grid.pixel_scale, sky=observation.sky_matrix, numbers=observation.frame_numbers
+            ),
             "-mask": viz.mask_figure(aperture),
         },
     )

@@ -13,8 +13,8 @@ import numpy as np
 
 from torchmask.grid import ARCSEC
 from torchmask.io import extra
-from torchmask.observation import celestial_cards, pixel_matrix
 from torchmask.optics.band import FILTERS, filter_of_header
+from torchmask.optics.sky import celestial_cards, pixel_matrix
 
 _ABOUT = ("OBJECT", "TARGNAME", "TARG_RA", "TARG_DEC", "RA", "DEC", "TELESCOP", "INSTRUME", "FILTER", "DATE-OBS")
 _ABOUT += ("TIME-OBS", "MJD-OBS", "MJD-AVG", "OBSERVER")

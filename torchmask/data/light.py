@@ -1,6 +1,6 @@
 """Selection of the frames that hold light, and detection of clouds.
 
-Frames (T, H, W) are NumPy arrays; `valid` (T, H, W) is True where a pixel is trustworthy. Frames are numbered from 0.
+Frames (T, H, W) are NumPy arrays; `valid` (T, H, W) is True where a pixel is trustworthy.
 """
 
 from __future__ import annotations
@@ -11,7 +11,9 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from torchmask.observation import Observation
+from torchmask.data import keywords
+from torchmask.data.fits import FITSImages
+from torchmask.observation import Observation, number_frames
 
 _UNLIT = 0.05  # fraction of the usual light below which a frame is unlit; an uneven dark may leave some
 _CLEAR = 5.0  # signal-to-noise ratio of the usual light that allows a comparison
@@ -21,52 +23,85 @@ _SIGMA = 1.4826  # standard deviation over median absolute deviation of a normal
 _FEWEST = 3  # smallest number of frames that define what is usual
 
 
-def usable_frames(frames: np.ndarray, valid: np.ndarray, skip: Sequence[int] = ()) -> np.ndarray:
-    """Return the numbers of the frames that hold light and are not in `skip`, in ascending order.
+def usable_frames(
+    frames: np.ndarray, valid: np.ndarray, skip: Sequence[int] = (), numbers: Sequence[int] = ()
+) -> np.ndarray:
+    """Return the positions of the frames that hold light and are not in `skip`, in ascending order.
+
+    `skip` and all messages name frames by `numbers` (T,), or by their positions, from 0, if none are given.
 
     Warns about frames that are left out because they have no valid pixel, no positive sum or no light of the target,
     and about frames that are kept although a cloud seems to have passed.
 
     Raises ValueError if `skip` names a frame that does not exist, or no frame is left.
     """
-    wrong = [number for number in skip if not 0 <= number < len(frames)]
+    named = np.array(number_frames(numbers, len(frames)))
+    wrong = [number for number in skip if number not in named]
     if wrong:
-        raise ValueError(f"skip names frame {wrong[0]}, but the stack has {len(frames)} frames, counted from 0")
-    kept = np.setdiff1d(np.arange(len(frames)), list(skip))
+        raise ValueError(
+            f"skip names frame {wrong[0]}, but the stack has {len(frames)} frames, with numbers from {named.min()} to "
+            f"{named.max()}"
+        )
+    kept = np.flatnonzero(~np.isin(named, list(skip)))
     if not kept.size:
         raise ValueError(f"skip leaves none of the {len(frames)} frames")
     total = np.where(valid, frames, 0.0).sum((1, 2))
-    kept = _leave_out(kept, np.logical_not(valid.any((1, 2))), "have no valid pixel")
-    kept = _leave_out(kept, np.asarray(total <= 0), "hold no light: the sum of their valid pixels is not positive")
+    kept = _leave_out(kept, named, np.logical_not(valid.any((1, 2))), "have no valid pixel")
+    kept = _leave_out(kept, named, total <= 0, "hold no light: the sum of their valid pixels is not positive")
     unlit = np.zeros(len(frames), dtype=bool)
     unlit[kept] = find_unlit(frames[kept], valid[kept])
-    kept = _leave_out(kept, unlit, "show nothing of what the others show, as with a closed shutter")
+    kept = _leave_out(kept, named, unlit, "show nothing of what the others show, as with a closed shutter")
     clouded = kept[find_clouds(frames[kept], valid[kept])]
     if clouded.size:
         warnings.warn(
-            f"frames {clouded.tolist()} have less than half the light of the others, as through a cloud: "
+            f"frames {named[clouded].tolist()} have less than half the light of the others, as through a cloud: "
             "`skip` leaves them out",
             stacklevel=3,
         )
     return kept
 
 
+def opened_files(
+    files: Sequence[FITSImages], skip: Sequence[int]
+) -> tuple[list[FITSImages], tuple[int, ...], list[int]]:
+    """Return the files taken with an open shutter, the numbers of their frames, and those to skip among these.
+
+    Warns about other files; raises ValueError if there are only those.
+    """
+    closed = {file.path: keywords.closed_shutter(file.header) for file in files}
+    told = "; ".join(f"{path}: {why}" for path, why in closed.items() if why)
+    opened = [file for file in files if not closed[file.path]]
+    if not opened:
+        raise ValueError(f"no file holds light ({told}): give exposures of the target")
+    if told:
+        warnings.warn(f"files without light are left out ({told}); to subtract a dark, give dark", stacklevel=3)
+    starts = np.cumsum([0] + [len(file.values) for file in files])
+    dark = {
+        number
+        for file, start in zip(files, starts, strict=False)
+        if closed[file.path]
+        for number in range(start, start + len(file.values))
+    }
+    numbers = tuple(number for number in range(starts[-1]) if number not in dark)
+    return opened, numbers, [number for number in skip if number not in dark]
+
+
 def clouded_frames(observation: Observation) -> list[int]:
-    """Return the numbers of an observation's frames that seem to have been taken through a cloud."""
+    """Return the `frame_numbers` of an observation's frames that seem to have been taken through a cloud."""
     frames = observation.frames
     valid = torch.isfinite(frames) if observation.valid is None else observation.valid.expand_as(frames)
-    return np.flatnonzero(find_clouds(frames.numpy(force=True), valid.numpy(force=True))).tolist()
+    clouded = np.flatnonzero(find_clouds(frames.numpy(force=True), valid.numpy(force=True)))
+    return [observation.frame_numbers[position] for position in clouded]
 
 
-def _leave_out(kept: np.ndarray, bad: np.ndarray, why: str) -> np.ndarray:
+def _leave_out(kept: np.ndarray, named: np.ndarray, bad: np.ndarray, why: str) -> np.ndarray:
     """Return the frames `kept` that are not `bad`, with a warning that names the others. ValueError if none is left."""
-    lost = kept[bad[kept]]
+    lost = named[kept[bad[kept]]]
     if lost.size == kept.size:
         raise ValueError(f"frames {lost.tolist()} {why}, and no other is left")
     if lost.size:
         warnings.warn(
-            f"frames {lost.tolist()} {why}: they are left out, and the {kept.size - lost.size} that remain are then "
-            "numbered from 0",
+            f"frames {lost.tolist()} {why}: they are left out, and {kept.size - lost.size} remain",
             stacklevel=4,
         )
     return kept[~bad[kept]]

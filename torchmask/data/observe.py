@@ -15,10 +15,11 @@ import torch
 from torchmask.data import keywords
 from torchmask.data.calibration import SELECTIONS, best_frames, calibrate, crop_corner, find_target
 from torchmask.data.fits import FITSImages, read_fits
-from torchmask.data.light import usable_frames
+from torchmask.data.light import opened_files, usable_frames
 from torchmask.grid import ARCSEC, Grid
-from torchmask.observation import Observation, pixel_matrix
+from torchmask.observation import Observation
 from torchmask.optics.aperture import Aperture
+from torchmask.optics.sky import pixel_matrix
 
 PathLike = str | Path
 
@@ -87,7 +88,8 @@ def read_observation(
     target : (row, column), optional
         Pixel of the target in every file, counted from 0; by default, where the mean frame is brightest.
     skip : sequence of int
-        Frames to leave out, counted from 0 through all files.
+        Frames to leave out, counted from 0 through all files, also those without light; `frame_numbers` of the
+        observation, and all messages, count in the same way.
     keep : float, optional
         Fraction of the frames to keep, those with the highest `keep_by`.
     keep_by : {"sharpness", "flux"}
@@ -119,7 +121,7 @@ def read_observation(
     files = [read_fits(path) for path in ([paths] if isinstance(paths, str | Path) else list(paths))]
     if not files:
         raise ValueError("paths is empty: give at least one FITS file")
-    files = _without_darks(files)
+    files, numbers, skip = opened_files(files, skip)
     lengths = [keywords.wavelength(file.header, file.path, wavelength, design_wavelength) for file in files]
     scales = [keywords.pixel_scale(file.header, file.path, pixel_scale) for file in files]
     _check_alike(files, lengths, scales)
@@ -140,7 +142,7 @@ def read_observation(
     valid = np.concatenate([stack[2] for stack in stacks])
     errors = _joined([stack[1] for stack in stacks])
     _check_rotation(files, frames.shape[-1])
-    kept = usable_frames(frames, valid, skip)
+    kept = usable_frames(frames, valid, skip, numbers)
     if keep is not None:
         kept = kept[best_frames(frames[kept], valid[kept], keep, keep_by)]
     known = [noise for noise in noises if noise is not None]
@@ -155,19 +157,8 @@ def read_observation(
         valid=torch.from_numpy(valid),
         errors=None if errors is None else torch.from_numpy(errors),
         header=headers[0] | _mean_exposure(files, times),
+        frame_numbers=numbers,
     ).take(kept)
-
-
-def _without_darks(files: Sequence[FITSImages]) -> list[FITSImages]:
-    """Return the files taken with an open shutter. Warns about others; raises ValueError if there are only those."""
-    closed = {file.path: keywords.closed_shutter(file.header) for file in files}
-    told = "; ".join(f"{path}: {why}" for path, why in closed.items() if why)
-    opened = [file for file in files if not closed[file.path]]
-    if not opened:
-        raise ValueError(f"no file holds light ({told}): give exposures of the target")
-    if told:
-        warnings.warn(f"files without light are left out ({told}); to subtract a dark, give dark", stacklevel=3)
-    return opened
 
 
 def _below(file: FITSImages, full: float | None) -> FITSImages:

@@ -31,7 +31,7 @@ def restore_many(
     method : MyopicDeconvolution or sequence of MyopicDeconvolution
         One method for all stacks, or one for each.
     stacks : sequence
-        Frames (T, H, W) [electrons], or observations, whose valid pixels and errors are used.
+        Frames (T, H, W) [electrons], or observations, whose valid pixels, errors and frame numbers are used.
     n_samples : int
         Number of posterior samples, as for `MyopicDeconvolution.restore`.
     seed : int
@@ -109,7 +109,8 @@ def restore_in_turn(
 def _restore(task: tuple[MyopicDeconvolution, Tensor | Observation], n_samples: int, seed: int) -> RestorationResult:
     method, stack = task
     if isinstance(stack, Observation):
-        return method.restore(stack.frames, valid=stack.valid, errors=stack.errors, n_samples=n_samples, seed=seed)
+        result = method.restore(stack.frames, valid=stack.valid, errors=stack.errors, n_samples=n_samples, seed=seed)
+        return result.with_frame_numbers(stack.frame_numbers)
     return method.restore(stack, n_samples=n_samples, seed=seed)
 
 

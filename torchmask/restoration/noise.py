@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchmask.grid import Grid
+from torchmask.observation import number_frames
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.noise import noise_variance
 
@@ -49,10 +51,11 @@ def expected_variance(
     return measured if measured is not None and more_than_light else variance
 
 
-def check_errors(errors: Tensor | np.ndarray, frames: Tensor, valid: Tensor) -> Tensor:
+def check_errors(errors: Tensor | np.ndarray, frames: Tensor, valid: Tensor, numbers: Sequence[int] = ()) -> Tensor:
     """Return `errors`, standard deviations of pixels [electrons], as (T, H, W); (H, W) applies to every frame.
 
-    Raises ValueError if they have another shape, or that of a valid pixel is not finite and positive.
+    Raises ValueError if they have another shape, or that of a valid pixel is not finite and positive; the message names
+    the frame by `numbers`, or from 0 if none are given.
     """
     given = torch.as_tensor(errors, dtype=frames.dtype, device=frames.device)
     if tuple(given.shape) not in (tuple(frames.shape), tuple(frames.shape[1:])):
@@ -63,9 +66,11 @@ def check_errors(errors: Tensor | np.ndarray, frames: Tensor, valid: Tensor) -> 
     given = given.expand_as(frames)
     wrong = (valid & ~(torch.isfinite(given) & (given > 0))).nonzero()
     if len(wrong):
-        place = tuple(wrong[0].tolist())
+        frame, row, column = wrong[0].tolist()
+        number = number_frames(numbers, len(frames))[frame]
+        value = float(given[frame, row, column])
         raise ValueError(
-            f"errors is not positive at {len(wrong)} valid pixels, the first is {float(given[place]):.3g} at (frame, "
-            f"row, column) {place}: standard deviations in electrons are needed, or False in `valid`"
+            f"errors is not positive at {len(wrong)} valid pixels, the first is {value:.3g} at (frame, row, column) "
+            f"{(number, row, column)}: standard deviations in electrons are needed, or False in `valid`"
         )
     return given

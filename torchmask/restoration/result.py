@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import MISSING, dataclass, fields
+from collections.abc import Sequence
+from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import torch
 from torch import Tensor
 
 from torchmask.io import load_npz, save_npz
+from torchmask.observation import number_frames
 from torchmask.optics.geometry import MaskGeometry
 from torchmask.record import Brief
 from torchmask.restoration.verdict import Verdict
@@ -46,6 +48,7 @@ class RestorationResult(Brief):
     geometry_std : (2,) standard deviations of rotation and magnification due to noise, or None
     verdict : whether all this explains the frames; None in files of 0.1
     motion : (T, N, J) change of the coefficients while a frame lasts [rad rms]; None where frames are snapshots
+    frame_numbers : number of each frame, by which summary and verdict name it; 0 to T - 1 by default
 
     Examples
     --------
@@ -85,6 +88,21 @@ class RestorationResult(Brief):
     geometry_std: Tensor | None = None
     verdict: Verdict | None = None
     motion: Tensor | None = None
+    frame_numbers: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "frame_numbers", number_frames(self.frame_numbers, len(self.chi_square)))
+
+    def with_frame_numbers(self, numbers: Sequence[int]) -> RestorationResult:
+        """Return the result with other numbers of its frames, such as `Observation.frame_numbers`.
+
+        Raises ValueError unless there are as many numbers as frames.
+        """
+        renamed = replace(self, frame_numbers=tuple(numbers))
+        if self.verdict is None:
+            return renamed
+        name = dict(zip(self.frame_numbers, renamed.frame_numbers, strict=True))
+        return replace(renamed, verdict=replace(self.verdict, frames=tuple(name[n] for n in self.verdict.frames)))
 
     @property
     def geometry(self) -> MaskGeometry:
@@ -99,6 +117,7 @@ class RestorationResult(Brief):
     def save(self, path: str | Path) -> None:
         """Write everything to a new .npz file, without pickle. Raises the errors of `torchmask.io.save_npz`."""
         values = {item.name: getattr(self, item.name) for item in fields(self)}
+        values["frame_numbers"] = np.array(self.frame_numbers)
         if self.verdict is not None:
             values["verdict"] = json.dumps(self.verdict.to_json())
         save_npz(path, {name: value for name, value in values.items() if value is not None})
@@ -117,6 +136,8 @@ class RestorationResult(Brief):
         names = [item.name for item in fields(cls) if item.name in stored]
         values: dict[str, Any] = {name: torch.from_numpy(stored[name]) for name in names if stored[name].ndim}
         values.update({name: stored[name].item() for name in names if not stored[name].ndim})
+        if "frame_numbers" in values:
+            values["frame_numbers"] = tuple(values["frame_numbers"].tolist())
         if "verdict" in values:
             values["verdict"] = Verdict.from_json(values["verdict"])
         return cls(**values)
@@ -124,12 +145,12 @@ class RestorationResult(Brief):
     def summary(self) -> str:
         """Return a summary of a few lines, the last of which is the verdict."""
         n_frames, n_sub, n_modes = self.coefficients.shape
-        chi = self.chi_square
+        chi, worst = self.chi_square, self.frame_numbers[int(self.chi_square.argmax())]
         lines = [
             f"restored {self.object.shape[0]} x {self.object.shape[1]} pixels from {n_frames} frames, "
             f"{n_sub} x {n_modes} aberrations each",
             f"{self.message} after {len(self.cost)} iterations, {self.n_evaluations} evaluations, {self.seconds:.1f} s",
-            f"chi-square per pixel {float(chi.mean()):.3f} (worst frame {int(chi.argmax())}: {float(chi.max()):.3f})",
+            f"chi-square per pixel {float(chi.mean()):.3f} (worst frame {worst}: {float(chi.max()):.3f})",
             f"noise {self.noise:.3g} electrons rms, prior {self.prior}"
             + ("" if math.isnan(self.r0) else f", r0 {self.r0:.3g} m")
             + (f", sky {self.sky:.3g} electrons" if self.sky > 0 else ""),

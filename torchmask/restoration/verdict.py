@@ -35,7 +35,7 @@ class Verdict:
     model_error : expected contribution to the chi-square of modes that the search leaves out
     limit : chi-square up to which the frames count as explained
     phase_error : rms of the modes left out, over a sub-aperture [rad]
-    frames : frames that are not explained individually, counted from 0
+    frames : numbers of the frames that are not explained individually
     n_frames : number of frames in the stack
     check : what may be wrong; empty if everything is explained
 
@@ -110,8 +110,8 @@ def judge(
 ) -> Verdict:
     """Return the verdict on frames with mean square residuals `chi_square` (T,) over `pixels` (T,) valid pixels.
 
-    `contrast` is the chi-square per pixel of the mean frame against a uniform one; `at_rest` says whether the search
-    ran to its end.
+    Its frames are counted from 0. `contrast` is the chi-square per pixel of the mean frame against a uniform one;
+    `at_rest` says whether the search ran to its end.
     """
     chi_square, pixels = chi_square.double().cpu(), pixels.double().cpu()
     free = (pixels - error.fitted).clamp(min=1)

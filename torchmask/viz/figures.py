@@ -7,13 +7,14 @@ OTFs are given in FFT order; this module moves their origin to the middle.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from torchmask.grid import Grid
 from torchmask.io import as_array
+from torchmask.observation import number_frames
 from torchmask.optics.aperture import Aperture
 from torchmask.viz import style as drawing
 
@@ -178,17 +179,26 @@ def psf_figure(psfs: Mapping[str, Any], grid: Grid) -> Figure:
 
 @drawing.styled
 def frames_figure(
-    frames: Any, count: int = 4, pixel_scale: float | None = None, unit: str = "electrons", sky: Any | None = None
+    frames: Any,
+    count: int = 4,
+    pixel_scale: float | None = None,
+    unit: str = "electrons",
+    sky: Any | None = None,
+    numbers: Sequence[int] = (),
 ) -> Figure:
     """Draw the first `count` exposures of a stack (T, H, W) and the mean of all, on one scale [`unit` per pixel].
 
     With `pixel_scale` [rad] the axes show angles instead of pixels. With `sky` (2, 2), such as
-    `Observation.sky_matrix`, arrows show north and east. Raises ValueError if `frames` has another shape.
+    `Observation.sky_matrix`, arrows show north and east. `numbers` (T,) are the frames' own, such as
+    `Observation.frame_numbers`; they are counted from 0 if none are given.
+
+    Raises ValueError if `frames` has another shape, or there are more or fewer numbers.
     """
     stack = as_array(frames).astype(float)
     if stack.ndim != 3 or 0 in stack.shape:
         raise ValueError(f"frames have shape {stack.shape}: a stack (frames, rows, columns) is needed")
-    images = {f"frame {k + 1}": frame for k, frame in enumerate(stack[:count])}
+    named = number_frames(numbers, len(stack))
+    images = {f"frame {number}": frame for number, frame in zip(named, stack[:count], strict=False)}
     images[f"mean of {len(stack)}"] = stack.mean(0)
     figure, axes = drawing.row_of_axes([1.0] * len(images), height=2.5)
     angle, extent = drawing.sky_extent(stack.shape[1:], pixel_scale)
