@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 import re
+from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from torchmask.cli.config import load_config
 from torchmask.cli.main import main
 from torchmask.cli.program import NOT_EXPLAINED
 from torchmask.cli.report import draw_zones
-from torchmask.cli.restore import Options
+from torchmask.cli.restore import SKIES, Options
 from torchmask.cli.view import view_path
 from torchmask.design.constraints import KeepOutDisc, KeepOutSegment, MinimumGap, check_mask
 from torchmask.design.criterion import AsymptoticMSE
@@ -25,6 +26,7 @@ from torchmask.io import load_npz
 from torchmask.observation import Observation
 from torchmask.optics.aperture import FullAperture
 from torchmask.optics.shapes import TelescopePupil
+from torchmask.restoration.background import Background
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.result import RestorationResult
 from torchmask.spectra import NoisePSD, PowerLawPSD
@@ -211,6 +213,12 @@ def test_errors_of_a_cube_and_the_sky_are_those_of_the_library_call(runs, cube, 
     refused(wrong, tmp_path, capsys, r"wrong.fits: errors is not positive at 1 valid .* \(1, 2, 3\).* --no-errors")
     refused([*wrong, "--no-errors", "--sky", "-1"], tmp_path, capsys, "background is negative")
     refused([*wrong, "--no-errors", "--exposure-tau0", "-1"], tmp_path, capsys, "exposure_tau0 is -1.*units of tau0")
+
+
+def test_every_assumption_about_the_sky_has_its_word():
+    words = get_args(get_args(get_type_hints(Options)["sky"])[1])
+    assert set(words) == set(SKIES)
+    assert set(SKIES.values()) == set(Background)
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from torchmask.restoration.priors import TotalVariation
 from torchmask.restoration.state import Calibration, State
 
 GRID = Grid((12, 15), 2.3e-7, 550e-9)
-FREE = Background.PER_FRAME
+FREE, COMMON = Background.PER_FRAME, Background.COMMON
 
 
 def test_no_other_constant_fits_better(random_exposures, three_holes):
@@ -33,12 +33,55 @@ def test_no_other_constant_fits_better(random_exposures, three_holes):
     assert torch.equal(Background.NONE.residual(difference, precision), difference)
 
 
+def test_no_other_common_constant_fits_better_in_frames_divided_by_their_transmission(random_exposures, three_holes):
+    exposures = random_exposures(ExposureModel(three_holes, GRID, 4))
+    difference, precision = exposures.frames, exposures.precision
+    unit = torch.tensor([0.5, 1.0, 3.0], dtype=torch.float64)[:, None, None]
+    level = COMMON.level(difference, precision, unit)
+    torch.testing.assert_close(level, unit * (level / unit).mean())  # one constant
+    least = (precision * (difference - level) ** 2).sum()
+    for step in (0.01, -0.01):
+        moved = (precision * (difference - level - step * unit) ** 2).sum()
+        torch.testing.assert_close(moved - least, (precision * unit**2).sum() * step**2)
+    assert float(level.min()) > 0
+    assert torch.equal(COMMON.residual(-difference, precision, unit), -difference)
+
+
+def test_a_common_sky_is_as_much_more_certain_as_there_are_frames(explained):
+    """Least squares: the variance is 1 / sum of w (1 - s m)^2, over one frame or over all.
+
+    s m is the image of the object that is nearest to a constant, since the transmission s is fitted too. The variance
+    of 300 draws scatters by sqrt(2 / 300) = 8 %: 4 deviations.
+    """
+    objective, state = explained
+    model, draws, noise = objective.model, 300, 0.5
+    transmission = torch.tensor([0.6, 0.9, 1.1, 1.4], dtype=torch.float64)[:, None, None]
+    sharp = model(state.image, state.z)
+    sky, generator = 3.0, torch.Generator().manual_seed(2)
+    nearest = sharp.sum((1, 2), keepdim=True) / (sharp**2).sum((1, 2), keepdim=True) * sharp
+    told = ((1 - nearest) ** 2).sum((1, 2)) / noise**2  # of the constant, by each frame
+    found: dict[Background, list] = {COMMON: [], FREE: []}
+    for _ in range(draws):
+        white = torch.randn(sharp.shape, dtype=torch.float64, generator=generator)
+        frames = transmission * sharp + sky + noise * white
+        for background, levels in found.items():
+            seen = MyopicObjective(model.beside(background), frames, torch.ones(1, 1, 1).double(), TotalVariation())
+            left = frames - fit_of_frames(seen, state)[0][:, None, None] * sharp
+            levels.append(background.level(left, seen.precision).flatten())
+    common, each = (torch.stack(found[background]) for background in (COMMON, FREE))
+    assert float(common.std(1).max()) == 0
+    for levels, expected in ((common[:, 0], 1 / told.sum()), (each, 1 / told)):
+        torch.testing.assert_close(levels.var(0), expected, rtol=4 * math.sqrt(2 / draws), atol=0)
+        assert float(((levels.mean(0) - sky) / (expected / draws).sqrt()).abs().max()) < 4
+
+
 @pytest.mark.parametrize(("dtype", "rounding"), [(torch.float64, 1e-12), (torch.float32, 1e-4)])
 @pytest.mark.parametrize("one_precision", [True, False])
+@pytest.mark.parametrize("background", [FREE, COMMON])
 def test_gradients_beside_a_free_background_are_those_of_autograd(
-    dtype, rounding, one_precision, random_exposures, three_holes
+    dtype, rounding, one_precision, background, random_exposures, three_holes
 ):
-    model = ExposureModel(three_holes, GRID, 4, background=FREE, dtype=dtype)
+    model = ExposureModel(three_holes, GRID, 4, background=background, dtype=dtype)
     model, image, z, frames, precision = random_exposures(model)
     precision = precision[:, :1, :1] if one_precision else precision
     objective = MyopicObjective(
@@ -139,6 +182,18 @@ def test_a_model_beside_a_background_shares_all_else(random_exposures, three_hol
     beside = model.beside(FREE)
     assert (model.background, beside.background) == (Background.NONE, FREE)
     assert beside.pupil is model.pupil
+
+
+def test_a_restoration_finds_one_sky_for_all_frames_through_clouds(observe, restoring):
+    """As bright as a mean pixel of the object; less than a tenth of that would not count as seen."""
+    observation = observe()
+    sky, gains = float(observation.frames.mean()), torch.linspace(0.5, 1.5, 8, dtype=torch.float64)[:, None, None]
+    noise = torch.poisson(torch.full_like(observation.frames, sky), generator=torch.Generator().manual_seed(5))
+    method = restoring(background=COMMON, max_iterations=30)
+    result = method.restore(gains * observation.frames + noise, known_object=observation.object)
+    assert result.background is not None
+    assert float(result.background.std()) < 1e-6 * sky
+    assert result.sky == pytest.approx(sky, rel=0.1)
 
 
 @pytest.mark.filterwarnings("ignore:the frames are bright at the border")  # where the sky is ignored

@@ -31,7 +31,12 @@ from torchmask.restoration.priors import TotalVariation
 from torchmask.restoration.result import RestorationResult
 
 REFINEMENTS = {"if-seen": None, "yes": True, "no": False}
-SKIES = {"if-seen": Background.IF_SEEN, "per-frame": Background.PER_FRAME, "none": Background.NONE}
+SKIES = {
+    "if-seen": Background.IF_SEEN,
+    "per-frame": Background.PER_FRAME,
+    "common": Background.COMMON,
+    "none": Background.NONE,
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,9 +63,9 @@ class Options(BandOptions, StackOptions, OIFITSOptions, WorkerOptions, RunOption
     pupil."""
     static_modes: int = 0
     """Number of Zernike modes per hole for aberrations that all frames share, such as those of the telescope."""
-    sky: float | Literal["if-seen", "per-frame", "none"] = "if-seen"
-    """Known sky [electrons per pixel]; or per-frame to fit a constant in each frame, if-seen: if the frames show a
-    sky."""
+    sky: float | Literal["if-seen", "per-frame", "common", "none"] = "if-seen"
+    """Known sky [electrons per pixel]; or per-frame to fit a constant in each frame, common to fit one for all frames,
+    if-seen: per-frame if the frames show a sky."""
     pixel_fill: float | None = None
     """Sensitive fraction of the area of a pixel, 1 for pixels without gaps; None: pixels are points."""
     exposure_tau0: float = 0.0

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchmask.restoration.background import Background
 from torchmask.restoration.forward import ExposureModel, intensity
 from torchmask.restoration.parallel import Map
 from torchmask.restoration.pupil import OpenSamples
@@ -41,6 +42,7 @@ def data_fidelity(
     *,
     want_object: bool = True,
     want_aberrations: bool = True,
+    unit: Tensor | float = 1.0,
     samples: OpenSamples | None = None,
     parallel: Map = map,
 ) -> DataFidelity:
@@ -60,6 +62,8 @@ def data_fidelity(
         Inverse noise variance of each pixel, 0 where a pixel is not valid.
     want_object, want_aberrations : bool
         Which gradients to compute.
+    unit : (T, 1, 1) tensor or float
+        What a background of 1, if it is common to all frames, amounts to in each of them.
     samples : OpenSamples, optional
         Samples of a moved pupil; the gradients with respect to them are computed too. None: those of the model.
     parallel : callable
@@ -72,13 +76,23 @@ def data_fidelity(
     phase = samples.phase(z)  # for all frames at once: one large matrix product is faster than many small ones
 
     @torch.no_grad()  # needed here too, as no_grad applies to one thread only
+    def make(part: slice) -> Tensor:
+        transfer = torch.fft.rfft2(intensity(model.amplitude(samples, samples.field(phase[part]))))
+        return model.window.crop(torch.fft.irfft2(transfer * spectrum, s=shape))
+
+    background = model.background
+    if background is Background.COMMON:  # it depends on all frames, so they are made once more below
+        made = torch.cat(list(parallel(make, model.chunks(len(z)))))
+        frames, background = frames - background.level(frames - made, precision, unit), Background.NONE
+
+    @torch.no_grad()  # needed here too, as no_grad applies to one thread only
     def compare(part: slice) -> tuple[Tensor | None, ...]:
         field = samples.field(phase[part])
         amplitude = model.amplitude(samples, field)
         transfer = torch.fft.rfft2(intensity(amplitude))
         weight = precision[part] if len(precision) > 1 else precision
         made = model.window.crop(torch.fft.irfft2(transfer * spectrum, s=shape))
-        error = model.background.residual(frames[part] - made, weight)
+        error = background.residual(frames[part] - made, weight)
         residual = error * -weight
         value = -0.5 * torch.linalg.vecdot(residual.flatten(1), error.flatten(1)).double()
         if not (want_object or want_aberrations):

@@ -16,8 +16,9 @@ _SEEN = 0.1  # of the mean light in the darkest part, where holes scatter up to 
 class Background(Enum):
     """Assumption of a restoration about a background that is not given.
 
-    A free constant in every frame needs no variable: for any object, the best constant is the weighted mean of the
-    residual, or zero if that is negative.
+    A free constant needs no variable, whether every frame has its own or all have the same: for any object, the best
+    constant is the weighted mean of the residual, or zero if that is negative. One constant for all frames takes half
+    as long again, since it must be known before the gradient of any frame.
 
     A uniform level of the object looks the same as a background. A small penalty on the object's light therefore moves
     such a level to the background, as far as the object stays positive: an object that is nowhere dark loses the light
@@ -29,16 +30,20 @@ class Background(Enum):
     Examples
     --------
     >>> difference = torch.tensor([[[3.0, 5.0]], [[-1.0, -2.0]]])
-    >>> Background.PER_FRAME.level(difference, torch.tensor([[[1.0, 3.0]]])).flatten().tolist()
+    >>> precision = torch.tensor([[[1.0, 3.0]]])
+    >>> Background.PER_FRAME.level(difference, precision).flatten().tolist()
     [4.5, 0.0]
+    >>> Background.COMMON.level(difference, precision).flatten().tolist()
+    [1.375, 1.375]
     """
 
     NONE = "none"
     PER_FRAME = "one constant for each frame, not negative"
+    COMMON = "one constant for all frames, not negative"
     IF_SEEN = "one constant for each frame, if the darkest part of the field shows a sky"
 
     def of(self, frames: Tensor) -> Background:
-        """Return the assumption for the frames (T, H, W), `NONE` or `PER_FRAME`; their light decides `IF_SEEN`."""
+        """Return the assumption for frames (T, H, W), never `IF_SEEN`, which becomes `NONE` or `PER_FRAME`."""
         if self is not Background.IF_SEEN:
             return self
         is_seen = float(darkest_level(frames).mean()) > _SEEN * float(frames.mean())
@@ -49,19 +54,31 @@ class Background(Enum):
         """Penalty on the object's light, per mean pixel, in the cost of a restoration."""
         return 0.0 if self is Background.NONE else _PRICE
 
-    def level(self, difference: Tensor, precision: Tensor) -> Tensor:
-        """Return the background (T, 1, 1) that fits `difference` (T, H, W) best, weighted by `precision`."""
+    def level(self, difference: Tensor, precision: Tensor, unit: Tensor | float = 1.0) -> Tensor:
+        """Return the background (T, 1, 1) that fits `difference` (T, H, W) best, weighted by `precision`.
+
+        `unit` (T, 1, 1) is what a background of 1 amounts to in each frame; it matters for `COMMON` only.
+        """
         if self is Background.NONE:
             return torch.zeros_like(difference[:, :1, :1])
-        return weighted_mean(difference, precision).clamp(min=0)
+        if self is Background.PER_FRAME:
+            return weighted_mean(difference, precision).clamp(min=0)
+        units = unit * torch.ones_like(difference[:, :1, :1])
+        weight = precision.expand_as(difference) * units
+        total = (weight * units).sum().clamp(min=torch.finfo(weight.dtype).tiny)
+        return ((weight * difference).sum() / total).clamp(min=0) * units
 
-    def residual(self, difference: Tensor, precision: Tensor) -> Tensor:
-        """Return `difference` (T, H, W) minus the background that fits it best."""
-        return difference if self is Background.NONE else difference - self.level(difference, precision)
+    def residual(self, difference: Tensor, precision: Tensor, unit: Tensor | float = 1.0) -> Tensor:
+        """Return `difference` (T, H, W) minus the background that fits it best; arguments as for `level`."""
+        return difference if self is Background.NONE else difference - self.level(difference, precision, unit)
 
     def first_guess(self, frames: Tensor) -> Tensor:
         """Return an estimate of the background (T, 1, 1) of frames (T, H, W) before their object is known."""
-        return torch.zeros_like(frames[:, :1, :1]) if self is Background.NONE else darkest_level(frames).clamp(min=0)
+        if self is Background.NONE:
+            return torch.zeros_like(frames[:, :1, :1])
+        darkest = darkest_level(frames)
+        darkest = darkest.mean(0, keepdim=True).expand_as(darkest) if self is Background.COMMON else darkest
+        return darkest.clamp(min=0)
 
 
 def weighted_mean(values: Tensor, precision: Tensor) -> Tensor:

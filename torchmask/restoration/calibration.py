@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
@@ -21,10 +22,11 @@ def fit_of_frames(objective: MyopicObjective, state: State) -> tuple[Tensor, Ten
     A free background is fitted at the same time.
     """
     transmissions, squares, background = [], [], objective.model.background
-    for part in objective.model.chunks(len(state.z)):
-        precision = objective.precision[part] if len(objective.precision) > 1 else objective.precision
-        frames = objective.frames[part]
-        model = objective.model(state.image, state.z[part])
+    common = 0.0
+    if background is Background.COMMON:
+        common, background = _common_level(objective, state), Background.NONE
+    for frames, precision, model in _compared(objective, state):
+        frames = frames - common
         transmission = _fit_transmission(background, model, frames, precision)
         transmissions.append(transmission.flatten())
         precision = precision.expand_as(frames)
@@ -33,18 +35,38 @@ def fit_of_frames(objective: MyopicObjective, state: State) -> tuple[Tensor, Ten
     return torch.cat(transmissions).to(state.z).clamp(min=_LEAST_TRANSMISSION), torch.cat(squares).to(state.z)
 
 
+def _compared(objective: MyopicObjective, state: State) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Return frames (t, H, W), their precision and the model at unit transmission, for a few frames at a time."""
+    for part in objective.model.chunks(len(state.z)):
+        frames = objective.frames[part]
+        precision = objective.precision[part] if len(objective.precision) > 1 else objective.precision
+        yield frames, precision, objective.model(state.image, state.z[part])
+
+
+def _common_level(objective: MyopicObjective, state: State) -> float:
+    """Return the constant, at least 0, that fits all frames best together with a transmission of each frame."""
+    pull = weight = 0.0
+    for frames, precision, model in _compared(objective, state):
+        slope = _slope(precision, model, torch.ones_like(model))
+        apart = precision * (1 - slope * model)  # of a constant, what no transmission can imitate
+        pull += float((apart * frames).sum())
+        weight += float(apart.sum())
+    return max(0.0, pull / weight)
+
+
 def _fit_transmission(background: Background, model: Tensor, frames: Tensor, precision: Tensor) -> Tensor:
     """Return the least-squares factor (T, 1, 1) of `model` to `frames`, with a constant if that is free and > 0."""
-
-    def slope(x: Tensor, y: Tensor) -> Tensor:
-        return (precision * x * y).sum((1, 2), keepdim=True) / (precision * x**2).sum((1, 2), keepdim=True)
-
-    alone = slope(model, frames)
+    alone = _slope(precision, model, frames)
     if background is Background.NONE:
         return alone
     mean_model, mean_frame = weighted_mean(model, precision), weighted_mean(frames, precision)
-    beside = slope(model - mean_model, frames - mean_frame)
+    beside = _slope(precision, model - mean_model, frames - mean_frame)
     return torch.where(mean_frame > beside * mean_model, beside, alone)
+
+
+def _slope(precision: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Return the least-squares factor (t, 1, 1) of `x` to `y`."""
+    return (precision * x * y).sum((1, 2), keepdim=True) / (precision * x**2).sum((1, 2), keepdim=True)
 
 
 def recalibrate(objective: MyopicObjective, state: State, power: int | None, *, follow_r0: bool) -> State:

@@ -30,7 +30,7 @@ class FrameStack:
     unit : mean pixel without background [electrons]
     variance : mean noise variance of a pixel [electrons^2], including that of the background
     known : known background [electrons], which broadcasts to the frames
-    free : unknown background, `NONE` or `PER_FRAME`
+    free : unknown background, not `IF_SEEN`
     errors : (T, H, W) measured standard deviations of the pixels [electrons]; None if all pixels have `variance`
     """
 

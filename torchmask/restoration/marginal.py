@@ -70,9 +70,12 @@ class AberrationSampler:
     def _energy(self, state: State, z: Tensor) -> tuple[Tensor, Tensor]:
         """Return misfit plus prior of each frame (T,), and the gradient in its own parameters (T, n_own)."""
         objective = self.objective
-        frames, precision = objective.scaled_data(state.calibration)
+        frames, precision, unit = objective.scaled_data(state.calibration)
         misfit = data_fidelity(
-            objective.model, state.image, z, frames, precision, want_object=False, parallel=objective.parallel
+            *(objective.model, state.image, z, frames, precision),
+            want_object=False,
+            unit=unit,
+            parallel=objective.parallel,
         )
         assert misfit.aberration_gradient is not None
         held = objective.aberration_weight(state.calibration, z) * (z - objective.centre)

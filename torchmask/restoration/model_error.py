@@ -155,7 +155,7 @@ def _tangents(frame: MyopicObjective, state: State, made: Tensor, root: Tensor) 
     """
     model, z = frame.model, state.z
     rows = [made]
-    if model.background is not Background.NONE:
+    if model.background is Background.PER_FRAME:
         rows.append(torch.ones_like(made))
     n_own = model.aberrations.n_own if Free.ABERRATIONS in frame.free else 0
     if n_own:

@@ -44,13 +44,27 @@ class CostAndGradients(NamedTuple):
     place_gradient: Tensor | None = None
 
 
+class ScaledData(NamedTuple):
+    """Frames as at unit transmission.
+
+    frames : (T, H, W) frames divided by their transmission g
+    precision : (T, H, W) inverse noise variance, times g^2 and divided by the noise inflation
+    unit : (T, 1, 1) what a background of 1 amounts to, 1 / g
+    """
+
+    frames: Tensor
+    precision: Tensor
+    unit: Tensor
+
+
 class MyopicObjective(nn.Module):
     """Negative log-posterior of an object and of the aberrations of every frame.
 
         1/2 sum precision / inflation (transmission * model + background - frames)^2 + prior(image)
         + weight/2 |z - centre|^2
 
-    A free background is always the best-fitting one, with a small penalty on the object's light (`Background`).
+    A free background, of each frame or of all, is always the best-fitting one, with a small penalty on the object's
+    light (`Background`).
 
     `forward(image, z)` returns the cost as a scalar that autograd differentiates, to any order, in the image, in z and
     in the centres of the model's aperture; the matrix of the aberration basis stays fixed when the centres change.
@@ -162,8 +176,8 @@ class MyopicObjective(nn.Module):
 
     def forward(self, image: Tensor, z: Tensor, calibration: Calibration | None = None) -> Tensor:
         calibration = calibration or self.neutral_calibration()
-        frames, precision = self.scaled_data(calibration)
-        residual = self.model.background.residual(frames - self.model(image, z), precision)
+        frames, precision, unit = self.scaled_data(calibration)
+        residual = self.model.background.residual(frames - self.model(image, z), precision, unit)
         misfit = 0.5 * (precision * residual**2).sum().to(image.dtype)
         away = z - self.centre
         hold = 0.5 * (self.aberration_weight(calibration, z) * away**2).sum()
@@ -178,7 +192,7 @@ class MyopicObjective(nn.Module):
 
         Its third argument is a step (2,) that rotates [rad] and shrinks the mask (`placed.PlacedSamples`).
         """
-        frames, precision = self.scaled_data(calibration)
+        frames, precision, unit = self.scaled_data(calibration)
         by_object = Free.OBJECT in self.free
         by_aberrations = bool(self.free & (Free.ABERRATIONS | Free.COMMON))
 
@@ -193,6 +207,7 @@ class MyopicObjective(nn.Module):
                 precision,
                 want_object=by_object,
                 want_aberrations=by_aberrations or placed is not None,
+                unit=unit,
                 samples=None if placed is None else placed.samples,
                 parallel=self.parallel,
             )
@@ -229,11 +244,12 @@ class MyopicObjective(nn.Module):
             return basis.mean_common(gradient)
         return basis.with_common_of(gradient, torch.zeros_like(gradient[:1]))
 
-    def scaled_data(self, calibration: Calibration) -> tuple[Tensor, Tensor]:
-        """Return frames and precision for unit transmission, frames / g and precision g^2 / inflation."""
+    def scaled_data(self, calibration: Calibration) -> ScaledData:
+        """Return the frames as at unit transmission."""
         transmission = calibration.transmission[:, None, None].to(self.frames)
         inflation = calibration.noise_inflation[:, None, None].to(transmission)
-        return self.frames / transmission, self.precision * (transmission**2 / inflation)
+        scaled = self.precision * (transmission**2 / inflation)
+        return ScaledData(self.frames / transmission, scaled, 1 / transmission)
 
     def aberration_weight(self, calibration: Calibration, z: Tensor) -> float | Tensor:
         """Return the weight of a frame's (z - centre)^2 / 2.
@@ -249,8 +265,10 @@ class MyopicObjective(nn.Module):
 
     def frame_costs(self, image: Tensor, z: Tensor, calibration: Calibration) -> Tensor:
         """Return misfit plus prior of the aberrations for each frame (T,)."""
-        frames, precision = self.scaled_data(calibration)
-        misfit = data_fidelity(self.model, image, z, frames, precision, want_object=False, want_aberrations=False)
+        frames, precision, unit = self.scaled_data(calibration)
+        misfit = data_fidelity(
+            self.model, image, z, frames, precision, want_object=False, want_aberrations=False, unit=unit
+        )
         return misfit.value.to(z) + 0.5 * (self.aberration_weight(calibration, z) * (z - self.centre) ** 2).sum(1)
 
     @torch.no_grad()
@@ -259,9 +277,9 @@ class MyopicObjective(nn.Module):
 
         The gradient is exact; the Hessian is that of frames as large as the field, which is diagonal in frequency.
         """
-        frames, precision = self.scaled_data(calibration)
+        frames, precision, unit = self.scaled_data(calibration)
         slope = data_fidelity(
-            self.model, image, z, frames, precision, want_aberrations=False, parallel=self.parallel
+            self.model, image, z, frames, precision, want_aberrations=False, unit=unit, parallel=self.parallel
         ).object_gradient
         assert slope is not None
         power = torch.zeros_like(torch.fft.rfft2(image).real)

@@ -58,9 +58,9 @@ def slopes_of_frames(model: ExposureModel, image: Tensor, z: Tensor) -> Tensor:
 def misplacement(objective: MyopicObjective, state: State) -> Misplacement:
     """Return the Gauss-Newton step of the mask alone; jointly with object and aberrations it would be larger."""
     model = objective.model
-    frames, precision = objective.scaled_data(state.calibration)
+    frames, precision, unit = objective.scaled_data(state.calibration)
     made = torch.cat([model(state.image, state.z[part]) for part in model.chunks(len(state.z))])
-    residual = model.background.residual(frames - made, precision)
+    residual = model.background.residual(frames - made, precision, unit)
     slopes = slopes_of_frames(model, state.image, state.z)
     pull = (precision * slopes * residual).double().sum((1, 2, 3))
     step = torch.linalg.solve(information(slopes, precision), pull)
