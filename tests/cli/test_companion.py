@@ -59,6 +59,22 @@ def test_a_companion_is_found_beside_its_star_and_none_beside_another(write, tmp
     assert "no companion above 5 standard errors" in capsys.readouterr().out
 
 
+def test_a_resolved_source_is_no_companion(write, tmp_path, capsys):
+    ring = [(1.5 * np.sin(angle), 1.5 * np.cos(angle), 1) for angle in np.linspace(0, 2 * np.pi, 7)[:-1]]
+    resolved, star = write("resolved.oifits", ring, 1), write("star.oifits", ((0, 0, 1),), 2)
+    assert run(resolved, "--star", star, "--out", tmp_path / "run") == 3
+    found = json.loads((tmp_path / "run/companion.json").read_text())
+    companion = found["companion"]
+    assert companion["chi_square"] > companion["chi_square_limit"]
+    assert companion["significance"] > 5  # by how much better it is than a star alone
+    assert not found["explained"]
+    assert not found["detected"]
+    assert json.loads((tmp_path / "run/status.json").read_text())["explained"] is False
+    said = capsys.readouterr().out
+    assert "not explained: a star and one companion leave a chi-square of" in said
+    assert "would be found" not in said
+
+
 def test_bounds_are_in_arcsec(write, tmp_path):
     star = write("star.oifits", ((0, 0, 1),), 2)
     wide = ("--least-arcsec", "0.1", "--most-arcsec", "0.3")

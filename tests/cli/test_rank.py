@@ -38,6 +38,8 @@ def test_masks_of_catalogue_files_and_searches_are_ranked(tmp_path, capsys):
     criterion = observed(Options(n_frequencies=32, fill_factor=0.1)).criterion()
     assert rows["torchmask_6", "searched"]["relative_mse"] == pytest.approx(float(criterion.relative(own)), rel=1e-9)
     assert (tmp_path / "run/ranking.png").read_bytes().startswith(b"\x89PNG")
+    events = [path.parent for path in (tmp_path / "run").rglob("events.*")]
+    assert events == [tmp_path / "run"]  # one run in TensorBoard, in one folder
     said = capsys.readouterr().out
     assert "not ranked: keck_lws_pattern2a_9, as built: 3 pairs of holes overlap" in said
 

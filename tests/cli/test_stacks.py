@@ -45,7 +45,7 @@ def test_a_cube_without_wavelength_has_that_of_the_mask_file(write_fits, fits_cu
     save_json(tmp_path / "old.json", mask)
     bare = [write_fits("bare.fits", fits_cube, WAVELEN=None)]
     assert read_stack(bare, StackOptions(mask=tmp_path / "mask.json")).grid.wavelength == 633e-9
-    with pytest.raises(ValueError, match=r"bare\.fits has no WAVELEN.*: give --wavelength \[m\]"):
+    with pytest.raises(ValueError, match=r"bare\.fits has no WAVELEN.*: give wavelength \[m\]"):
         read_stack(bare, StackOptions(mask=tmp_path / "old.json"))
 
 
@@ -61,13 +61,13 @@ def test_frames_of_a_stack_are_skipped_and_those_without_light_left_out(tmp_path
     assert seen.frame_numbers == (0, 2, 3, 5)
     seen.save(tmp_path / "part.npz")
     assert read_stack([tmp_path / "part.npz"], StackOptions(skip=(3,))).frame_numbers == (0, 2, 5)
-    with pytest.raises(ValueError, match="--skip names frame 6, but the stack has 6 frames, with numbers from 0 to 5"):
+    with pytest.raises(ValueError, match="skip names frame 6, but the stack has 6 frames, with numbers from 0 to 5"):
         read_stack([tmp_path / "a.npz"], StackOptions(skip=(6,)))
 
 
 def test_a_cube_in_adu_needs_a_gain(write_fits, fits_cube):
     raw = [write_fits("raw.fits", fits_cube, BUNIT=None)]
-    with pytest.raises(ValueError, match=r"give --gain \[electrons per adu\]; if pixels are not in adu, give --unit"):
+    with pytest.raises(ValueError, match=r"give gain \[electrons per adu\]; if pixels are not in adu, give unit"):
         read_stack(raw, StackOptions(mask=Path("keck_nirc2_9")))
     assert len(read_stack(raw, StackOptions(mask=Path("keck_nirc2_9"), gain=2.0)).frames) == 3
 

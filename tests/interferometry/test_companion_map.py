@@ -1,6 +1,7 @@
 """Companions in squared visibilities and closure phases: found where they are, with errors and limits that hold."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -60,6 +61,16 @@ def test_errors_that_were_told_too_small_grow_with_what_is_left(measure_pair):
     assert mean.abs().max() < 4
     # Student's t of 22 degrees of freedom has a variance of 22/20, and a kurtosis of 6/18
     assert (variance * math.sqrt(2 / SEEDS) + 1 - 1.1).abs().max() < 4 * 1.1 * math.sqrt((2 + 6 / 18) / SEEDS)
+
+
+def test_what_errors_half_as_large_again_do_not_explain_is_no_companion(measure_pair):
+    fits = [fit_pair(measure_pair(TRUTH, seed, told=told), TRUTH) for told in (1.0, 1 / 1.5, 0.3) for seed in range(8)]
+    assert [fit.explained for fit in fits] == 16 * [True] + 8 * [False]
+    assert [fit.detected for fit in fits] == [fit.explained for fit in fits]
+    assert min(fit.significance for fit in fits) > 5
+    assert fits[0].limit == pytest.approx(1.5**2 * (22 + 5 * math.sqrt(44)), rel=1e-12)
+    assert replace(fits[0], chi_square=fits[0].limit).explained
+    assert not replace(fits[0], chi_square=1.001 * fits[0].limit).explained
 
 
 def test_a_star_alone_is_as_significant_as_chance(measure_pair):

@@ -13,6 +13,7 @@ import torch
 import tyro
 
 from torchmask.cli.options import RunOptions
+from torchmask.cli.program import NOT_EXPLAINED
 from torchmask.cli.run import new_run
 from torchmask.grid import ARCSEC, MAS
 from torchmask.interferometry.companion_errors import MEASURED, polar, rotation_towards
@@ -29,7 +30,8 @@ class Options(RunOptions):
     """Search for a companion of a star in OIFITS files, and give the contrasts that would have been detected.
 
     The files are those of `torchmask restore --oifits` or of any other program; several are analysed jointly. The
-    command writes companion.json, the map of all positions tried (companion.npz) and a figure to a new folder.
+    command writes companion.json, the map of all positions tried (companion.npz) and a figure to a new folder. The exit
+    status is 3 if a star and one companion do not explain the measurements.
     """
 
     files: tyro.conf.Positional[tuple[Path, ...]] = ()
@@ -47,8 +49,8 @@ class Options(RunOptions):
     """Largest separation to try [arcsec]; None: half the period of the widest fringe."""
 
 
-def run(options: Options) -> None:
-    """Read the files, search, and write and print the results."""
+def run(options: Options) -> int:
+    """Read the files, search, and write and print the results; return the exit status."""
     measured = read_measurements(options)
     bounds = [None if value is None else value * ARCSEC for value in (options.least_arcsec, options.most_arcsec)]
     try:
@@ -63,7 +65,8 @@ def run(options: Options) -> None:
         numbers = {
             "files": [str(path) for path in options.files],
             "stars": [str(path) for path in options.star],
-            "detected": fit.significance >= SIGNIFICANCE,
+            "explained": fit.explained,
+            "detected": fit.detected,
             "companion": describe(fit),
             "side_known": sides,
             "limits": dataclasses.asdict(limits),
@@ -74,7 +77,9 @@ def run(options: Options) -> None:
         }
         save_npz(output.directory / "companion.npz", arrays)
         output.logger.figure("companion", companion_figure(found, limits))
-        output.summary.extend(summary(numbers["companion"], limits, sides))
+        output.logger.conclude(explained=fit.explained, detected=fit.detected)
+        output.summary.extend(summary(fit, limits, sides))
+    return 0 if fit.explained else NOT_EXPLAINED
 
 
 def read_measurements(options: Options) -> Measurements:
@@ -116,21 +121,32 @@ def describe(fit: PairFit) -> dict[str, Any]:
         "errors": dict(zip(MEASURED, errors, strict=True)),
         "significance": fit.significance,
         "chi_square": fit.chi_square,
+        "chi_square_limit": fit.limit,
         "chi_square_without": fit.star_chi_square,
         "degrees_of_freedom": fit.degrees_of_freedom,
     }
 
 
-def summary(companion: dict[str, Any], limits: DetectionLimits, side_known: bool) -> Sequence[str]:
-    """Return the lines to print."""
-    errors, significant = companion["errors"], companion["significance"] >= SIGNIFICANCE
-    head = "a companion" if significant else f"no companion above {SIGNIFICANCE:g} standard errors; the likeliest is"
+def summary(fit: PairFit, limits: DetectionLimits, side_known: bool) -> Sequence[str]:
+    """Return the lines to print; limits only if the measurements are explained, as they rest on the residuals."""
+    seen = describe(fit)
+    errors, freedom = seen["errors"], f"of {fit.degrees_of_freedom} degrees of freedom"
+    where = (
+        f"of {seen['contrast']:.3g} +- {seen['contrast_error']:.2g} of the star's light, "
+        f"{seen['separation']:.4g} +- {errors['separation']:.2g} mas from it at "
+        f"{seen['position_angle']:.4g} +- {errors['position_angle']:.2g} deg, north through east"
+    )
+    if not fit.explained:
+        return [
+            f"not explained: a star and one companion leave a chi-square of {fit.chi_square:.4g} {freedom}; up to "
+            f"{fit.limit:.4g} counts as explained; check that the star is a point and has one companion at most, "
+            "that --star is a point seen through the same mask, and the errors in the files",
+            f"the companion that fits best, which the measurements contradict, is {where}",
+        ]
+    head = "a companion" if fit.detected else f"no companion above {SIGNIFICANCE:g} standard errors; the likeliest is"
     lines = [
-        f"{head} of {companion['contrast']:.3g} +- {companion['contrast_error']:.2g} of the star's light, "
-        f"{companion['separation']:.4g} +- {errors['separation']:.2g} mas from it at "
-        f"{companion['position_angle']:.4g} +- {errors['position_angle']:.2g} deg, north through east "
-        f"({companion['significance']:.1f} standard errors; chi-square {companion['chi_square']:.4g} of "
-        f"{companion['degrees_of_freedom']}, {companion['chi_square_without']:.4g} without it)"
+        f"{head} {where} ({fit.significance:.1f} standard errors; chi-square {fit.chi_square:.4g} {freedom}, "
+        f"{fit.star_chi_square:.4g} without it)"
     ]
     if not side_known:
         lines.append("without closure phases, a companion on the opposite side of the star fits equally well")

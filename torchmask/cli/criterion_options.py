@@ -162,10 +162,12 @@ class ObservationOptions(CriterionOptions):
     def observation(self, n_frequencies: int, exponent: float, knee: float, fill_factor: float) -> Observed:
         """Return the observation through holes of a fill factor N d^2 / D^2.
 
-        Raises ValueError for a fill factor or a pixel scale that cannot be, and as `turbulence`.
+        Raises ValueError for a fill factor, a number of pixels or a pixel scale that cannot be, and as `turbulence`.
         """
         if not (math.isfinite(fill_factor) and fill_factor > 0):
             raise ValueError(f"--fill-factor is {fill_factor:g}: it must be finite and positive")
+        if self.n_pixels < 1:
+            raise ValueError(f"--n-pixels is {self.n_pixels}: it must be at least 1")
         area = math.pi / 4 * fill_factor * self.mask_diameter**2
         photons = self.n_photons
         if photons is None:

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 
 from torchmask import __version__
-from torchmask.cli.program import exit_status, parse
+from torchmask.cli.program import carry_out, exit_status, parse
 
 COMMANDS = {
     "plan": "predict how many holes, of what size, and what exposure an observation needs",
@@ -37,7 +37,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     def work() -> int | None:
         module = importlib.import_module(f"torchmask.cli.{command}")
-        return module.run(parse(module.Options, command, arguments[1:], prog=program))
+        return carry_out(module.run, parse(module.Options, command, arguments[1:], prog=program))
 
     return exit_status(program, work, debug="--debug" in arguments)
 

@@ -143,6 +143,8 @@ class BandOptions(FilterOptions):
 
     def band(self, wavelength: float) -> dict[str, Any]:
         """Return the band as `MyopicDeconvolution` takes it. Raises ValueError for two bands or another filter."""
+        if self.weights and not self.wavelengths:
+            raise ValueError("--weights are those of --wavelengths: give both")
         band = self.filter_band(wavelength)
         if band is None:
             if self.temperature is not None:
@@ -237,8 +239,7 @@ def load_aperture(options: MaskOptions, telescope: Telescope | None = None) -> A
     try:
         mask = SparseAperture.from_catalog(name, diameter, options.fill_factor, options.mirrored)
     except ValueError as error:
-        message = str(error).replace("mask_diameter", "--mask-diameter [m]").replace("fill_factor", "--fill-factor")
-        raise ValueError(f"--mask {name}: {message}") from error
+        raise ValueError(f"--mask {name}: {error}") from error
     return require_apart(name, mask, options.allow_overlap)
 
 

@@ -2,8 +2,7 @@
 shares its ways.
 
 Exit status: 0 done; 1 something the user can mend, said in one line; 2 wrong usage; 3 done, and all of it written, but
-frames are not explained by what was restored from them; 130 interrupted, by Ctrl-C or by SIGTERM, which batch systems
-send.
+the result does not explain the data; 130 interrupted, by Ctrl-C or by SIGTERM, which batch systems send.
 """
 
 from __future__ import annotations
@@ -22,6 +21,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from torchmask.cli.config import CONFIG, load_config
+from torchmask.cli.wording import in_options
 from torchmask.instrument.instrument import Instrument
 
 T = TypeVar("T")
@@ -64,9 +64,17 @@ def run_script(
     arguments = list(sys.argv[1:] if argv is None else argv)
     return exit_status(
         name,
-        lambda: run(parse(options, name, arguments, prog=name, description=description)),
+        lambda: carry_out(run, parse(options, name, arguments, prog=name, description=description)),
         debug="--debug" in arguments,
     )
+
+
+def carry_out(run: Callable[[T], int | None], options: T) -> int | None:
+    """Run a program with its options. Raises ValueError as `run` does, but in the words of the command line."""
+    try:
+        return run(options)
+    except ValueError as error:
+        raise ValueError(in_options(str(error), options)) from error
 
 
 def exit_status(program: str, work: Callable[[], int | None], debug: bool) -> int:
@@ -135,13 +143,16 @@ def parse(options: type[T], command: str, argv: Sequence[str], *, prog: str, des
     default: dict[str, Any] = {} if path is None else {"default": load_config(path, options, command)}
     if instrument is not None:
         default["default"] = typing.cast(Any, options).of_instrument(Instrument.load(instrument))
-    with _checked_at_the_end(options):
-        return tyro.cli(options, prog=prog, args=argv, description=description, **default)
+    with _checks_deferred(options) as mistakes:
+        found = tyro.cli(options, prog=prog, args=argv, description=description, **default)
+    if mistakes:
+        raise ValueError(in_options(str(mistakes[0]), found)) from mistakes[0]
+    return found
 
 
 @contextmanager
-def _checked_at_the_end(options: type) -> Iterator[None]:
-    """Hold back the first mistake that a group of options finds in itself until all options are parsed.
+def _checks_deferred(options: type) -> Iterator[list[ValueError]]:
+    """Collect the mistakes that groups of options find in themselves, until all options are parsed.
 
     Groups check themselves when they are made, and tyro would call an error then wrong usage.
     """
@@ -161,12 +172,10 @@ def _checked_at_the_end(options: type) -> Iterator[None]:
     for kind, check in checks.items():
         kind.__post_init__ = deferred(check)
     try:
-        yield
+        yield mistakes
     finally:
         for kind, check in checks.items():
             kind.__post_init__ = check
-    if mistakes:
-        raise mistakes[0]
 
 
 def _groups(options: type) -> set[Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -21,7 +21,7 @@ from torchmask.instrument.instrument import Instrument
 from torchmask.io import atomic_write
 from torchmask.optics import catalog
 from torchmask.optics.aperture import SparseAperture
-from torchmask.record import label_stage
+from torchmask.record import Callback
 from torchmask.viz.ranking import ranking_figure
 
 _SHOWN = 5  # masks named on the terminal
@@ -82,12 +82,20 @@ def search_masks(options: Options, criterion: AsymptoticMSE, output: Run) -> dic
             seed=options.seed,
             budget=options.budget,
             constraints=options.constraints(),
-            callback=label_stage(output.callback, f"{n}_holes"),
+            callback=_in_one_run(output.callback, n),
         )
         name = f"torchmask_{n}"
         masks[name] = result.aperture
         save_json(output.directory / f"{name}.json", result.aperture, options.wavelength)
     return masks
+
+
+def _in_one_run(callback: Callback, n: int) -> Callback:
+    """Return a callback for one of several searches, which renames its stage "design/cma" to "cma_6_holes".
+
+    A stage "KIND/VARIANT" would be a run of its own in TensorBoard, with a folder of its own.
+    """
+    return lambda record: callback(replace(record, stage=f"{record.stage.rpartition('/')[2]}_{n}_holes"))
 
 
 def ranking(options: Options, output: Run) -> Ranking:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -222,7 +223,7 @@ def deconvolution(observation: Observation, options: Options) -> MyopicDeconvolu
         r0=observation.r0 if options.r0 is None else options.r0,
         outer_scale=observation.outer_scale if options.outer_scale is None else options.outer_scale,
         readout_noise=observation.readout_noise,
-        background=SKIES[options.sky] if isinstance(options.sky, str) else options.sky,
+        background=SKIES[options.sky] if isinstance(options.sky, str) else known_sky(options),
         **options.band(observation.grid.wavelength),
         static_modes=options.static_modes,
         pixel=pixel_response(options.pixel_fill),
@@ -236,8 +237,12 @@ def deconvolution(observation: Observation, options: Options) -> MyopicDeconvolu
 
 
 def known_sky(options: Options) -> float:
-    """Return the sky of --sky [electrons per pixel]; 0 if it is to be estimated."""
-    return 0.0 if isinstance(options.sky, str) else options.sky
+    """Return the sky of --sky [electrons per pixel]; 0 if it is to be estimated. ValueError if it is no light."""
+    if isinstance(options.sky, str):
+        return 0.0
+    if not (math.isfinite(options.sky) and options.sky >= 0):
+        raise ValueError(f"--sky is {options.sky:g}: it must be finite and at least 0, in electrons per pixel")
+    return options.sky
 
 
 def history(files: Sequence[Path], result: RestorationResult, options: Options) -> list[str]:

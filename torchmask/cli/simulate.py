@@ -117,11 +117,16 @@ class TrueMaskOptions:
     """Magnification of the positions and sizes of the holes."""
 
     def apply(self, aperture: Aperture) -> Aperture | None:
-        """Return the true mask, or None if it does not differ. Raises ValueError for a full pupil."""
+        """Return the true mask, or None if it does not differ.
+
+        Raises ValueError for a full pupil or an impossible magnification.
+        """
         if self == TrueMaskOptions():
             return None
         if not isinstance(aperture, SparseAperture):
             raise ValueError("--true-mask.rotation-deg and --true-mask.magnification are for masks, not a full pupil")
+        if not (math.isfinite(self.magnification) and self.magnification > 0):
+            raise ValueError(f"--true-mask.magnification is {self.magnification}: it must be finite and positive")
         geometry = MaskGeometry(math.radians(self.rotation_deg), self.magnification, self.magnification)
         return geometry.apply(aperture)
 

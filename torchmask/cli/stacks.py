@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -100,11 +99,9 @@ def _read(files: Sequence[Path], options: StackOptions) -> Observation:
         return _from_fits(files, options)
     if len(files) > 1:
         raise ValueError(f"--join is for FITS files, but {files[0]} is a stack by itself: leave it out")
-    for item in dataclasses.fields(FITSOptions):
-        if getattr(options, item.name) != item.default:
-            raise ValueError(
-                f"--{item.name.replace('_', '-')} is for FITS files, but {files[0]} is not one: leave it out"
-            )
+    _refuse(options, FITSOptions, f"is for FITS files, but {files[0]} is not one: leave it out")
+    if options.mask is None:
+        _refuse(options, MaskOptions, f"is for --mask, which is not given: {files[0]} has a mask of its own")
     observation = Observation.load(files[0])
     grid, scale = observation.grid, pixel_angle(options.pixel_scale_arcsec)
     changes: dict[str, Any] = {
@@ -117,6 +114,13 @@ def _read(files: Sequence[Path], options: StackOptions) -> Observation:
     return _usable(dataclasses.replace(observation, **changes), files[0], options)
 
 
+def _refuse(options: StackOptions, group: type, reason: str) -> None:
+    """Raise ValueError if an option of this group is given."""
+    for item in dataclasses.fields(group):
+        if getattr(options, item.name) != item.default:
+            raise ValueError(f"--{item.name.replace('_', '-')} {reason}")
+
+
 def _usable(observation: Observation, path: Path, options: StackOptions) -> Observation:
     """Return the observation with the frames that hold light and are not skipped."""
     frames = observation.frames
@@ -125,16 +129,11 @@ def _usable(observation: Observation, path: Path, options: StackOptions) -> Obse
         kept = usable_frames(frames.numpy(), valid.numpy(), options.skip, observation.frame_numbers)
         return observation.take(kept)
     except ValueError as error:
-        raise ValueError(f"{path}: {_as_option(str(error))}") from error
-
-
-def _as_option(message: str) -> str:
-    """Replace `skip` at the beginning of a message by the name of the option."""
-    return re.sub(r"^skip", "--skip", message)
+        raise ValueError(f"{path}: {error}") from error
 
 
 def _from_fits(files: Sequence[Path], options: StackOptions) -> Observation:
-    """Read FITS files. Errors about missing keywords name the command-line options to give instead."""
+    """Read FITS files. Raises ValueError as `read_observation`, but asks for a missing pixel scale in arcsec."""
     aperture = load_aperture(options)
     scale = pixel_angle(options.pixel_scale_arcsec)
     given = {item.name: getattr(options, item.name) for item in dataclasses.fields(FITSOptions)}
@@ -143,7 +142,4 @@ def _from_fits(files: Sequence[Path], options: StackOptions) -> Observation:
     try:
         return read_observation(files, aperture, pixel_scale=scale, **given)
     except ValueError as error:
-        message = _as_option(str(error)).replace("give pixel_scale [rad]", "give --pixel-scale-arcsec [arcsec]")
-        for name in given:
-            message = message.replace(f"give {name}", f"give --{name.replace('_', '-')}")
-        raise ValueError(message) from error
+        raise ValueError(str(error).replace("give pixel_scale [rad]", "give --pixel-scale-arcsec [arcsec]")) from error

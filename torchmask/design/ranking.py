@@ -152,7 +152,7 @@ def rank_masks(
     allow_overlap : bool
         Whether masks as built are ranked even if their holes overlap, as one real mask's do.
     callback : callable, optional
-        Receives a `Record` of stage "design/rank" after each mask.
+        Receives a `Record` of stage "ranking" after each mask.
 
     Raises
     ------
@@ -190,7 +190,7 @@ def rank_masks(
             error = float(judge.relative(mask))
         measured.append((error, name, layout, mask))
         if callback is not None:
-            callback(Record("design/rank", step, len(masks), {"relative_mse": error}))
+            callback(Record("ranking", step, len(masks), {"relative_mse": error}))
     judge = next(iter(known.values()))  # the floor is relative, and the same for all
     floor = judge.relative_floor(mask_diameter)
     return Ranking(tuple(_rows(measured, floor)), left_out, floor)

@@ -41,5 +41,11 @@ class MaskRules:
             rules.append(KeepOutDisc(self.central_obstruction))
         if self.rim_margin:
             rules.append(RimMargin(self.rim_margin))
-        rules += [KeepOutDisc(diameter, (x, y)) for x, y, diameter in self.keep_out]
-        return rules + [KeepOutSegment((x, y), (to_x, to_y), width) for x, y, to_x, to_y, width in self.spiders]
+        try:
+            rules += [KeepOutDisc(diameter, (x, y)) for x, y, diameter in self.keep_out]
+        except ValueError as error:
+            raise ValueError(f"keep_out has a disc whose {error}") from error
+        try:
+            return rules + [KeepOutSegment((x, y), (to_x, to_y), width) for x, y, to_x, to_y, width in self.spiders]
+        except ValueError as error:
+            raise ValueError(f"spiders has a bar whose {error}") from error

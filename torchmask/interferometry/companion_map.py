@@ -20,6 +20,8 @@ _WIDEST = 25  # maximum radius of the raster, in periods of the finest fringe
 _STEPS = 40  # maximum number of Gauss-Newton steps for contrast and position
 _LEAST_CURVATURE = 1e-12  # of the largest: below, the companion's position along some direction is unconstrained
 _CHUNK = 1024  # positions at a time
+_ERRORS_WITHIN = 1.5  # factor by which errors may be too small: 20 frames give them to 16 %, three times which is 1.5
+_CHANCE = 5.0  # standard deviations of the chi-square that are put down to chance
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -99,6 +101,25 @@ class PairFit(Brief):
         """Root of the decrease of chi-square over the reduced chi-square, if that is above 1."""
         left = _unexplained(self.chi_square, self.degrees_of_freedom)
         return math.sqrt(max(0.0, self.star_chi_square - self.chi_square) / left)
+
+    @property
+    def limit(self) -> float:
+        """Chi-square up to which a star and a companion explain the measurements.
+
+        It allows for chance, and for errors that are too small by up to half of what is given.
+        """
+        freedom = max(1, self.degrees_of_freedom)
+        return _ERRORS_WITHIN**2 * (freedom + _CHANCE * math.sqrt(2 * freedom))
+
+    @property
+    def explained(self) -> bool:
+        """Whether a star and a companion explain the measurements; if not, the companion means nothing."""
+        return self.chi_square <= self.limit
+
+    @property
+    def detected(self) -> bool:
+        """Whether the companion explains the measurements and is worth at least `SIGNIFICANCE` standard errors."""
+        return self.explained and self.significance >= SIGNIFICANCE
 
 
 def raster(measured: Measurements, least: float | None = None, most: float | None = None) -> Tensor:

@@ -108,7 +108,9 @@ def layout(
         hole = mask_diameter * math.sqrt(fill_factor / mask.n_subapertures)
         centers = _fit(centers, mask_diameter, mask.shape.outer_diameter(hole))
     elif mask.pupil_diameter is None:
-        raise ValueError(f"{mask.name} has no size of its own: give both mask_diameter and fill_factor (N d^2 / D^2)")
+        raise ValueError(
+            f"{mask.name} has no size of its own: give both mask_diameter [m] and fill_factor (N d^2 / D^2)"
+        )
     else:
         scale = 1.0 if mask_diameter is None else mask_diameter / mask.pupil_diameter
         mask_diameter = scale * mask.pupil_diameter

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from enum import Enum
@@ -15,7 +16,9 @@ from torch import Tensor
 
 from torchmask.io import as_array, load_npz, save_npz
 from torchmask.optics.geometry import MaskGeometry
+from torchmask.record import Callback, Record
 from torchmask.restoration.candidates import Candidates
+from torchmask.restoration.descent import Listener, Variables
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.state import Calibration, Modes, State
 from torchmask.restoration.traits import Refinement
@@ -97,6 +100,17 @@ class Progress:
     def iterations(self) -> int:
         """Number of iterations of the present start."""
         return len(self.costs) - self.began
+
+    def reporter(self, stage: str, n_steps: int, callback: Callback | None) -> Listener:
+        """Return a listener of a descent after the search: it counts its evaluations and reports its iterations."""
+        steps = itertools.count(1)
+
+        def listen(cost: float, evaluations: int, variables: Variables) -> None:
+            self.n_evaluations += evaluations
+            if callback is not None:
+                callback(Record(stage, next(steps), n_steps, {"cost": cost}, {}))
+
+        return listen
 
 
 _NUMBERS = ("n_evaluations", "escapes", "starts", "began", "alike")

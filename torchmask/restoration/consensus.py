@@ -18,7 +18,6 @@ from torchmask.restoration.candidates import Candidates, select, with_candidates
 from torchmask.restoration.checkpoint import Progress
 from torchmask.restoration.descent import descend
 from torchmask.restoration.escapes import tilt
-from torchmask.restoration.finish import reporter
 from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.schedule import Schedule
@@ -39,7 +38,7 @@ def average_starts(
     crowded = with_candidates(objective, n_each)
     fitted = share_noise_inflation(calibrate(crowded, together))
     best = select(crowded, Candidates(fitted, n_each), 1).state
-    listen = reporter(ended, "fit to the mean", schedule.segment, callback)
+    listen = ended.reporter("fit to the mean", schedule.segment, callback)
     known_object = objective.with_changes(free=objective.free & ~Free.OBJECT)
     found = descend(known_object, best, schedule.segment, minimizer, listen)
     ended.state, ended.averaged = calibrate(objective, found), len(states)

@@ -7,12 +7,10 @@ model leaves unexplained. So once all has come to rest, the aberrations gain mod
 
 from __future__ import annotations
 
-import itertools
-
-from torchmask.record import Callback, Record
+from torchmask.record import Callback
 from torchmask.restoration.calibration import recalibrate
 from torchmask.restoration.checkpoint import Progress
-from torchmask.restoration.descent import Listener, Variables, descend
+from torchmask.restoration.descent import descend
 from torchmask.restoration.escapes import settle
 from torchmask.restoration.marginal import integrate_aberrations
 from torchmask.restoration.motion import Setting
@@ -20,18 +18,6 @@ from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.traits import Traits
-
-
-def reporter(ended: Progress, stage: str, total: int, callback: Callback | None) -> Listener:
-    """Return what counts the evaluations of a descent of at most `total` iterations, and reports each of these."""
-    steps = itertools.count(1)
-
-    def listen(cost: float, evaluations: int, variables: Variables) -> None:
-        ended.n_evaluations += evaluations
-        if callback is not None:
-            callback(Record(stage, next(steps), total, {"cost": cost}, {}))
-
-    return listen
 
 
 def finish(
@@ -59,7 +45,7 @@ def finish(
     if schedule.recalibrates:
         state = recalibrate(objective, state, power=1, follow_r0=traits.r0_is_open)
 
-    listen = reporter(ended, "last descent", schedule.last_iterations, callback)
+    listen = ended.reporter("last descent", schedule.last_iterations, callback)
     state = descend(objective, state, schedule.last_iterations, minimizer, listen)
     ended.state = settle(objective, state, schedule.last_settling)  # a descent moves flat parts of the object slowly
     return objective

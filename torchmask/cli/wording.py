@@ -1,0 +1,118 @@
+"""Errors of the library in the words of the command line: they name options in place of parameters."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+import typing
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+_START = r"(?:^|(?<=: ))"  # of a message, or of its part after the name of a file
+_VALUE = re.compile(_START + r"(?P<name>[\w.]+) (?:is|are) (?P<value>[-+]?(?:\d[-+\w.]*|nan|inf)|[(\[][^)\]]*)")
+_SUBJECT = re.compile(_START + r"(?P<name>[a-z]\w*) (?=(?:is|are|has|have|holds|names|leaves) )")
+_ADVICE = re.compile(r"(?<=give )(?P<name>[a-z]\w*)\b|(?<![-\w./'\"`])(?P<word>[a-z]\w*_\w+)\b(?![./(=])")
+_NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*(?:e[-+]?\d+)?|nan|inf)\b")
+
+
+@dataclass(frozen=True)
+class Option:
+    """One option of a program, as it was given.
+
+    flag : how it is written, such as --imaging.n-photons
+    name : last part of its name as a parameter, such as n_photons
+    numbers : the numbers in its value
+    is_given : whether the value differs from the default
+    """
+
+    flag: str
+    name: str
+    numbers: list[float]
+    is_given: bool
+
+
+def in_options(message: str, options: Any) -> str:
+    """Return an error message of the library that speaks of options where it spoke of parameters.
+
+    The library names parameters: "fill_factor is 2.0: it must be ...". Several options may stand behind one parameter,
+    and their names may differ from it, so the option is known by its value. In advice, such as "lower fill_factor", the
+    name alone decides.
+
+    Parameters
+    ----------
+    message : str
+        Message of a ValueError.
+    options : dataclass
+        Options of the program, whose fields may be dataclasses of options themselves.
+
+    Examples
+    --------
+    >>> @dataclass
+    ... class Options:
+    ...     fill_factor: float = 0.15
+    ...     pixel_fill: float | None = None
+    >>> in_options("fill_factor is 2.0: it must be a fraction", Options(pixel_fill=2.0))
+    '--pixel-fill is 2.0: it must be a fraction'
+    >>> in_options("these holes overlap: lower fill_factor", Options())
+    'these holes overlap: lower --fill-factor'
+    """
+    known = list(_flatten(options))
+    told = _VALUE.search(message)
+    head = told or _SUBJECT.search(message)
+    if head is None:
+        return _advise(message, known)
+    name, rest = head["name"], message[head.end("name") :]
+    flag = _by_name(name, known) if told is None else _by_value(name, _numbers(told["value"]), known)
+    return message[: head.start()] + (flag or name) + _advise(rest, known)
+
+
+def _by_value(name: str, numbers: list[float], known: list[Option]) -> str | None:
+    """Return the option of a parameter with these numbers: one of its name, or else the only one given with them."""
+    same = [option for option in known if numbers and _holds(option.numbers, numbers)]
+    named = [option for option in same if name in (option.name, option.flag[2:])]
+    given = [option for option in same if option.is_given]
+    for chosen in (named, given, [option for option in given if name in option.name]):
+        if len(chosen) == 1:
+            return chosen[0].flag
+    return None
+
+
+def _by_name(name: str, known: list[Option]) -> str | None:
+    flags = [option.flag for option in known if option.name == name]
+    return flags[0] if len(flags) == 1 else None
+
+
+def _advise(text: str, known: list[Option]) -> str:
+    """Replace names of parameters that are also those of options."""
+    return _ADVICE.sub(lambda found: _by_name(found[0], known) or found[0], text)
+
+
+def _flatten(options: Any, prefix: str = "--") -> Iterator[Option]:
+    """Yield all options but positional arguments, which have no name on the command line."""
+    import tyro
+
+    hints = typing.get_type_hints(type(options), include_extras=True)
+    for item in dataclasses.fields(options):
+        value, flag = getattr(options, item.name), prefix + item.name.replace("_", "-")
+        if dataclasses.is_dataclass(value):
+            yield from _flatten(value, f"{flag}.")
+        elif tyro.conf.Positional not in typing.get_args(hints[item.name]):
+            numbers = [] if isinstance(value, bool) else _numbers(str(value))
+            yield Option(flag, item.name, numbers, value != item.default)
+
+
+def _numbers(text: str) -> list[float]:
+    return [float(number) for number in _NUMBER.findall(text)]
+
+
+def _holds(numbers: list[float], wanted: list[float]) -> bool:
+    """Return whether these are the wanted numbers, or the one that is wanted is among them."""
+
+    def same(a: float, b: float) -> bool:
+        return a == b or (math.isnan(a) and math.isnan(b))
+
+    if len(wanted) == 1:
+        return any(same(number, wanted[0]) for number in numbers)
+    return len(numbers) == len(wanted) and all(map(same, numbers, wanted))
