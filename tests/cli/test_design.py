@@ -146,11 +146,11 @@ def test_wavelengths_of_light_pass(wavelength):
 @pytest.mark.parametrize(
     ("option", "said"),
     [
-        (["--rim-margin", "-0.1"], "margin is -0.1"),
+        (["--rim-margin", "-0.1"], "--rim-margin is -0.1"),
         (["--rim-margin", "0.45"], r"cannot fit into a disc of 0\.1 m"),
-        (["--keep-out", "0", "0", "-1"], "diameter is -1"),
-        (["--scale", "0"], "scale is 0"),
-        (["--n-pixels", "0"], "n_pixels is 0"),
+        (["--keep-out", "0", "0", "-1"], "--keep-out has a disc whose diameter is -1"),
+        (["--scale", "0"], "--scale is 0"),
+        (["--n-pixels", "0"], "--n-pixels is 0"),
     ],
 )
 def test_what_cannot_be_is_refused_before_any_work(option, said, tmp_path, capsys):

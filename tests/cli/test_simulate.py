@@ -65,7 +65,7 @@ def test_options_are_the_turbulence_that_they_name():
     ("options", "message"),
     [
         (["--conditions.sky", "-1"], r"sky is -1\.0: it must be finite and at least 0"),
-        (["--turbulence.exposure-time", "-0.1"], r"exposure_time is -0\.1: .* in s"),
+        (["--turbulence.exposure-time", "-0.1"], r"--turbulence.exposure-time is -0\.1: .* in s"),
         (["--turbulence.exposure-time", "0.1"], "no wind"),
         (["--turbulence.profile", "hv58"], "profile 'hv58' is unknown: known ones are hv57, las_campanas, mauna_kea"),
         (["--turbulence.frame-interval", "0.1"], "--turbulence.frame-interval needs --turbulence.wind"),
@@ -74,8 +74,8 @@ def test_options_are_the_turbulence_that_they_name():
         (["--pixel-scale-arcsec", "0"], "--pixel-scale-arcsec is 0: it must be finite and positive, in arcsec"),
         (["--pixel-scale-arcsec", "0.5"], r"\(0\.5 arcsec\) undersamples .* at most .* \(0\.06\d+ arcsec\)"),
         (["--scene.path", "none.png"], "none.png"),
-        (["--conditions.pixel-fill-factor", "1.5"], r"fill_factor is 1\.5"),
-        (["--true-mask.magnification", "0"], "the magnifications positive"),
+        (["--conditions.pixel-fill-factor", "1.5"], r"--conditions.pixel-fill-factor is 1\.5"),
+        (["--true-mask.magnification", "0"], "--true-mask.magnification is"),
     ],
 )
 def test_what_cannot_be_is_one_line_and_leaves_nothing(tmp_path, capsys, options, message):

@@ -49,7 +49,7 @@ def test_rows_are_written_and_not_computed_twice(tmp_path, capsys):
     assert main([*argv, "--diameter-over-r0", "30"]) == 1
     assert "no combination can be built" in capsys.readouterr().err
     assert main([*argv, "--exponent", "-3"]) == 1
-    assert capsys.readouterr().err == "torchmask table: error: exponent is -3.0: it must be finite and not negative\n"
+    assert capsys.readouterr().err == "torchmask table: error: --exponent is -3.0: it must be finite and not negative\n"
 
 
 def test_under_turbulence_the_error_is_that_criterion_and_the_sky_grows_with_the_area(tmp_path):

@@ -97,8 +97,11 @@ class CriterionOptions(ExposureOptions):
     def turbulence(self, wavelength: float, area: float) -> dict[str, Any] | None:
         """Return the options as `TurbulentMSE` takes them, None for the asymptotic criterion.
 
-        Raises ValueError as `conditions`, for turbulence without r0, and for an outer scale without turbulence.
+        Raises ValueError as `conditions`, for turbulence without r0, an impossible r0, and an outer scale without
+        turbulence.
         """
+        if self.r0 is not None and not (math.isfinite(self.r0) and self.r0 > 0):
+            raise ValueError(f"--r0 is {self.r0:g}: it must be finite and positive, in m at the wavelength")
         conditions = self.conditions(wavelength, area)
         if conditions is None:
             if self.outer_scale is not None and self.instrument is None:

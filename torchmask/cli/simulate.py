@@ -119,12 +119,14 @@ class TrueMaskOptions:
     def apply(self, aperture: Aperture) -> Aperture | None:
         """Return the true mask, or None if it does not differ.
 
-        Raises ValueError for a full pupil or an impossible magnification.
+        Raises ValueError for a full pupil, and for numbers that are not finite or, as a magnification, not positive.
         """
         if self == TrueMaskOptions():
             return None
         if not isinstance(aperture, SparseAperture):
             raise ValueError("--true-mask.rotation-deg and --true-mask.magnification are for masks, not a full pupil")
+        if not math.isfinite(self.rotation_deg):
+            raise ValueError(f"--true-mask.rotation-deg is {self.rotation_deg}: it must be finite, in degrees")
         if not (math.isfinite(self.magnification) and self.magnification > 0):
             raise ValueError(f"--true-mask.magnification is {self.magnification}: it must be finite and positive")
         geometry = MaskGeometry(math.radians(self.rotation_deg), self.magnification, self.magnification)
