@@ -245,7 +245,7 @@ def test_every_assumption_about_the_sky_has_its_word():
         (["--mask", "MASK", "--vane-angles", "0"], "--vane-angles is for a full pupil"),
         (
             ["--mask", "full", "--mask-diameter", "2", "--vane-width", "0.1"],
-            r"vane_width is 0.1 m and vane_angles are \[\] degrees",
+            r"--vane-width is 0.1 m and --vane-angles are \[\] degrees",
         ),
     ],
 )
@@ -332,10 +332,10 @@ def test_impossible_requests_are_refused_and_leave_nothing(tmp_path, capsys):
     refused([*DESIGN, "--fill-factor", "0.9"], tmp_path, capsys, "cannot be packed|no mask|fill_factor")
     refused([*DESIGN, "--central-obstruction", "0.99"], tmp_path, capsys, "no mask of 4 holes")
     refused([*DESIGN, "--min-gap", "-1"], tmp_path, capsys, "gap is -1.0")
-    refused([*DESIGN, "--budget", "0"], tmp_path, capsys, "budget is 0")
+    refused([*DESIGN, "--budget", "0"], tmp_path, capsys, "--budget is 0")
     refused(["simulate", "--mask", "none.json"], tmp_path, capsys, "there is no mask file none.json")
     dark = ["--wavelength", "2e-6", "--n-photons", "0"]
-    refused(["simulate", "--mask", "keck_nirc2_9", *dark], tmp_path, capsys, "n_photons is 0")
+    refused(["simulate", "--mask", "keck_nirc2_9", *dark], tmp_path, capsys, "--n-photons is 0")
     (tmp_path / "bad.yaml").write_text("n_holes: 4")
     refused(
         ["design", "--config", tmp_path / "bad.yaml"], tmp_path, capsys, "unknown key n_holes; known keys are n_sub"
@@ -345,15 +345,15 @@ def test_impossible_requests_are_refused_and_leave_nothing(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        (["--imaging.d-over-r0", "0"], "d_over_r0 is 0.0: it must be positive"),
-        (["--imaging.outer-scale", "-1", "--imaging.diameter", "8"], r"outer_scale is -1\.0: .* units of the diameter"),
-        (["--imaging.readout-noise", "-1"], "readout_noise is -1.0"),
-        (["--imaging.n-frames", "0"], "n_frames is 0"),
+        (["--imaging.d-over-r0", "0"], "--imaging.d-over-r0 is 0.0: it must be positive"),
+        (["--imaging.outer-scale", "-1", "--imaging.diameter", "8"], r"--imaging.outer-scale is -1\.0: .* units of the diameter"),
+        (["--imaging.readout-noise", "-1"], "--imaging.readout-noise is -1.0"),
+        (["--imaging.n-frames", "0"], "--imaging.n-frames is 0"),
         (["--imaging.n-pixels", "24"], "spans 1.75 pupil samples"),
         (["--restoration.n-modes", "-3"], "is -3: it must be"),
-        (["--restoration.max-iterations", "0"], "max_iterations is 0"),
-        (["--design.n-subapertures", "0"], "n_subapertures is 0"),
-        (["--design.fill-factor", "2"], "fill_factor is 2.0"),
+        (["--restoration.max-iterations", "0"], "--restoration.max-iterations is 0"),
+        (["--design.n-subapertures", "0"], "--design.n-subapertures is 0"),
+        (["--design.fill-factor", "2"], "--design.fill-factor is 2.0"),
     ],
 )
 def test_codesign_refuses_before_it_searches(tmp_path, capsys, monkeypatch, given, message):
