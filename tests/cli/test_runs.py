@@ -329,7 +329,7 @@ def test_a_band_that_the_pixels_undersample_is_refused_before_any_work(runs, tmp
 
 
 def test_impossible_requests_are_refused_and_leave_nothing(tmp_path, capsys):
-    refused([*DESIGN, "--fill-factor", "0.9"], tmp_path, capsys, "cannot be packed|no mask|fill_factor")
+    refused([*DESIGN, "--fill-factor", "0.9"], tmp_path, capsys, "cannot be packed|no mask|--fill-factor")
     refused([*DESIGN, "--central-obstruction", "0.99"], tmp_path, capsys, "no mask of 4 holes")
     refused([*DESIGN, "--min-gap", "-1"], tmp_path, capsys, "gap is -1.0")
     refused([*DESIGN, "--budget", "0"], tmp_path, capsys, "--budget is 0")
@@ -346,7 +346,8 @@ def test_impossible_requests_are_refused_and_leave_nothing(tmp_path, capsys):
     ("given", "message"),
     [
         (["--imaging.d-over-r0", "0"], "--imaging.d-over-r0 is 0.0: it must be positive"),
-        (["--imaging.outer-scale", "-1", "--imaging.diameter", "8"], r"--imaging.outer-scale is -1\.0: .* units of the diameter"),
+        (["--imaging.outer-scale", "-1", "--imaging.diameter", "8"], r"scale is -1\.0: .* units of the diameter"),
+        (["--imaging.diameter", "0"], "--imaging.diameter is 0.0"),
         (["--imaging.readout-noise", "-1"], "--imaging.readout-noise is -1.0"),
         (["--imaging.n-frames", "0"], "--imaging.n-frames is 0"),
         (["--imaging.n-pixels", "24"], "spans 1.75 pupil samples"),

@@ -122,6 +122,8 @@ def image_grid(options: Options) -> Grid:
 def outside(options: Options) -> tuple[TurbulencePhase, Detector]:
     """Return turbulence and detector of the simulation. Raises ValueError if their options are out of range."""
     imaging = options.imaging
+    if not imaging.diameter > 0:
+        raise ValueError(f"imaging.diameter is {imaging.diameter}: it must be positive, in m")
     if not imaging.d_over_r0 > 0:
         raise ValueError(f"imaging.d_over_r0 is {imaging.d_over_r0}: it must be positive")
     if not imaging.outer_scale > 0:
