@@ -26,7 +26,7 @@ from torchmask.restoration.placement import slopes_of_frames
 from torchmask.restoration.priors import divergence, gradient
 from torchmask.restoration.state import State
 
-_REACH = 0.7  # smoothing of the gradients' variance [1 / cut-off]: 0.5 to 1.4 tried, see docs/restoration.md
+_REACH = 0.7  # smoothing of the gradients' variance [1 / cut-off]: 0.5 to 1.4 tried, see docs/tried.md
 _ROUNDS, _FEW = 3, 6  # rounds and samples of expectation maximisation; few suffice, as they are smoothed
 _LEAST = 1e-6  # of the largest value: minimum, for a finite prior in dark parts and a finite scale of all aberrations
 _BATCH = 8  # samples drawn at once, each of which takes the memory of several stacks

@@ -11,7 +11,7 @@ _NO_LIMIT = 10**9  # iterations
 
 @dataclass(frozen=True)
 class Schedule:
-    """Numbers that control the course of a restoration. How the defaults were chosen is told in docs/restoration.md.
+    """Numbers that control the course of a restoration. How the defaults were chosen is told in docs/tried.md.
 
     segment : number of iterations between two recalibrations of scales, transmissions, noise and turbulence
     recalibrates : whether to recalibrate transmissions, noise and turbulence; the scales of the variables always are
