@@ -106,7 +106,7 @@ def test_coverage_is_where_the_transfer_function_is(shape):
     assert {tuple(np.round(xy, 12)) for xy in ax.lines[0].get_xydata()} == pairs
     assert ax.get_title(loc="left") == "3 baselines"
     labels = [text.get_text() for text in ax.figure.legends[0].get_texts()]
-    assert labels == ["cut-off of the whole disc", "sampled by the grid"]
+    assert labels == ["pair of holes, in either order", "cut-off of the whole disc", "sampled by the grid"]
 
 
 def test_psf_and_otf_have_their_origin_in_the_middle():

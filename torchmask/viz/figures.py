@@ -98,7 +98,9 @@ def uv_coverage_figure(aperture: Aperture, grid: Grid | None = None, title: str 
         ax.add_patch(
             drawing.hole(aperture, baseline, 2 * scale, facecolor=drawing.COLORS[0], edgecolor="none", alpha=0.35)
         )
-    ax.plot(*(pairs.T * scale), ".", color=drawing.INK, markersize=2.5, label="pair of holes, in either order")
+    if len(pairs):
+        dots: dict[str, Any] = {"color": drawing.INK, "markersize": 2.5, "linestyle": "none"}
+        ax.plot(*(pairs.T * scale), ".", label="pair of holes, in either order", **dots)
     reach = aperture.mask_diameter * scale
     ax.add_patch(
         Circle((0, 0), reach, fill=False, color=drawing.FAINT, linewidth=0.9, label="cut-off of the whole disc")
