@@ -30,7 +30,6 @@ from torchmask.interferometry.calibration import MaskCalibration, calibrate_mask
 from torchmask.observation import Observation
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.geometry import MaskGeometry
-from torchmask.optics.pixel import SquarePixel
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,7 +116,7 @@ def run(options: Options) -> None:
         assert isinstance(aperture, SparseAperture)
         found = calibrate_mask(
             *(seen.frames, aperture, seen.grid),
-            **{"valid": seen.valid, "pixel": SquarePixel(), "n_modes": options.n_modes},
+            **{"valid": seen.valid, "pixel": seen.pixel, "n_modes": options.n_modes},
             callback=output.callback,
         )
         rows = compare(found, PipelineAffine().geometry())

@@ -1,5 +1,6 @@
 """An observation and its file, its directions on the sky, and the checks that frames pass."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -9,6 +10,7 @@ import torch
 from torchmask.grid import Grid
 from torchmask.observation import PHASE_OVERSAMPLING, Observation, check_frames
 from torchmask.optics.aperture import FullAperture, SparseAperture
+from torchmask.optics.pixel import MappedPixel, SquarePixel
 from torchmask.optics.shapes import Annulus, Disc, Hexagon
 
 GRID = Grid((16, 20), 1e-7, 550e-9)
@@ -47,17 +49,34 @@ def test_everything_survives_the_file(tmp_path, mask):
         valid=frames_of(3, 3) > 0.1,
         errors=frames_of(3, 4),
         header={"OBJECT": "satellite", "CRPIX1": 5.0, "EQUINOX": 2000},
+        pixel=SquarePixel(0.8),
         frame_numbers=(4, 5, 9),
     )
     whole.save(tmp_path / "a.npz")
     back = Observation.load(tmp_path / "a.npz")
     for name in ARRAYS:
         assert torch.equal(getattr(back, name), getattr(whole, name)), name
-    for name in ("grid", "readout_noise", "r0", "outer_scale", "n_photons", "header", "frame_numbers"):
+    for name in ("grid", "readout_noise", "r0", "outer_scale", "n_photons", "header", "pixel", "frame_numbers"):
         assert getattr(back, name) == getattr(whole, name), name
     assert torch.equal(back.aperture.centers, mask.centers)
     for name in ("subaperture_diameter", "mask_diameter", "shape"):
         assert getattr(back.aperture, name) == getattr(mask, name), name
+
+
+def test_a_map_of_a_pixel_survives_the_file_and_a_response_of_ones_own_is_refused(tmp_path, mask):
+    seen = Observation(frames_of(2), mask, GRID, None, pixel=MappedPixel(torch.eye(4).double(), 2))
+    seen.save(tmp_path / "map.npz")
+    back = Observation.load(tmp_path / "map.npz").take([1]).pixel
+    assert isinstance(back, MappedPixel)
+    assert (str(back), back.samples) == ("map of 4 x 4 samples, 2 per pixel", 2)
+    assert torch.equal(back.sensitivity, seen.pixel.sensitivity)
+
+    class Round:
+        def transfer(self, nu_y, nu_x):
+            return torch.exp(-(nu_y**2) - nu_x**2)
+
+    with pytest.raises(ValueError, match="a Round cannot be written to a file: give a SquarePixel or a MappedPixel"):
+        dataclasses.replace(seen, pixel=Round()).save(tmp_path / "own.npz")
 
 
 def test_some_frames_come_with_what_belongs_to_them(mask):

@@ -17,6 +17,7 @@ from torchmask.grid import Grid
 from torchmask.io import load_npz, save_npz
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.bad_pixels import fill_bad_pixels
+from torchmask.optics.pixel import PixelResponse, pixel_record, read_pixel
 from torchmask.optics.records import aperture_record, read_aperture
 from torchmask.optics.sky import pixel_matrix
 from torchmask.record import Brief
@@ -55,6 +56,7 @@ class Observation(Brief):
     background : true sky [electrons per pixel and frame]
     transmission : (T,) true transmission of each frame, 1 on average
     header : FITS cards that belong to the frames: sky coordinates, target, telescope, filter, date
+    pixel : blur by the detector's pixels, which psfs include; None if they are points
     frame_numbers : number of each frame in the files it was read from, counted from 0 through all of them; 0 to T - 1
         by default
 
@@ -87,6 +89,7 @@ class Observation(Brief):
     true_aperture: Aperture | None = None
     background: float | None = None
     transmission: Tensor | None = None
+    pixel: PixelResponse | None = None
     frame_numbers: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
@@ -142,7 +145,8 @@ class Observation(Brief):
     def save(self, path: str | Path) -> None:
         """Write the observation to a new compressed .npz file, which `load` reads.
 
-        Raises ValueError if the file exists, its folder does not, or its name does not end in .npz.
+        Raises ValueError if the file exists, its folder does not, its name does not end in .npz, or `pixel` is of
+        a class of your own.
         """
         grid = self.grid
         values = {
@@ -151,6 +155,7 @@ class Observation(Brief):
             "wavelength": grid.wavelength,
             "frame_numbers": np.array(self.frame_numbers),
             **aperture_record(self.aperture),
+            **pixel_record(self.pixel),
         }
         if self.true_aperture is not None:
             record = aperture_record(self.true_aperture)
@@ -186,7 +191,7 @@ class Observation(Brief):
         height, width = frames.shape[-2:]
         grid = Grid(height if height == width else (height, width), number["pixel_scale"], number["wavelength"])
         true_aperture = _read_aperture(stored, _TRUE) if f"{_TRUE}centers" in stored else None
-        optional: dict[str, Any] = {"true_aperture": true_aperture} | {
+        optional: dict[str, Any] = {"true_aperture": true_aperture, "pixel": read_pixel(stored)} | {
             name: torch.from_numpy(stored[name]) for name in _ARRAYS if name in stored
         }
         optional |= {name: number[name] for name in _OPTIONAL_NUMBERS if name in number}

@@ -5,7 +5,6 @@ import math
 
 import pytest
 import torch
-import yaml
 
 from torchmask.cli.main import main
 from torchmask.cli.program import NOT_EXPLAINED
@@ -18,7 +17,6 @@ from torchmask.optics.geometry import MaskGeometry
 from torchmask.optics.pixel import SquarePixel
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.result import RestorationResult
-from torchmask.simulation.conditions import Conditions
 from torchmask.simulation.exposures import simulate_observation
 
 pytestmark = pytest.mark.usefixtures("coarse_figures")
@@ -88,10 +86,9 @@ def test_a_restoration_calibrates_on_its_star_first(star, tmp_path, capsys):
 
 
 def test_a_restoration_takes_the_pixels_of_its_star(tmp_path, capsys):
-    pixel = Conditions(pixel=SquarePixel(0.8))
     scene = torch.zeros(64, 64, dtype=torch.float64)
     scene[32, 32] = 1e7
-    seen = simulate_observation(scene, TOLD, GRID, None, Detector(), n_frames=1, conditions=pixel)
+    seen = simulate_observation(scene, TOLD, GRID, None, Detector(pixel=SquarePixel(0.8)), n_frames=1)
     seen = Observation(seen.frames, TOLD, GRID, 1.0)
     seen.save(tmp_path / "star.npz")
     given = ["restore", str(tmp_path / "star.npz"), "--max-iterations", "2", "--estimate-pixel"]
@@ -102,5 +99,5 @@ def test_a_restoration_takes_the_pixels_of_its_star(tmp_path, capsys):
     numbers = json.loads((tmp_path / "run" / "calibration.json").read_text())
     # noise of 1e7 electrons, and the border of the star's square, which is blurred as if it were periodic
     assert abs(numbers["fill_factor"] - 0.8) < 4 * numbers["fill_factor_error"] + 0.005
-    config = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
-    assert (config["pixel_fill"], config["estimate_pixel"]) == (numbers["fill_factor"], False)
+    told = json.loads((tmp_path / "run" / "metrics.json").read_text())["pixel"]
+    assert told == str(SquarePixel(numbers["fill_factor"]))

@@ -162,7 +162,7 @@ def test_what_cannot_be_is_refused_before_any_work(option, said, tmp_path, capsy
 def test_a_mask_is_searched_under_turbulence(tmp_path):
     out = tmp_path / "run"
     few = ["--no-refine", "--method", "cma", "--budget", "20", "--criterion", "turbulent"]
-    seeing = ["--r0", "0.2", "--outer-scale", "20", "--sky", "2", "--pixel-fill-factor", "1"]
+    seeing = ["--r0", "0.2", "--outer-scale", "20", "--sky", "2", "--pixel-fill", "1"]
     assert main([*SMALL, *NOISE, *few, *seeing, "--out", str(out)]) == 0
     grid, noise = Grid.nyquist(1.0, 550e-9, 32), NoisePSD(1e5, 5.0, 48**2)
     seen = {"r0": 0.2, "outer_scale": 20.0, "pixel": SquarePixel(1.0), "sky": 2.0}

@@ -20,6 +20,7 @@ from torchmask.instrument.instrument import Instrument
 from torchmask.instrument.parts import Camera, Site, Source, Telescope
 from torchmask.observation import Observation
 from torchmask.optics.aperture import FullAperture, SparseAperture
+from torchmask.optics.pixel import SquarePixel
 
 pytestmark = pytest.mark.usefixtures("coarse_figures")
 
@@ -53,13 +54,14 @@ def test_frames_are_simulated_as_the_instrument_takes_them(folder, capsys):
     assert (stack.grid.wavelength, stack.readout_noise, stack.outer_scale) == (700e-9, 2.5, 30.0)
     assert stack.grid.pixel_scale == pytest.approx(KNOWN.pixel_scale, rel=1e-12)
     assert stack.background == pytest.approx(KNOWN.sky(float(MASK.area)), rel=1e-12)
+    assert stack.pixel == KNOWN.camera.pixel == SquarePixel(0.9)
     assert stack.r0 == pytest.approx(0.2)  # given beside it
     assert f"{KNOWN.photons(float(MASK.area)):.4g} photons in each" in capsys.readouterr().out
     config = yaml.safe_load((folder / "run/config.yaml").read_text())
     assert config["turbulence"]["exposure_time"] == 3e-3
     assert config["turbulence"]["wind"] == [5.0, 0.0]
     conditions = config["conditions"]
-    assert (conditions["band_width"], conditions["pixel_fill_factor"], conditions["temperature"]) == (20e-9, 0.9, 3e3)
+    assert (conditions["band_width"], conditions["temperature"]) == (20e-9, 3e3)
     again = ["simulate", "--config", str(folder / "run/config.yaml"), "--out", str(folder / "again")]
     assert main(again) == 0
     assert Observation.load(folder / "again/stack.npz").frames.equal(stack.frames)

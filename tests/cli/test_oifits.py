@@ -40,7 +40,7 @@ def test_the_file_holds_the_observables_of_the_frames(n_stacks, seen, tmp_path, 
     assert restore(*stacks, *given) == NOT_EXPLAINED  # after two iterations
     files = sorted((tmp_path / "run").rglob("*.oifits"))
     assert len(files) == n_stacks
-    expected = frame_observables(seen, SquarePixel(0.8))
+    expected = frame_observables(dataclasses.replace(seen, pixel=SquarePixel(0.8)))
     for file in files:
         assert str(file) in capsys.readouterr().out.replace("\n", "") or n_stacks > 1
         with fits.open(file) as hdus:

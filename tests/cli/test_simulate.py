@@ -7,7 +7,7 @@ import torch
 
 from torchmask.atmosphere.profiles import named_layers
 from torchmask.cli.main import main
-from torchmask.cli.simulate import ConditionOptions, TurbulenceOptions
+from torchmask.cli.simulate import TurbulenceOptions
 from torchmask.design.manufacture import save_json
 from torchmask.grid import ARCSEC
 from torchmask.observation import Observation
@@ -26,7 +26,7 @@ def test_all_effects_at_once_leave_their_truths_in_the_stack(tmp_path, capsys):
     turbulence += ["--turbulence.frame-interval", "0.01", "--turbulence.exposure-time", "0.001"]
     conditions = ["--conditions.sky", "40", "--conditions.transparency-scatter", "0.2"]
     conditions += ["--conditions.band-width", "5e-8", "--conditions.n-wavelengths", "2"]
-    conditions += ["--conditions.pixel-fill-factor", "0.9", "--n-photons", "1e5"]
+    conditions += ["--pixel-fill", "0.9", "--n-photons", "1e5"]
     conditions += ["--true-mask.rotation-deg", "90", "--true-mask.magnification", "0.99"]
     assert main([*MASK, *SMALL, *turbulence, *conditions, "--out", str(tmp_path / "run")]) == 0
     stack = Observation.load(tmp_path / "run/stack.npz")
@@ -58,7 +58,6 @@ def test_options_are_the_turbulence_that_they_name():
     assert TurbulenceOptions().make(None, 550e-9, 20.0) is None
     wind = TurbulenceOptions(wind=(3.0, 4.0), frame_interval=0.02).make(0.1, 550e-9, 20.0)
     assert (wind.layers.heights, wind.frame_interval) == ((0.0,), 0.02)
-    assert ConditionOptions(pixel_fill_factor=0.5).make(0.0, 550e-9).pixel.fill_factor == 0.5
 
 
 @pytest.mark.parametrize(
@@ -74,7 +73,7 @@ def test_options_are_the_turbulence_that_they_name():
         (["--pixel-scale-arcsec", "0"], "--pixel-scale-arcsec is 0: it must be finite and positive, in arcsec"),
         (["--pixel-scale-arcsec", "0.5"], r"\(0\.5 arcsec\) undersamples .* at most .* \(0\.06\d+ arcsec\)"),
         (["--scene.path", "none.png"], "none.png"),
-        (["--conditions.pixel-fill-factor", "1.5"], r"--conditions.pixel-fill-factor is 1\.5"),
+        (["--pixel-fill", "1.5"], r"--pixel-fill is 1\.5"),
         (["--true-mask.magnification", "0"], "--true-mask.magnification is"),
     ],
 )

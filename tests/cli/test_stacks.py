@@ -13,6 +13,7 @@ from torchmask.grid import Grid
 from torchmask.observation import Observation
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.band import Band
+from torchmask.optics.pixel import SquarePixel
 
 FILES = [Path("a/cube.fits"), Path("b/cube.fits"), Path("b/other.npz"), Path("c/cube.fits")]
 
@@ -61,6 +62,13 @@ def test_frames_of_a_stack_are_skipped_and_those_without_light_left_out(tmp_path
     assert seen.frame_numbers == (0, 2, 3, 5)
     seen.save(tmp_path / "part.npz")
     assert read_stack([tmp_path / "part.npz"], StackOptions(skip=(3,))).frame_numbers == (0, 2, 5)
+    whole = read_stack([tmp_path / "a.npz"], StackOptions(skip=(4,), pixel_fill=0.9))
+    assert (seen.pixel, whole.pixel) == (None, SquarePixel(0.9))
+    whole.save(tmp_path / "square.npz")
+    found = [read_stack([tmp_path / "square.npz"], StackOptions(pixel_fill=fill)).pixel for fill in (None, 0.0, 1.0)]
+    assert found == [SquarePixel(0.9), None, SquarePixel(1.0)]
+    with pytest.raises(ValueError, match="fill_factor is 2"):
+        read_stack([tmp_path / "none.npz"], StackOptions(pixel_fill=2.0))
     with pytest.raises(ValueError, match="skip names frame 6, but the stack has 6 frames, with numbers from 0 to 5"):
         read_stack([tmp_path / "a.npz"], StackOptions(skip=(6,)))
 

@@ -57,7 +57,7 @@ def test_under_turbulence_the_error_is_that_criterion_and_the_sky_grows_with_the
         n_subapertures=(3,), fill_factor=(0.06,), n_frequencies=32, n_frames=(4,), diameter_over_r0=(5.0,), budget=20,
         method="cma", n_photons=(1e5,), readout_noise=2.0,
     )  # fmt: skip
-    conditions = ExposureConditions(pixel_fill_factor=1.0, sky=5.0)
+    conditions = ExposureConditions(pixel_fill=1.0, sky=5.0)
     found = design_table(space, tmp_path / "table", conditions=conditions, n_workers=1)
     (row,) = found.rows
     light = 1e5 * 0.06 / 0.15
@@ -115,6 +115,6 @@ def test_an_instrument_gives_all_but_the_axes(tmp_path, monkeypatch):
     area = float(SparseAperture.from_catalog("golay6", 1.2, 0.15).area)
     assert space.n_photons[0] == pytest.approx(known.photons(area), rel=1e-12)
     assert conditions.sky == pytest.approx(known.sky(area), rel=1e-12)
-    assert (conditions.exposure, conditions.wind, conditions.pixel_fill_factor) == (3e-3, 5.0, 0.9)
+    assert (conditions.exposure, conditions.wind, conditions.pixel_fill) == (3e-3, 5.0, 0.9)
     assert conditions.wavelengths == known.band.wavelengths
     assert conditions.weights == pytest.approx(known.band.shares)

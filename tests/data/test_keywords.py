@@ -10,12 +10,14 @@ from torchmask.data.keywords import (
     exposure_seconds,
     kept_cards,
     number,
+    pixel_response,
     pixel_scale,
     saturation,
     shift_cards,
     wavelength,
 )
 from torchmask.grid import ARCSEC
+from torchmask.optics.pixel import SquarePixel
 
 pytest.importorskip("astropy")
 
@@ -77,6 +79,8 @@ def test_a_scale_that_is_no_angle_is_no_pixel_scale(cards):
 
 def test_the_wavelength_is_that_of_its_card_or_of_the_filter():
     cards = {"INSTRUME": "NIRISS", "FILTER": "F380M"}
+    assert pixel_response(cards) == SquarePixel(1.0)
+    assert pixel_response({"INSTRUME": "MY CAMERA"}) is pixel_response({}) is None
     assert wavelength(cards, "a.fits", None) == 3.828e-6
     assert wavelength(cards | {"WAVELEN": 3.8e-6}, "a.fits", None) == 3.8e-6
     assert wavelength(cards | {"WAVELEN": 3.8e-6}, "a.fits", 1e-6) == 1e-6

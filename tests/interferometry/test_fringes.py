@@ -179,7 +179,7 @@ def test_what_pixels_take_off_the_fringes_is_given_back(fill_factor, expose_poin
     parts = moved.unflatten(2, (48, fine)).unflatten(1, (48, fine))
     seen = torch.einsum("tyaxb,a,b->tyx", parts, weights, weights)
     pixel = MappedPixel(weights[:, None] * weights, fine)
-    freed = frame_observables(Observation(seen, mask, grid, 0.0), pixel)
+    freed = frame_observables(Observation(seen, mask, grid, 0.0, pixel=pixel))
     plain = frame_observables(Observation(seen, mask, grid, 0.0))
     # The fringes' patches, and that of the light, are as wide as a hole.
     nu, reach = (freed.baselines / grid.period).abs(), grid.cutoff(mask.subaperture_diameter)

@@ -15,6 +15,7 @@ from torchmask.interferometry.visibilities import restored_observables, sky_stat
 from torchmask.observation import Observation
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.detector import Detector
+from torchmask.optics.pixel import SquarePixel
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.simulation.exposures import simulate_observation
 
@@ -76,12 +77,15 @@ def test_a_restored_object_has_exactly_the_visibilities_of_its_pixels(mask, grid
     np.testing.assert_allclose(wrapped(phases), 0, atol=1e-12)
 
 
-def test_errors_of_a_restored_object_are_those_of_frames_with_its_noise(expose_points):
+@pytest.mark.parametrize("pixel", [None, SquarePixel()])
+def test_errors_of_a_restored_object_are_those_of_frames_with_its_noise(pixel, expose_points):
     # White noise, no aberrations, patches that do not overlap: two ways to the same error.
     mask = SparseAperture([[0.0, 0.42], [0.38, -0.2], [-0.4, -0.15]], 0.07, 1.0)
     grid = Grid.nyquist(mask.extent, WAVELENGTH, 96, 1.1)
     frames = expose_points(mask, grid, electrons=1e5, n_frames=2, pistons=False)
-    observation = Observation(frames, mask, grid, 0.0, errors=torch.full_like(frames, 3.0))
+    if pixel is not None:
+        frames = torch.fft.ifft2(torch.fft.fft2(frames) * pixel.transfer(*grid.frequencies(torch.float64))).real
+    observation = Observation(frames, mask, grid, 0.0, errors=torch.full_like(frames, 3.0), pixel=pixel)
     direct = frame_observables(observation)
     scene = torch.zeros(grid.shape, dtype=torch.float64)
     scene[48, 48] = 1e5

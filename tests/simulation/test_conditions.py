@@ -23,9 +23,10 @@ GRID = Grid.nyquist(1.0, WAVELENGTH, 32)
 MASK = SparseAperture([[0.0, 0.38], [0.33, -0.2], [-0.35, -0.15]], 0.2, 1.0)
 
 
-def simulate(scene, n_frames=3, turbulence=None, readout_noise=0.0, seed=0, **conditions):
+def simulate(scene, n_frames=3, turbulence=None, readout_noise=0.0, pixel=None, seed=0, **conditions):
     return simulate_observation(
-        *(scene, MASK, GRID, turbulence or TurbulencePhase(0.2, 20.0), Detector(readout_noise), n_frames),
+        *(scene, MASK, GRID, turbulence or TurbulencePhase(0.2, 20.0)),
+        *(Detector(readout_noise, pixel=pixel), n_frames),
         torch.Generator().manual_seed(seed),
         conditions=Conditions(**conditions),
     )
@@ -105,6 +106,7 @@ def test_frames_and_psfs_are_those_of_the_pixels():
     point = torch.zeros(32, 32, dtype=torch.float64)
     point[16, 16] = 1e10
     seen = simulate(point, 1, pixel=SquarePixel())
+    assert seen.pixel == SquarePixel()
     sharp = simulate(point, 1)
     assert float((seen.psfs - sharp.psfs).abs().max()) > 0.05 * float(sharp.psfs.max())
     error = (seen.psfs[0] / 1e10).sqrt().clamp(min=1e-10)

@@ -17,7 +17,6 @@ from torchmask.interferometry.calibration import MaskCalibration, calibrate_mask
 from torchmask.io import write_json
 from torchmask.observation import Observation
 from torchmask.optics.aperture import SparseAperture
-from torchmask.optics.pixel import PixelResponse, SquarePixel
 from torchmask.record import Callback
 
 
@@ -32,10 +31,8 @@ class Options(StackOptions, RunOptions):
 
     stacks: tyro.conf.Positional[tuple[Path, ...]] = ()
     """Exposures of the star, .npz or .fits; several FITS files are one stack."""
-    pixel_fill: float | None = None
-    """Sensitive fraction of the area of a pixel, 1 for pixels without gaps; None: pixels are points."""
     estimate_pixel: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Estimate that fraction too; exposures must be short, as motion looks like larger pixels."""
+    """Estimate the sensitive fraction of a pixel too; exposures must be short, as motion looks like larger pixels."""
     n_modes: int = 6
     """Number of Zernike modes per hole and frame, from Noll mode 1 (piston)."""
 
@@ -44,28 +41,21 @@ def run(options: Options) -> None:
     """Measure the geometry, write it and print it."""
     if not options.stacks:
         raise ValueError("no exposures of a star are given: give .npz or FITS files")
+    require_one_pixel(options, options.estimate_pixel)
     seen = read_stack(options.stacks, options)
-    pixel = pixel_response(options.pixel_fill)
-    require_one_pixel(pixel, options.estimate_pixel)
     with new_run("calibrate", options) as output:
-        found = calibrate_on(seen, pixel, options.estimate_pixel, options.n_modes, output.callback)
+        found = calibrate_on(seen, options.estimate_pixel, options.n_modes, output.callback)
         write_calibration(output, found, options.stacks, seen.grid.wavelength)
 
 
-def pixel_response(fill: float | None) -> SquarePixel | None:
-    """Return the pixel response for --pixel-fill. Raises ValueError if it is not in (0, 1]."""
-    return None if fill is None else SquarePixel(fill)
-
-
-def require_one_pixel(pixel: PixelResponse | None, estimate: bool) -> None:
-    """Raise ValueError if the pixels are both known and to be estimated."""
-    if estimate and pixel is not None:
+def require_one_pixel(options: StackOptions, estimate: bool) -> None:
+    """Raise ValueError if the size of the pixels is both given and to be estimated."""
+    if estimate and options.pixel_fill is not None:
         raise ValueError("--pixel-fill says how large pixels are, and --estimate-pixel asks for it: give one of them")
 
 
 def calibrate_on(
     star: Observation,
-    pixel: PixelResponse | None,
     estimate_pixel: bool = False,
     n_modes: int = 6,
     callback: Callback | None = None,
@@ -79,17 +69,17 @@ def calibrate_on(
         star.grid,
         valid=star.valid,
         readout_noise=star.readout_noise or 0.0,
-        pixel=pixel,
+        pixel=None if estimate_pixel else star.pixel,
         estimate_pixel=estimate_pixel,
         n_modes=n_modes,
         callback=callback,
     )
 
 
-def read_star(path: Path, options: StackOptions, pixel: PixelResponse | None, estimate_pixel: bool) -> MaskCalibration:
+def read_star(path: Path, options: StackOptions, estimate_pixel: bool) -> MaskCalibration:
     """Measure the mask's geometry on a file with a star. Raises ValueError, which names --star, if that fails."""
     try:
-        return calibrate_on(read_stack([path], options), pixel, estimate_pixel)
+        return calibrate_on(read_stack([path], options), estimate_pixel)
     except ValueError as error:
         raise ValueError(f"--star {path}: {error}") from error
 

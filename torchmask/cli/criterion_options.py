@@ -26,8 +26,8 @@ class ExposureOptions(BandOptions, InstrumentOptions):
     """Duration of a frame [s]; it needs a wind."""
     wind: tuple[float, ...] = ()
     """Wind speed [m/s], all directions being equally likely, or two numbers: towards +x and towards +y."""
-    pixel_fill_factor: float = 0.0
-    """Sensitive part of the area of a square pixel, at most 1; 0: pixels are points."""
+    pixel_fill: float = 0.0
+    """Sensitive fraction of the area of a pixel, 1 for pixels without gaps; 0: pixels are points."""
     sky: float | None = None
     """Electrons per pixel and frame from the sky; None: from --instrument, or else 0."""
 
@@ -52,7 +52,7 @@ class ExposureOptions(BandOptions, InstrumentOptions):
             exposure=self.exposure_time,
             wind=(speeds[0], speeds[1]) if len(speeds) == 2 else sum(speeds),
             **band,
-            pixel_fill_factor=self.pixel_fill_factor,
+            pixel_fill=self.pixel_fill,
             sky=sky,
         )
 
@@ -61,7 +61,7 @@ class ExposureOptions(BandOptions, InstrumentOptions):
             "--exposure-time": self.exposure_time != 0,
             "--wind": bool(self.wind),
             "--filter or --wavelengths": broad,
-            "--pixel-fill-factor": self.pixel_fill_factor != 0,
+            "--pixel-fill": self.pixel_fill != 0,
             "--sky": self.sky is not None,
         }
         for name, is_given in given.items():
@@ -81,7 +81,7 @@ def exposure_options(known: Instrument) -> dict[str, Any]:
         "n_wavelengths": known.n_wavelengths,
         "wavelengths": () if filtered else band.wavelengths,
         "weights": () if filtered else band.shares,
-        "pixel_fill_factor": known.camera.pixel_fill or 0.0,
+        "pixel_fill": known.camera.pixel_fill,
     }
 
 

@@ -14,7 +14,6 @@ from torchmask.interferometry.observables import Observables
 from torchmask.interferometry.oifits import save_oifits
 from torchmask.observation import Observation
 from torchmask.optics.band import filter_of_header
-from torchmask.optics.pixel import PixelResponse
 
 FILE = "frames.oifits"
 
@@ -29,12 +28,8 @@ class OIFITSOptions:
     """Width of the band for the OIFITS file [m]; None: that of the FILTER in the header."""
 
 
-def measure_frames(
-    observation: Observation, options: OIFITSOptions, sky: float = 0.0, pixel: PixelResponse | None = None
-) -> Observables | None:
+def measure_frames(observation: Observation, options: OIFITSOptions, sky: float = 0.0) -> Observables | None:
     """Return the frames' observables, after subtracting a sky [electrons per pixel]; None if --oifits was not given.
-
-    What the detector's pixels take off the fringes is divided out if their response is given.
 
     Raises ValueError if the width of the band is unknown or invalid, or the mask's fringes overlap too much.
     """
@@ -51,7 +46,7 @@ def measure_frames(
     if readout is not None:
         readout = math.hypot(readout, math.sqrt(sky))  # a subtracted sky leaves its noise
     dark = dataclasses.replace(observation, frames=observation.frames - sky, readout_noise=readout)
-    return frame_observables(dark, pixel)
+    return frame_observables(dark)
 
 
 def write_frames(

@@ -41,6 +41,7 @@ def metrics(observation: Observation, result: RestorationResult) -> dict[str, An
         "r0": result.r0,
         "rotation": result.rotation,
         "magnification": result.magnification,
+        "pixel": pixel_text(observation),
         "photons_per_frame": float(result.object.sum()),
         "cost": float(result.cost[-1]),
         "iterations": len(result.cost),
@@ -56,6 +57,11 @@ def metrics(observation: Observation, result: RestorationResult) -> dict[str, An
         table["ssim"] = ssim(result.object, observation.object, cutoff)
         table["mean_frame_score"] = relative_error(observation.frames.mean(0), observation.object, cutoff)
     return table
+
+
+def pixel_text(observation: Observation) -> str:
+    """Return the response of the detector's pixels in words."""
+    return "points" if observation.pixel is None else str(observation.pixel)
 
 
 def log_outcome(
@@ -78,12 +84,12 @@ def log_outcome(
         pictures = {"stack": (observation.frames[0], result.object)}
         logger.figure(f"{prefix}comparison", comparison_figure(observation.object, pictures, cutoff, scale, sky))
     for name, value in table.items():
-        if name not in ("verdict", "clouded_frames"):
+        if name not in ("pixel", "verdict", "clouded_frames"):
             logger.scalar(f"summary/{prefix}{name}", float(value))
 
 
 def summarise_outcome(result: RestorationResult, table: Mapping[str, Any]) -> str:
-    """Return the text to print: a warning of clouds, and the summary of the result, which ends in its verdict."""
+    """Return the text to print: a warning of clouds, pixels, and the result, which ends in its verdict."""
     clouded = table["clouded_frames"]
     told = f"frames {clouded} have less than half the light of the others, as through a cloud: --skip leaves them out\n"
-    return (told if clouded else "") + result.summary()
+    return f"{told if clouded else ''}pixels: {table['pixel']}\n{result.summary()}"

@@ -13,11 +13,11 @@ from typing import Any, Literal
 import tyro
 
 from torchmask import __version__
-from torchmask.cli.calibrate import pixel_response, read_star, require_one_pixel, write_calibration
+from torchmask.cli.calibrate import read_star, require_one_pixel, write_calibration
 from torchmask.cli.config import stored
 from torchmask.cli.oifits import OIFITSOptions, measure_frames, write_frames
 from torchmask.cli.options import BandOptions, RunOptions, WorkerOptions
-from torchmask.cli.outcome import log_outcome, summarise_outcome, write_outcome
+from torchmask.cli.outcome import log_outcome, pixel_text, summarise_outcome, write_outcome
 from torchmask.cli.program import NOT_EXPLAINED
 from torchmask.cli.run import CHECKPOINT, new_run
 from torchmask.cli.stacks import StackOptions, group_files, read_stack
@@ -67,8 +67,6 @@ class Options(BandOptions, StackOptions, OIFITSOptions, WorkerOptions, RunOption
     sky: float | Literal["if-seen", "per-frame", "common", "none"] = "if-seen"
     """Known sky [electrons per pixel]; or per-frame to fit a constant in each frame, common to fit one for all frames,
     if-seen: per-frame if the frames show a sky."""
-    pixel_fill: float | None = None
-    """Sensitive fraction of the area of a pixel, 1 for pixels without gaps; None: pixels are points."""
     exposure_tau0: float = 0.0
     """Exposure time of a frame [tau0 = 0.314 r0 / wind], during which the model lets holes move; 0: snapshots."""
     star: Path | None = None
@@ -109,14 +107,10 @@ def run(options: Options) -> int:
         raise ValueError("there is no stack to restore: give .npz or FITS files")
     if options.resume is not None and len(stacks) > 1:
         raise ValueError(f"--resume continues one stack, but {len(stacks)} are given")
-    pixel, estimate = pixel_response(options.pixel_fill), options.estimate_pixel
-    require_one_pixel(pixel, estimate)
-    if estimate and options.star is None:
+    require_one_pixel(options, options.estimate_pixel)
+    if options.estimate_pixel and options.star is None:
         raise ValueError("--estimate-pixel needs a star, whose size is known: give --star, or --pixel-fill")
-    star = None if options.star is None else read_star(options.star, options, pixel, estimate)
-    if estimate and star is not None:
-        fill = None if star.pixel is None else star.pixel.fill_factor
-        options = dataclasses.replace(options, pixel_fill=fill, estimate_pixel=False)
+    star = None if options.star is None else read_star(options.star, options, options.estimate_pixel)
     if len(stacks) > 1:
         return restore_several(stacks, options, star)
     (files,) = stacks.values()
@@ -124,9 +118,12 @@ def run(options: Options) -> int:
 
 
 def read_calibrated(files: Sequence[Path], options: Options, star: MaskCalibration | None) -> Observation:
-    """Read one stack, with the mask's geometry as measured on the star if there is one."""
+    """Read one stack, with the mask's geometry, and pixels if asked for, as measured on the star if there is one."""
     observation = read_stack(files, options)
-    return observation if star is None else dataclasses.replace(observation, aperture=star.aperture)
+    if star is None:
+        return observation
+    pixel = star.pixel if options.estimate_pixel else observation.pixel
+    return dataclasses.replace(observation, aperture=star.aperture, pixel=pixel)
 
 
 def restore_one(files: Sequence[Path], options: Options, star: MaskCalibration | None) -> int:
@@ -136,7 +133,7 @@ def restore_one(files: Sequence[Path], options: Options, star: MaskCalibration |
     if checkpoint is not None and not checkpoint.is_file():
         raise ValueError(f"there is no {checkpoint} to resume from: it is first written at the 100th iteration")
     method = deconvolution(observation, options)
-    observables = measure_frames(observation, options, known_sky(options), pixel_response(options.pixel_fill))
+    observables = measure_frames(observation, options, known_sky(options))
     with new_run("restore", options) as output:
         output.summary.extend(write_frames(output.directory, observables, observation, options))
         state = output.directory / CHECKPOINT
@@ -152,7 +149,7 @@ def restore_one(files: Sequence[Path], options: Options, star: MaskCalibration |
         ).with_frame_numbers(observation.frame_numbers)
         if star is not None and options.star is not None:
             write_calibration(output, star, [options.star], observation.grid.wavelength)
-        table = write_outcome(output.directory, observation, result, history(files, result, options))
+        table = write_outcome(output.directory, observation, result, history(files, observation, result, options))
         log_outcome(observation, result, table, output.logger)
         output.logger.conclude(verdict=table["verdict"], clouded_frames=table["clouded_frames"])
         output.summary.append(summarise_outcome(result, table))
@@ -172,8 +169,7 @@ def restore_several(stacks: Mapping[str, Sequence[Path]], options: Options, star
         try:
             observations[name] = read_calibrated(files, options, star)
             method = deconvolution(observations[name], options)
-            pixel = pixel_response(options.pixel_fill)
-            observables[name] = measure_frames(observations[name], options, known_sky(options), pixel)
+            observables[name] = measure_frames(observations[name], options, known_sky(options))
             methods.append(method)
         except (ValueError, OSError) as error:
             observations.pop(name, None)
@@ -192,7 +188,9 @@ def restore_several(stacks: Mapping[str, Sequence[Path]], options: Options, star
                 failures[name] = result
                 continue
             folder = new_folder(output.directory / name)
-            tables[name] = write_outcome(folder, seen[number], result, history(stacks[name], result, options))
+            tables[name] = write_outcome(
+                folder, seen[number], result, history(stacks[name], seen[number], result, options)
+            )
             output.summary.extend(write_frames(folder, observables[name], seen[number], options))
             log_outcome(seen[number], result, tables[name], output.logger, f"{name}/")
             output.summary.append(f"{name}: {summarise_outcome(result, tables[name])}")
@@ -226,7 +224,7 @@ def deconvolution(observation: Observation, options: Options) -> MyopicDeconvolu
         background=SKIES[options.sky] if isinstance(options.sky, str) else known_sky(options),
         **options.band(observation.grid.wavelength),
         static_modes=options.static_modes,
-        pixel=pixel_response(options.pixel_fill),
+        pixel=observation.pixel,
         exposure_tau0=options.exposure_tau0,
         refine_geometry=REFINEMENTS[options.refine_geometry],
         prior=TotalVariation(options.tv_weight),
@@ -245,13 +243,14 @@ def known_sky(options: Options) -> float:
     return options.sky
 
 
-def history(files: Sequence[Path], result: RestorationResult, options: Options) -> list[str]:
-    """Return the HISTORY of a FITS header: version, files, options that differ from their defaults, and outcome."""
+def history(files: Sequence[Path], observation: Observation, result: RestorationResult, options: Options) -> list[str]:
+    """Return the HISTORY of a FITS header: version, files, options other than their defaults, pixels, and outcome."""
     default = stored(Options())
     changed = {name: value for name, value in stored(options).items() if value != default[name]}
     return [
         f"torchmask {__version__}",
         *(f"stack {path}" for path in files),
         *(f"{name} = {value}" for name, value in changed.items() if name not in ("stacks", "join")),
+        f"pixels: {pixel_text(observation)}",
         *result.summary().splitlines(),
     ]

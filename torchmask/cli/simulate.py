@@ -30,7 +30,7 @@ from torchmask.optics.band import Band
 from torchmask.optics.detector import Detector
 from torchmask.optics.geometry import MaskGeometry
 from torchmask.optics.passband import Passband
-from torchmask.optics.pixel import SquarePixel
+from torchmask.optics.pixel import square_pixel
 from torchmask.optics.pupil import Aperture
 from torchmask.simulation.conditions import Conditions
 from torchmask.simulation.exposures import simulate_observation
@@ -75,7 +75,7 @@ class TurbulenceOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ConditionOptions(FilterOptions):
-    """Observing conditions: sky, clouds, band and pixels."""
+    """Observing conditions: sky, clouds and band."""
 
     sky: float | None = None
     """Sky background [electrons per pixel and frame]; None: from --instrument, or else 0."""
@@ -83,8 +83,6 @@ class ConditionOptions(FilterOptions):
     """Standard deviation of the logarithm of each frame's transmission, due to clouds."""
     band_width: float = 0.0
     """Width of a top-hat band around the wavelength, instead of a filter [m]; 0: one wavelength."""
-    pixel_fill_factor: float = 0.0
-    """Sensitive fraction of the area of a square pixel, at most 1; 0: pixels are points."""
 
     def make(self, exposure_time: float, wavelength: float, sky: float = 0.0) -> Conditions:
         """Return the conditions for `simulate_observation`. Raises ValueError if a value is out of range."""
@@ -103,7 +101,6 @@ class ConditionOptions(FilterOptions):
             transparency_scatter=self.transparency_scatter,
             exposure_time=exposure_time,
             band=even or self.filter_band(wavelength),
-            pixel=SquarePixel(self.pixel_fill_factor) if self.pixel_fill_factor else None,
         )
 
 
@@ -156,7 +153,7 @@ class Options(InstrumentOptions, MaskOptions, RunOptions):
     turbulence: TurbulenceOptions = field(default_factory=TurbulenceOptions)
     """Layers, wind and timing."""
     conditions: ConditionOptions = field(default_factory=ConditionOptions)
-    """Sky, clouds, filter and pixels."""
+    """Sky, clouds and filter."""
     true_mask: TrueMaskOptions = field(default_factory=TrueMaskOptions)
     """Error of the mask's position."""
     n_frames: int = 20
@@ -165,6 +162,8 @@ class Options(InstrumentOptions, MaskOptions, RunOptions):
     """Electrons per frame through the mask, also outside the field; None: from --instrument, or else 1e7."""
     readout_noise: float = 1.5
     """Read-out noise [electrons rms per pixel and frame]."""
+    pixel_fill: float = 0.0
+    """Sensitive fraction of the area of a pixel, 1 for pixels without gaps; 0: pixels are points."""
     seed: int = 0
     """Random seed of the turbulence and the noise."""
 
@@ -183,10 +182,10 @@ class Options(InstrumentOptions, MaskOptions, RunOptions):
                 band_width=known.width or 0.0,
                 n_wavelengths=known.n_wavelengths,
                 temperature=known.source.temperature,
-                pixel_fill_factor=known.camera.pixel_fill or 0.0,
             ),
             n_frames=known.frames,
             readout_noise=known.camera.readout_noise,
+            pixel_fill=known.camera.pixel_fill,
         )
 
 
@@ -226,7 +225,7 @@ def run(options: Options) -> None:
         grid = Grid(options.n_pixels, finest.pixel_scale, wavelength)
     else:
         grid = Grid(options.n_pixels, pixel_scale, wavelength)
-    detector = Detector(options.readout_noise)
+    detector = Detector(options.readout_noise, pixel=square_pixel(options.pixel_fill))
     scene = make_scene(grid.shape, n_photons, options.scene)
     with new_run("simulate", options, options.seed) as output:
         generator = torch.Generator().manual_seed(options.seed)

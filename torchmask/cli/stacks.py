@@ -15,6 +15,7 @@ from torchmask.data.light import usable_frames
 from torchmask.data.observe import read_observation
 from torchmask.grid import Grid
 from torchmask.observation import Observation, check_frames
+from torchmask.optics.pixel import square_pixel
 from torchmask.restoration.noise import check_errors
 
 
@@ -56,6 +57,9 @@ class StackOptions(MaskOptions, FITSOptions):
     """Angle on the sky of one pixel [arcsec]; None: from the file."""
     readout_noise: float | None = None
     """Read-out noise [electrons rms per pixel and frame]; None: from the file, or else measured on the frames."""
+    pixel_fill: float | None = None
+    """Sensitive fraction of the area of a pixel, 1 for pixels without gaps, 0 for points; None: from the file or its
+    instrument, or else points."""
     skip: tuple[int, ...] = ()
     """Numbers of frames to leave out, counted from 0 through all files of a stack."""
     errors: bool = True
@@ -79,7 +83,10 @@ def read_stack(files: Sequence[Path], options: StackOptions) -> Observation:
     """Read one stack: an .npz file, or FITS files that belong together. Raises ValueError if it cannot be used."""
     if options.wavelength is not None:
         require_wavelength(options.wavelength)
+    pixel = None if options.pixel_fill is None else square_pixel(options.pixel_fill)
     observation = _read(files, options)
+    if options.pixel_fill is not None:
+        observation = dataclasses.replace(observation, pixel=pixel)
     numbers = observation.frame_numbers
     try:
         frames, valid = check_frames(observation.frames, observation.valid, observation.grid, numbers)

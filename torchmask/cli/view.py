@@ -160,6 +160,8 @@ def _stack_view(observation: Observation) -> View:
         f"{aperture.n_subapertures} {aperture.shape}s of {aperture.subaperture_diameter:.4g} m in "
         f"{aperture.mask_diameter:.4g} m",
     ]
+    if observation.pixel is not None:
+        lines.append(f"pixels: {observation.pixel}")
     if observation.r0 is not None:
         lines.append(f"simulated, r0 {observation.r0:.4g} m, {observation.n_photons or 0:.4g} photons per frame")
     return View(

@@ -14,7 +14,13 @@ import numpy as np
 from torchmask.grid import ARCSEC
 from torchmask.io import extra
 from torchmask.optics.band import FILTERS, filter_of_header
+from torchmask.optics.pixel import PixelResponse, square_pixel
 from torchmask.optics.sky import celestial_cards, pixel_matrix
+
+# Sensitive fraction of a pixel's area, by INSTRUME. NIRISS and NIRCam have H2RG detectors of Teledyne (Goudfrooij et
+# al., PASP 136, 2024, doi:10.1088/1538-3873/ad1c98), whose pixels of HgCdTe fill their pitch (Beletic, Laser Focus
+# World, October 2007). Charge that spreads to neighbours blurs a little more, by a share that depends on the light.
+PIXEL_FILL = {"NIRISS": 1.0, "NIRCAM": 1.0}
 
 _ABOUT = ("OBJECT", "TARGNAME", "TARG_RA", "TARG_DEC", "RA", "DEC", "TELESCOP", "INSTRUME", "FILTER", "DATE-OBS")
 _ABOUT += ("TIME-OBS", "MJD-OBS", "MJD-AVG", "OBSERVER")
@@ -80,6 +86,11 @@ def wavelength(header: Any, path: Any, given: float | None, fallback: float | No
     known = ", ".join(" ".join(names) for names in FILTERS)
     what = f" (FILTER is {name!r} of INSTRUME {instrument!r}; known: {known})" if name else ""
     raise missing(path, "WAVELEN, nor a FILTER that is known", f"wavelength [m]{what}")
+
+
+def pixel_response(header: Any) -> PixelResponse | None:
+    """Return the response of the pixels of a known INSTRUME, see `PIXEL_FILL`; None, that is points, for others."""
+    return square_pixel(PIXEL_FILL.get(str(header.get("INSTRUME", "")).strip().upper(), 0.0))
 
 
 def exposure_seconds(header: Any, path: Any, is_cube: bool, given: float | None) -> float | None:

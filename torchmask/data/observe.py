@@ -47,7 +47,8 @@ def read_observation(
 ) -> Observation:
     """Read a telescope's exposures from FITS files: cubes (T, H, W) or images, in the order given.
 
-    Options that are not given are read from the header; those that are take precedence. Needs astropy (extra `data`).
+    Options that are not given are read from the header; those that are take precedence. The pixels are points, or those
+    of a known INSTRUME (`torchmask.data.keywords.PIXEL_FILL`). Needs astropy (extra `data`).
 
     Parameters
     ----------
@@ -157,6 +158,7 @@ def read_observation(
         valid=torch.from_numpy(valid),
         errors=None if errors is None else torch.from_numpy(errors),
         header=headers[0] | _mean_exposure(files, times),
+        pixel=keywords.pixel_response(headers[0]),
         frame_numbers=numbers,
     ).take(kept)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from torchmask.instrument.instrument import Instrument
-from torchmask.optics.pixel import SquarePixel
+from torchmask.optics.pixel import square_pixel
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,8 +28,8 @@ class ExposureConditions:
     """Wavelengths that represent a broad band [m]; None: one wavelength."""
     weights: tuple[float, ...] | None = None
     """Relative amount of light at each of them; None: equal."""
-    pixel_fill_factor: float = 0.0
-    """Sensitive part of the area of a square pixel; 0: pixels are points."""
+    pixel_fill: float = 0.0
+    """Sensitive fraction of the area of a pixel, 1 for pixels without gaps; 0: pixels are points."""
     sky: float = 0.0
     """Electrons per pixel and frame."""
 
@@ -42,7 +42,7 @@ class ExposureConditions:
             wind=instrument.site.wind,
             wavelengths=band.wavelengths,
             weights=band.shares,
-            pixel_fill_factor=instrument.camera.pixel_fill or 0.0,
+            pixel_fill=instrument.camera.pixel_fill,
             sky=instrument.sky(area),
         )
 
@@ -55,7 +55,7 @@ class ExposureConditions:
             "wind": self.wind,
             "wavelengths": self.wavelengths,
             "weights": self.weights,
-            "pixel": SquarePixel(self.pixel_fill_factor) if self.pixel_fill_factor else None,
+            "pixel": square_pixel(self.pixel_fill),
             "sky": self.sky,
         }
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from torchmask.optics.aperture import FullAperture
-from torchmask.optics.pixel import SquarePixel
+from torchmask.optics.detector import Detector
+from torchmask.optics.pixel import PixelResponse, square_pixel
 
 
 def require(name: str, value: float | None, unit: str, zero: bool = False, most: float = math.inf) -> None:
@@ -153,8 +154,8 @@ class Camera:
     """Pixels per side of the field that is read out, all of which add read-out noise."""
     pixel_scale: float | None = None
     """Angle on the sky of one pixel [arcsec]; None: the largest without aliasing at the shortest wavelength."""
-    pixel_fill: float | None = None
-    """Sensitive fraction of the area of a pixel, 1 for pixels without gaps; None: pixels are points."""
+    pixel_fill: float = 0.0
+    """Sensitive fraction of the area of a pixel, 1 for pixels without gaps; 0: pixels are points."""
     readout_noise: float = 0.0
     """Read-out noise [electrons rms per pixel and frame]."""
     readout_time: float = 0.0
@@ -166,5 +167,13 @@ class Camera:
         require("camera.pixel_scale", self.pixel_scale, ", in arcsec")
         require("camera.readout_noise", self.readout_noise, ", in electrons rms", zero=True)
         require("camera.readout_time", self.readout_time, ", in s", zero=True)
-        if self.pixel_fill is not None:
-            SquarePixel(self.pixel_fill)
+        self.detector()  # raises for a fill factor that cannot be
+
+    @property
+    def pixel(self) -> PixelResponse | None:
+        """Blur by the pixels, None if they are points."""
+        return square_pixel(self.pixel_fill)
+
+    def detector(self) -> Detector:
+        """Return the pixels and the noise of the camera, for a simulation."""
+        return Detector(self.readout_noise, pixel=self.pixel)

@@ -17,10 +17,9 @@ from torchmask.interferometry.visibilities import sky_stations, triangle_sides
 from torchmask.observation import Observation, check_frames
 from torchmask.optics.noise import noise_variance
 from torchmask.optics.phasor import phasor
-from torchmask.optics.pixel import PixelResponse
 
 
-def frame_observables(observation: Observation, pixel: PixelResponse | None = None) -> Observables:
+def frame_observables(observation: Observation) -> Observables:
     """Measure visibilities and closure phases directly on the frames, without a restoration.
 
     In each frame the fringes of all baselines are fitted jointly, by least squares over the valid pixels weighted by
@@ -32,8 +31,7 @@ def frame_observables(observation: Observation, pixel: PixelResponse | None = No
     observation : Observation
         Observation with a mask of at least two holes whose baselines are distinct. Subtract the sky beforehand, as it
         counts as light without fringes. If its `readout_noise` is None, it is measured beyond the cut-off frequency.
-    pixel : PixelResponse, optional
-        Blur by the detector's pixels, which lowers the fringes of long baselines most. None: pixels are points.
+        What its `pixel` takes off the fringes, of long baselines most, is given back.
 
     Returns
     -------
@@ -71,7 +69,7 @@ def frame_observables(observation: Observation, pixel: PixelResponse | None = No
     (True, True)
     """
     aperture, grid = observation.aperture, observation.grid
-    model = FringeModel(aperture, grid, pixel)
+    model = FringeModel(aperture, grid, observation.pixel)
     frames, valid = (values.cpu() for values in check_frames(observation.frames, observation.valid, grid))
     fit = fit_fringes(frames, valid, _pixel_noise(observation, frames, valid), model)
     n = aperture.n_subapertures

@@ -46,16 +46,16 @@ def restored_observables(result: Restored, observation: Observation) -> Observab
     """Return visibilities and closure phases of a restored object, free of the restored aberrations.
 
     Errors are those by noise if the restored aberrations were exact: the noise of the frames (or the residual of the
-    model, if that is larger) over the light that the transfer functions of the restored coefficients transmit in the
-    patch of each baseline. They do not include the effect of the prior and the uncertainty of the aberrations, which
-    dominate at high flux.
+    model, if that is larger) over the light that pixels and the transfer functions of the restored coefficients
+    transmit in the patch of each baseline. They do not include the effect of the prior and the uncertainty of the
+    aberrations, which dominate at high flux.
 
     Parameters
     ----------
     result : RestorationResult
         Result of a restoration, or another object with the attributes of `Restored`.
     observation : Observation
-        Observation that was restored.
+        Observation that was restored, with its `pixel`.
 
     Raises
     ------
@@ -86,7 +86,7 @@ def restored_observables(result: Restored, observation: Observation) -> Observab
         raise ValueError("the restored object is zero everywhere: it has no visibilities")
     values = (fringe_waves(aperture, grid, pairs).conj() @ scene.to(torch.complex128).flatten()) / light
     variance = result.noise**2 * max(1.0, float(result.chi_square.mean()))
-    noise = variance * math.prod(grid.shape) / (light**2 * _transmitted(result, aperture, grid, pairs))
+    noise = variance * math.prod(grid.shape) / (light**2 * _transmitted(result, observation, pairs))
     total, of_light = noise[1:], noise[0]
     power = values.abs() ** 2
     first, second, third = triangle_sides(pairs, triangles)
@@ -152,8 +152,9 @@ def fringe_waves(aperture: Aperture, grid: Grid, pairs: Tensor) -> Tensor:
     return phasor(phase)
 
 
-def _transmitted(result: Restored, aperture: Aperture, grid: Grid, pairs: Tensor) -> Tensor:
-    """Return |OTF|^2 (1 + B,) of the restored aberrations, summed over frames and the patches of 0 and baselines."""
+def _transmitted(result: Restored, observation: Observation, pairs: Tensor) -> Tensor:
+    """Return |OTF|^2 (1 + B,) of pixels and restored aberrations, summed over frames and patches of 0 and baselines."""
+    aperture, grid = observation.aperture, observation.grid
     n_modes = result.coefficients.shape[-1]
     samples = _SAMPLES_PER_HOLE * grid.period / (aperture.subaperture_diameter * min(grid.shape))
     oversampling = max(1, math.ceil(samples))
@@ -163,6 +164,8 @@ def _transmitted(result: Restored, aperture: Aperture, grid: Grid, pairs: Tensor
         for coefficients in result.coefficients.to(aperture.centers):
             power += otf(phase(coefficients)).abs().double().cpu() ** 2
     nu_y, nu_x = grid.frequencies(torch.float64)
+    if observation.pixel is not None:
+        power *= observation.pixel.transfer(nu_y, nu_x).abs() ** 2
     centers = aperture.centers.detach().double().cpu()
     nu = torch.cat([centers.new_zeros(1, 2), centers[pairs[:, 1]] - centers[pairs[:, 0]]]) / grid.period
     reach = grid.cutoff(aperture.subaperture_diameter)

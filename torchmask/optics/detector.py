@@ -7,6 +7,8 @@ import math
 import torch
 from torch import Tensor, nn
 
+from torchmask.optics.pixel import PixelResponse
+
 NOISES = ("poisson", "gaussian")
 
 
@@ -77,7 +79,7 @@ def _wide_raster(psfs: Tensor, image: Tensor) -> tuple[int, int]:
 
 
 class Detector(nn.Module):
-    """Photon noise and read-out noise of a detector, independent from pixel to pixel.
+    """Pixels of a detector, with photon noise and read-out noise that are independent from pixel to pixel.
 
     Parameters
     ----------
@@ -87,6 +89,9 @@ class Detector(nn.Module):
         Model of the photon noise. "poisson" counts photons, as a detector does; its frames carry no gradient, because
         a count is a step function of the light. "gaussian" adds normal noise of the same total variance,
         `expected + readout_noise**2`, and is differentiable, so use it for training.
+    pixel : PixelResponse, optional
+        Blur by the pixels, such as `SquarePixel(0.9)`; points by default. `simulate_observation` multiplies the
+        transfer function of every exposure by it; `forward` only draws noise.
 
     Raises
     ------
@@ -112,7 +117,7 @@ class Detector(nn.Module):
     (True, False)
     """
 
-    def __init__(self, readout_noise: float = 0.0, noise: str = "poisson") -> None:
+    def __init__(self, readout_noise: float = 0.0, noise: str = "poisson", pixel: PixelResponse | None = None) -> None:
         super().__init__()
         if not (math.isfinite(readout_noise) and readout_noise >= 0):
             raise ValueError(f"readout_noise is {readout_noise}: it must be finite and not negative, in electrons rms")
@@ -120,6 +125,7 @@ class Detector(nn.Module):
             raise ValueError(f"noise is {noise!r}: it must be one of {', '.join(NOISES)}")
         self.readout_noise: float = float(readout_noise)
         self.noise: str = noise
+        self.pixel: PixelResponse | None = pixel
 
     def forward(self, expected: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Draw frames (..., H, W) [electrons] whose mean is `expected` (..., H, W) [electrons].
@@ -142,7 +148,8 @@ class Detector(nn.Module):
         return (counts + self.readout_noise * normal).to(expected.device)
 
     def extra_repr(self) -> str:
-        return f"readout_noise={self.readout_noise:.6g}, noise={self.noise!r}"
+        pixel = "" if self.pixel is None else f", pixel={self.pixel}"
+        return f"readout_noise={self.readout_noise:.6g}, noise={self.noise!r}{pixel}"
 
 
 def _root(variance: Tensor, rounding: Tensor) -> Tensor:

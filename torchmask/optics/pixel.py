@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -38,6 +39,9 @@ class SquarePixel:
     def __post_init__(self) -> None:
         if not 0 < self.fill_factor <= 1:
             raise ValueError(f"fill_factor is {self.fill_factor}: it must be a fraction, above 0 and at most 1")
+
+    def __str__(self) -> str:
+        return f"square, fill factor {self.fill_factor:.4g}"
 
     def transfer(self, nu_y: Tensor, nu_x: Tensor) -> Tensor:
         """Return sinc(w nu_y) sinc(w nu_x), with w the side of the square in pixels."""
@@ -76,6 +80,10 @@ class MappedPixel:
         if not (0 < total < math.inf and float(self.sensitivity.min()) >= 0):
             raise ValueError("sensitivity must be finite, nowhere negative and somewhere positive")
 
+    def __str__(self) -> str:
+        rows, columns = self.sensitivity.shape
+        return f"map of {rows} x {columns} samples, {self.samples} per pixel"
+
     def transfer(self, nu_y: Tensor, nu_x: Tensor) -> Tensor:
         """Return the normalised Fourier transform of the map, complex (H, W)."""
         weights = (self.sensitivity / self.sensitivity.sum()).to(nu_y)
@@ -88,3 +96,37 @@ class MappedPixel:
     def _places(self, size: int) -> Tensor:
         """Return the positions of the samples along one axis [pixels]."""
         return (torch.arange(size) - (size - 1) / 2) / self.samples
+
+
+def square_pixel(fill_factor: float) -> SquarePixel | None:
+    """Return square pixels, or None, which means points, for a fill factor of 0. Raises ValueError above 1 or below 0.
+
+    Examples
+    --------
+    >>> square_pixel(0.8), square_pixel(0.0)
+    (SquarePixel(fill_factor=0.8), None)
+    """
+    return SquarePixel(fill_factor) if fill_factor else None
+
+
+def pixel_record(pixel: PixelResponse | None) -> dict[str, Any]:
+    """Return a pixel response as values for a file, none of them for points.
+
+    Raises ValueError for a response that is neither a `SquarePixel` nor a `MappedPixel`.
+    """
+    if pixel is None:
+        return {}
+    if isinstance(pixel, SquarePixel):
+        return {"pixel_fill": pixel.fill_factor}
+    if isinstance(pixel, MappedPixel):
+        return {"pixel_map": pixel.sensitivity, "pixel_samples": pixel.samples}
+    raise ValueError(f"a {type(pixel).__name__} cannot be written to a file: give a SquarePixel or a MappedPixel")
+
+
+def read_pixel(record: Mapping[str, Any]) -> PixelResponse | None:
+    """Return the pixel response that a `pixel_record` describes. Raises ValueError for numbers out of range."""
+    if "pixel_fill" in record:
+        return SquarePixel(float(record["pixel_fill"]))
+    if "pixel_map" in record:
+        return MappedPixel(torch.as_tensor(record["pixel_map"]), int(record["pixel_samples"]))
+    return None

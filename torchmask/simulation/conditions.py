@@ -1,4 +1,4 @@
-"""Observing conditions: sky, transparency, exposure time, band and pixels."""
+"""Observing conditions: sky, transparency, exposure time and band."""
 
 from __future__ import annotations
 
@@ -6,12 +6,11 @@ import math
 from dataclasses import dataclass
 
 from torchmask.optics.band import Band
-from torchmask.optics.pixel import PixelResponse
 
 
 @dataclass(frozen=True, kw_only=True)
 class Conditions:
-    """Conditions under which exposures are taken. The defaults are monochromatic snapshots by point pixels, no sky.
+    """Conditions under which exposures are taken. The defaults are monochromatic snapshots on a black sky.
 
     sky : float
         Sky background [electrons per pixel and frame].
@@ -23,8 +22,6 @@ class Conditions:
     band : Band, optional
         Wavelengths and their shares of the light. Turbulence has the same path differences at all of them. By default
         all light has the wavelength of the grid.
-    pixel : PixelResponse, optional
-        Blur by the detector's pixels, which are points by default.
 
     Raises
     ------
@@ -33,8 +30,7 @@ class Conditions:
 
     Examples
     --------
-    >>> from torchmask.optics.pixel import SquarePixel
-    >>> Conditions(sky=12.5, exposure_time=2e-3, pixel=SquarePixel()).sky
+    >>> Conditions(sky=12.5, exposure_time=2e-3).sky
     12.5
     """
 
@@ -42,7 +38,6 @@ class Conditions:
     transparency_scatter: float = 0.0
     exposure_time: float = 0.0
     band: Band | None = None
-    pixel: PixelResponse | None = None
 
     def __post_init__(self) -> None:
         for name, unit in (

@@ -64,14 +64,14 @@ def simulate_observation(
     turbulence : TurbulencePhase, LayeredPhase or None
         Random phase of the atmosphere; None for a perfect one. With layers at height the PSF varies over the field.
     detector : Detector
-        Noise of the detector.
+        Pixels and noise of the detector.
     n_frames : int
         Number of exposures.
     generator : torch.Generator, optional
         Source of randomness. It seeds separate streams for the screens and for the noise, so the screens do not depend
         on the flux or the read-out noise.
     conditions : Conditions, optional
-        Sky, transparency, exposure time, band and pixels. By default, monochromatic snapshots on a black sky.
+        Sky, transparency, exposure time and band. By default, monochromatic snapshots on a black sky.
     told : Aperture, optional
         Aperture that the observer believes was used, if it differs from `aperture`. The observation then has it as its
         `aperture` and the real one as its `true_aperture`.
@@ -137,7 +137,7 @@ def simulate_observation(
     screens_seed, noise_seed = torch.randint(2**62, (2,), generator=generator, device=device).tolist()
     noise = torch.Generator().manual_seed(noise_seed)
     with torch.no_grad():
-        optics = ExposedPSF(aperture, grid, conditions.band, conditions.pixel)
+        optics = ExposedPSF(aperture, grid, conditions.band, detector.pixel)
         points = field_points(scene, grid, SPACING * isoplanatic_angle(turbulence))
         transmission = _draw_transmission(n_frames, conditions.transparency_scatter, generator).to(scene)
         screens = torch.Generator().manual_seed(screens_seed)
@@ -170,6 +170,7 @@ def simulate_observation(
         background=conditions.sky,
         transmission=transmission,
         true_aperture=None if told is None else aperture.still(),
+        pixel=detector.pixel,
     )
 
 
