@@ -16,6 +16,8 @@ from torchmask.restoration.result import RestorationResult
 from torchmask.tracking import RunLogger
 from torchmask.viz.comparison import comparison_figure
 
+POINTS = "points"  # pixels without a size
+
 
 def write_outcome(
     folder: Path, observation: Observation, result: RestorationResult, history: Sequence[str]
@@ -61,7 +63,7 @@ def metrics(observation: Observation, result: RestorationResult) -> dict[str, An
 
 def pixel_text(observation: Observation) -> str:
     """Return the response of the detector's pixels in words."""
-    return "points" if observation.pixel is None else str(observation.pixel)
+    return POINTS if observation.pixel is None else str(observation.pixel)
 
 
 def log_outcome(
@@ -92,4 +94,5 @@ def summarise_outcome(result: RestorationResult, table: Mapping[str, Any]) -> st
     """Return the text to print: a warning of clouds, pixels, and the result, which ends in its verdict."""
     clouded = table["clouded_frames"]
     told = f"frames {clouded} have less than half the light of the others, as through a cloud: --skip leaves them out\n"
-    return f"{told if clouded else ''}pixels: {table['pixel']}\n{result.summary()}"
+    pixels = "" if table["pixel"] == POINTS else f"pixels: {table['pixel']}\n"
+    return (told if clouded else "") + pixels + result.summary()
