@@ -25,12 +25,14 @@ class Option:
     name : last part of its name as a parameter, such as n_photons
     numbers : the numbers in its value
     is_given : whether the value differs from the default
+    is_switch : whether it is on or off
     """
 
     flag: str
     name: str
     numbers: list[float]
     is_given: bool
+    is_switch: bool
 
 
 def in_options(message: str, options: Any) -> str:
@@ -64,7 +66,8 @@ def in_options(message: str, options: Any) -> str:
     if head is None:
         return _advise(message, known)
     name, rest = head["name"], message[head.end("name") :]
-    flag = _by_name(name, known) if told is None else _by_value(name, _numbers(told["value"]), known)
+    valued = [option for option in known if not option.is_switch]  # a switch cannot be wrong
+    flag = _by_name(name, valued) if told is None else _by_value(name, _numbers(told["value"]), known)
     return message[: head.start()] + (flag or name) + _advise(rest, known)
 
 
@@ -100,7 +103,7 @@ def _flatten(options: Any, prefix: str = "--") -> Iterator[Option]:
             yield from _flatten(value, f"{flag}.")
         elif tyro.conf.Positional not in typing.get_args(hints[item.name]):
             numbers = [] if isinstance(value, bool) else _numbers(str(value))
-            yield Option(flag, item.name, numbers, value != item.default)
+            yield Option(flag, item.name, numbers, value != item.default, isinstance(value, bool))
 
 
 def _numbers(text: str) -> list[float]:
