@@ -59,6 +59,7 @@ class Options:
             "a.fits has no GAIN: give --gain [electrons per adu]",
         ),
         ("holes overlap: lower fill_factor or n_holes", {}, "holes overlap: lower --fill-factor or n_holes"),
+        ("a.fits: refine is not positive at 1 pixel", {}, "a.fits: refine is not positive at 1 pixel"),
         ("there is no file /tmp/1/sky: give files", {"seed": 1}, "there is no file /tmp/1/sky: give files"),
         ("no fill_factor.npz in a/n_pixels/b", {}, "no fill_factor.npz in a/n_pixels/b"),
     ],
