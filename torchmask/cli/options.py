@@ -111,7 +111,7 @@ class FilterOptions:
     """A broad band, given by a filter."""
 
     filter: str | None = None
-    """Filter, by its name (bessell-V, twomass-Ks, ...) or a text file with columns wavelength [m] and transmission."""
+    """Filter: its name (bessell-V, twomass-Ks, ...), or a text file with columns wavelength [m] and transmission."""
     n_wavelengths: int = 5
     """Number of wavelengths that represent the band: 3 suffice for a width of 5 percent of the wavelength, 5 for 15."""
     temperature: float | None = None
@@ -137,9 +137,9 @@ class BandOptions(FilterOptions):
     """A broad band, given by a filter or by wavelengths."""
 
     wavelengths: tuple[float, ...] = ()
-    """Wavelengths that represent a broad band, instead of a filter [m]; default: the filter, or --wavelength alone."""
+    """Wavelengths that represent a broad band, instead of a filter [m]; none: --filter, or --wavelength alone."""
     weights: tuple[float, ...] = ()
-    """Relative amount of light at each of --wavelengths, any positive numbers; default: equal."""
+    """Relative amount of light at each of --wavelengths, any positive numbers; none: equal amounts."""
 
     def band(self, wavelength: float) -> dict[str, Any]:
         """Return the band as `MyopicDeconvolution` takes it. Raises ValueError for two bands or another filter."""

@@ -26,11 +26,11 @@ from torchmask.viz.planning import plan_figure
 class Options(Instrument, CatalogOptions, InstrumentOptions, RunOptions):
     """Plan an observation: how many holes, of what size, and what exposure restore the best image.
 
-    For every number of holes and hole diameter a mask is searched, quickly; for each of them and every exposure the
-    error of the restored image is predicted from magnitude, band, telescope, site, camera and time, with what
-    restorations that had to find the aberrations were measured to lose. Writes the map and its least point (plan.md,
-    plan.json, plan.png), that mask (mask.json) and the observation as one file for other commands (instrument.json) to
-    a new folder. Takes minutes.
+    A mask is searched, quickly, for every number of holes and hole diameter. For each of these masks and every exposure
+    the error of the restored image is predicted from magnitude, band, telescope, site, camera and time. The prediction
+    includes what restorations were measured to lose because they have to find the aberrations. Writes all predictions
+    and the best of them (plan.md, plan.json, plan.png), its mask (mask.json), and the observation as one file for other
+    commands (instrument.json) to a new folder. Takes minutes.
     """
 
     mask: Annotated[Path | None, tyro.conf.arg(metavar="FILE|NAME|full")] = None

@@ -95,9 +95,9 @@ class Source:
     temperature: float | None = None
     """Temperature of a black-body spectrum [K], 5772 for sunlight; None: equally many photons at each wavelength."""
     size: float | None = None
-    """Diameter of the target [arcsec], below whose inverse its power spectrum is flat; None: 64 pixels."""
+    """Diameter of the target [arcsec]; its power spectrum is flat below one over it. None: 64 pixels."""
     exponent: float = 1.5
-    """Exponent of the power law with which its power spectrum falls."""
+    """Exponent of the power law by which that spectrum falls beyond."""
 
     def __post_init__(self) -> None:
         if (self.magnitude is None) == (self.photon_rate is None):

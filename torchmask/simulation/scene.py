@@ -37,12 +37,12 @@ class SceneOptions:
     """
 
     path: Path | None = None
-    """Mesh (.obj, .stl, .ply, .glb ...) or image (.npz with key image, .png, .fits); default: packaged satellite."""
+    """Mesh (.obj, .stl, .ply, .glb ...) or image (.npz with key image, .png, .fits); None: the packaged satellite."""
     attitude: tuple[float, float, float] | None = None
-    """Rotation about the axes right, up, towards the viewer [degrees]; 25 -30 15 by default, 0 0 0 for images, which
-    rotate only about the last."""
+    """Rotation about the axes right, up, towards the viewer [degrees]; None: 25 -30 15, or 0 0 0 for images,
+    which rotate only about the last axis."""
     sun: tuple[float, float, float] | None = None
-    """Direction of the sun (right, up, towards the viewer), of any length; -0.5 0.6 0.7 by default. Only for meshes."""
+    """Direction of the sun (right, up, towards the viewer), of any length, for meshes only; None: -0.5 0.6 0.7."""
     size: float = 0.7
     """Larger side of the target as a fraction of the field."""
 
