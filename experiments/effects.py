@@ -59,7 +59,7 @@ class Options(ExperimentOptions):
     """Evaluations of that search."""
     d_over_r0: float = 5.0
     """Strength of the turbulence, D / r0."""
-    n_photons: float = 2e7
+    n_photons: float = 5e6
     """Electrons per frame through the mask."""
     readout_noise: float = 1.5
     """Read-out noise [electrons rms per pixel and frame]."""
