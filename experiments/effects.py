@@ -92,6 +92,8 @@ class Effect:
     conditions: Conditions = IDEAL
     geometry: MaskGeometry = AS_DRAWN
     """How the mask lies."""
+    pixel: SquarePixel | None = None
+    """Pixels of the detector; None: points."""
 
 
 def effects(options: Options, tau0: float) -> list[Effect]:
@@ -107,7 +109,7 @@ def effects(options: Options, tau0: float) -> list[Effect]:
         Effect(
             "pixels that fill their pitch",
             [Restoration("pixels as points"), Restoration("pixels told", {"pixel": filled})],
-            Conditions(pixel=filled),
+            pixel=filled,
         ),
         Effect(
             f"mask turned by {TURN:g} degrees",
@@ -144,7 +146,13 @@ def restore_all(options: Options, callback: Callback) -> tuple[torch.Tensor, Gri
     total, found = sum(len(effect.restorations) for effect in rows), list[dict[str, Any]]()
     for effect in rows:
         seen = simulate_observation(
-            *(scene, effect.geometry.apply(mask), grid, turbulence, Detector(options.readout_noise)),
+            *(
+                scene,
+                effect.geometry.apply(mask),
+                grid,
+                turbulence,
+                Detector(options.readout_noise, pixel=effect.pixel),
+            ),
             *(options.n_frames, torch.Generator().manual_seed(options.seed + 1)),
             conditions=effect.conditions,
         )

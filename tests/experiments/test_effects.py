@@ -19,7 +19,7 @@ def test_each_row_adds_one_effect_and_tells_it_to_its_last_restoration():
     sky, pixels, turned, exposed, verdicts = ROWS
     assert sky.conditions.sky == pytest.approx(0.5)  # of one electron in a mean pixel
     assert [each.told.get("background") for each in sky.restorations] == [Background.NONE, None]
-    assert pixels.conditions.pixel == SquarePixel(1.0)
+    assert pixels.pixel == SquarePixel(1.0)
     assert [each.told.get("pixel") for each in pixels.restorations] == [None, SquarePixel(1.0)]
     assert turned.geometry.rotation == pytest.approx(math.radians(1.2))
     assert [each.geometry for each in turned.restorations] == [MaskGeometry(), turned.geometry]
