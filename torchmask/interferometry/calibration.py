@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from torchmask.interferometry.star_fit import (
 )
 from torchmask.interferometry.star_frames import StarFrames
 from torchmask.interferometry.star_model import MAP, PLACE, Shared, StarModel
+from torchmask.interferometry.which_mask import require_mask
 from torchmask.observation import check_frames
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.geometry import MaskGeometry, turn_and_stretch
@@ -193,6 +194,7 @@ def calibrate_mask(
     centers = aperture.centers.detach().double().cpu()
     look = first_look(star.light, centers, grid)
     star.require_fringes(centers @ look.geometry.matrix.T, grid)
+    require_mask(star.light, look.geometry.apply(aperture), replace(grid, n_pixels=2 * reach + 1))
     coarse, model = (StarModel(aperture, grid, reach, number, pixel) for number in (_FIRST_MODES, n_modes))
     data, counted = star.pixels.flatten(1), star.counted.flatten(1).double()
     even = _even_weights(data, counted)

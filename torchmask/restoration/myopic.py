@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchmask.grid import Grid
-from torchmask.interferometry.orientation import warn_of_orientation
+from torchmask.interferometry.which_mask import look_at_mask
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.band import Band
 from torchmask.optics.pixel import PixelResponse
@@ -255,13 +255,13 @@ class MyopicDeconvolution:
         Warns
         -----
         UserWarning
-            If noise, border or fringes of the frames contradict `readout_noise`, the field or the mask's orientation.
+            If noise, border or fringes of the frames contradict `readout_noise`, the field or the mask.
         """
         started = time.perf_counter()
         check_samples(n_samples)
         keep_freed_memory()
         stack = self._stack(frames, valid, errors)
-        warn_of_orientation(stack.frames, self.recipe.aperture, self.recipe.grid)
+        (look := look_at_mask(stack.frames, self.recipe.aperture, self.recipe.grid)).warn(stacklevel=2)
         (known := Known(coefficients, covariance, known_object)).check()
         model = (self.model if covariance is None else self.recipe.estimated_model(covariance)).beside(stack.free)
         stack = stack.to(model.dtype, model.device)
@@ -274,7 +274,7 @@ class MyopicDeconvolution:
             settings = (replace(traits, max_iterations=0, tolerance=0.0), self.minimizer, self.schedule)
             check_prior(self.prior, model.window.embed(stack.frames.mean(0).clamp(min=0)).double())
             progress = solver.solve(known, start, Checkpoint.of(checkpoint, objective, settings, known.tensors))
-            found = (progress, solver.prior_r0, solver.verdict(progress.ending))
+            found = (progress, solver.prior_r0, replace(solver.verdict(progress.ending), **look._asdict()))
             result = assemble_result(solver.objective, stack, *found, n_modes=self.n_modes)
             if n_samples:
                 result = add_deviations(result, solver.objective, stack, progress, n_samples)

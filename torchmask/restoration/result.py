@@ -164,6 +164,8 @@ class RestorationResult(Brief):
         if self.motion is not None:
             piston = self.motion[..., 0] - self.motion[..., 0].mean(1, keepdim=True)
             lines.append(f"pistons change by {float(piston.square().mean().sqrt()):.2f} rad rms while a frame lasts")
+        if self.verdict is not None and self.verdict.unseen:
+            lines.append(f"the mask {self.verdict.unseen} makes the same fringes, so that frames cannot show that")
         return "\n".join([*lines, *([] if self.verdict is None else [str(self.verdict)])])
 
 

@@ -38,6 +38,8 @@ class Verdict:
     frames : numbers of the frames that are not explained individually
     n_frames : number of frames in the stack
     check : what may be wrong; empty if everything is explained
+    contradiction : what the fringes say against the mask as given, and which fits better; empty if nothing
+    unseen : other orientations of the mask that would make the same fringes; empty if there are none
 
     Examples
     --------
@@ -55,6 +57,8 @@ class Verdict:
     frames: tuple[int, ...]
     n_frames: int
     check: str
+    contradiction: str = ""
+    unseen: str = ""
 
     @property
     def explained(self) -> bool:
@@ -74,6 +78,7 @@ class Verdict:
                 numbers += f", since modes left out ({self.phase_error:.2g} rad rms) add about {self.model_error:.2g}"
         parts = [f"{_listed(self.frames, self.n_frames)} explained"] if self.frames else []
         parts += [f"check {self.check}"] if self.check else []
+        parts += [self.contradiction] if self.contradiction and not self.explained else []
         return f"{self.finding.value}: {'; '.join([*parts, numbers])}"
 
     def to_json(self) -> dict[str, Any]:

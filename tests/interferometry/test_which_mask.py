@@ -1,0 +1,113 @@
+"""What frames of an object say about the mask: how it lies, which it is, and what they cannot say."""
+
+import math
+import re
+import warnings
+from typing import get_type_hints
+
+import pytest
+import torch
+
+from torchmask.atmosphere.phase import TurbulencePhase
+from torchmask.grid import Grid
+from torchmask.interferometry.calibration import calibrate_mask
+from torchmask.interferometry.which_mask import ORIENTATIONS, MaskLook, look_at_mask
+from torchmask.optics.aperture import FullAperture, SparseAperture
+from torchmask.optics.detector import Detector
+from torchmask.optics.geometry import MaskGeometry
+from torchmask.restoration.myopic import MyopicDeconvolution
+from torchmask.restoration.verdict import Verdict
+from torchmask.simulation.exposures import simulate_observation
+from torchmask.simulation.scene import make_scene
+
+GRID = Grid.nyquist(1.0, 550e-9, 64)
+MASK = SparseAperture.from_catalog("golay9", 1.0, 0.12)
+UNKNOWN = SparseAperture.random(9, 1.0, 0.12, torch.Generator().manual_seed(4))  # to the catalogue
+
+
+def exposures(mask, scene=None, n_frames=10):
+    scene = make_scene((64, 64), n_photons=1e7).double() if scene is None else scene
+    turbulence, generator = TurbulencePhase(r0=1 / 7, outer_scale=20.0), torch.Generator().manual_seed(2)
+    return simulate_observation(scene, mask, GRID, turbulence, Detector(1.5), n_frames, generator).frames
+
+
+@pytest.fixture(scope="module")
+def frames():
+    return exposures(MASK)
+
+
+@pytest.fixture(scope="module")
+def frames_of_unknown():
+    return exposures(UNKNOWN)
+
+
+def test_of_the_right_mask_there_is_nothing_to_say(frames):
+    assert look_at_mask(frames, MASK, GRID) == MaskLook()
+    assert look_at_mask(frames, MASK.replace(-MASK.centers), GRID) == MaskLook()  # half a turn changes nothing
+
+
+@pytest.mark.parametrize("name", ORIENTATIONS)
+def test_another_orientation_is_named(frames, name):
+    """The mask is told as the inverse of what fits; mirrors and swaps are their own inverses."""
+    told = ORIENTATIONS[name].apply(MASK)
+    assert f"fit the mask better {name} than as given" in look_at_mask(frames, told, GRID).contradiction
+
+
+def test_the_mask_of_the_catalogue_that_was_in_the_beam_is_named(frames):
+    found = look_at_mask(frames, UNKNOWN, GRID).contradiction
+    assert "not those of the mask in any of its eight orientations" in found
+    assert "but fit golay9 of the catalogue (0." in found
+    mirrored = frames.flip(2).roll(1, 2)  # about pixel 32
+    found = look_at_mask(mirrored, UNKNOWN, GRID).contradiction
+    assert "but fit golay9 of the catalogue with x reversed (0." in found
+
+
+def test_a_mask_that_is_turned_or_of_another_size_is_named_as_such(frames_of_unknown):
+    """Angles and scales are tried in steps of a hole's over the mask's diameter: at most half of that is missed."""
+    step = UNKNOWN.subaperture_diameter
+
+    def fitting(geometry, words):
+        told = look_at_mask(frames_of_unknown, geometry.apply(UNKNOWN), GRID).contradiction
+        found = re.search(f"but fit it {words} by about ([\\d.]+)", told)
+        assert found is not None, told
+        return float(found[1])
+
+    assert abs(fitting(MaskGeometry(-0.6), "turned") - math.degrees(0.6)) < math.degrees(step) / 2 + 0.5
+    mirrored = fitting(MaskGeometry(0.6, mirrored=True), "with x reversed, then turned")  # its own inverse
+    assert abs(mirrored - math.degrees(0.6)) < math.degrees(step) / 2 + 0.5
+    assert abs(math.log(fitting(MaskGeometry(0.0, 1.25, 1.25), "magnified") / 0.8)) < step / 2 + 0.01
+
+
+@pytest.mark.parametrize("value", [0.0, 100.0])
+def test_noise_says_nothing(value):
+    generator = torch.Generator().manual_seed(0)
+    noise = value + torch.randn(6, 64, 64, generator=generator, dtype=torch.float64)
+    assert look_at_mask(noise, MASK, GRID) == MaskLook()
+
+
+def test_what_a_symmetric_mask_cannot_show_is_said(frames):
+    symmetric = SparseAperture.from_catalog("golay3", 1.0, 0.15)
+    assert look_at_mask(frames, symmetric, GRID).unseen == "with x reversed"
+    for simple in (FullAperture(1.0), MASK.replace(MASK.centers[:2])):
+        assert look_at_mask(frames, simple, GRID) == MaskLook()
+
+
+def test_a_restoration_warns_once_and_its_verdict_says_why(frames):
+    mirrored = ORIENTATIONS["with x reversed"].apply(MASK)
+    with pytest.warns(UserWarning, match="with x reversed") as caught:
+        result = MyopicDeconvolution(mirrored, GRID, n_modes=3, max_iterations=1).restore(frames)
+    assert [entry.filename for entry in caught if "with x reversed" in str(entry.message)] == [__file__]
+    assert "fit the mask better with x reversed" in result.summary().splitlines()[-1]
+    symmetric = SparseAperture.from_catalog("golay3", 1.0, 0.15)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        result = MyopicDeconvolution(symmetric, GRID, n_modes=3, max_iterations=1).restore(frames)
+    assert "the mask with x reversed makes the same fringes" in result.summary()
+    assert set(MaskLook._fields) <= set(get_type_hints(Verdict))
+
+
+def test_a_calibration_names_the_mask_too():
+    star = torch.zeros(64, 64, dtype=torch.float64)
+    star[32, 32] = 1e6
+    with pytest.raises(ValueError, match=r"not those of this mask at any angle .*: they fit golay9 of the catalogue"):
+        calibrate_mask(exposures(MASK, star, 3), UNKNOWN, GRID)

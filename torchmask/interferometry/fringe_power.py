@@ -1,0 +1,125 @@
+"""The power of fringes in frames of any object, compared with what masks would show.
+
+Fringes have power only at the baselines of the mask, whatever the object, the pistons of turbulence and the background.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchmask.grid import Grid
+from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.phasor import phasor
+
+_AT_A_TIME = 32  # frames
+_RING = 2  # width of a ring of spatial frequencies, in units of their spacing
+_LEAST = 8  # frequencies needed to tell anything
+
+
+class Match(NamedTuple):
+    """How much of a mask's pattern the power of fringes shows.
+
+    share : 1 if the pattern is that of the mask, 0 if it has nothing to do with it; in frames of extended objects the
+        right mask has 0.5 to 1, see docs/method.md
+    error : standard error of the share
+    """
+
+    share: float
+    error: float
+
+
+@dataclass(frozen=True, eq=False)
+class FringePower:
+    """Mean power of frames at the spatial frequencies that a mask transmits, without those within one hole.
+
+    power : (F,) mean |DFT|^2
+    noise : power of the noise
+    grid : grid of the frames
+    chosen : (H, W) bool, the F frequencies, in FFT order
+    rings : (F,) number of the ring of similar frequencies to which each belongs
+    """
+
+    power: Tensor
+    noise: float
+    grid: Grid
+    chosen: Tensor
+    rings: Tensor
+
+    @classmethod
+    def of(cls, frames: Tensor, aperture: SparseAperture, grid: Grid) -> FringePower | None:
+        """Return the power of frames (T, H, W), weighted by a Hann window; None if too few frequencies are left."""
+        nu_y, nu_x = grid.frequencies(torch.float64, frames.device)
+        radius = torch.hypot(nu_y, nu_x)
+        window = [
+            torch.hann_window(side, periodic=False, dtype=torch.float64, device=frames.device) for side in grid.shape
+        ]
+        power = torch.zeros_like(radius)
+        for part in frames.double().split(_AT_A_TIME):
+            still = (part - part.mean((1, 2), keepdim=True)) * window[0][:, None] * window[1]
+            power += (torch.fft.fft2(still).abs() ** 2).sum(0) / len(frames)
+        reach = grid.cutoff(aperture.extent)
+        chosen = (radius > grid.cutoff(aperture.outer_diameter)) & (radius <= reach) & (power > 0)
+        beyond = radius > max(reach, 0.5)  # the corners hold no light of a larger mask either
+        if int(beyond.sum()) < _LEAST or int(chosen.sum()) < _LEAST:
+            return None
+        rings = (radius[chosen] * (max(grid.shape) / _RING)).round().long()
+        return cls(power[chosen], float(power[beyond].mean()), grid, chosen, rings)
+
+    def match(self, aperture: SparseAperture) -> Match:
+        """Return how much of the pattern of a mask the power shows.
+
+        The share is the slope of the logarithm of the power over that of a point source behind the mask, within rings
+        of similar frequencies: an object and turbulence change the power from ring to ring. It scatters as if each of
+        the N (N - 1) baselines were one independent measurement.
+        """
+        pattern = _smoothed(expected_power(aperture, self.grid))[self.chosen].clamp(min=0)
+        light = (self._sums(self.power - self.noise).clamp(min=0) / self._sums(pattern).clamp(min=1e-12))[self.rings]
+        expected = self._within_rings((light * pattern + max(self.noise, 1e-12 * float(self.power.max()))).log())
+        measured = self._within_rings(self.power.log())
+        contrast, n = float(expected @ expected), aperture.n_subapertures
+        if contrast < 1e-12 * len(expected):
+            return Match(0.0, math.inf)
+        error = math.sqrt(float(measured @ measured) / contrast / (n * (n - 1)))
+        return Match(float(measured @ expected) / contrast, error)
+
+    def _sums(self, values: Tensor) -> Tensor:
+        """Return the sum of values (F,) over each ring."""
+        return values.new_zeros(int(self.rings.max()) + 1).index_add_(0, self.rings, values)
+
+    def _within_rings(self, values: Tensor) -> Tensor:
+        """Return values (F,) minus the mean of their ring."""
+        means = self._sums(values) / self._sums(torch.ones_like(values)).clamp(min=1)
+        return values - means[self.rings]
+
+
+def likeness(one: SparseAperture, other: SparseAperture, grid: Grid) -> float:
+    """Return the correlation of the fringe power of two masks; 1 if frames cannot tell them apart."""
+    patterns = [expected_power(aperture, grid).flatten() for aperture in (one, other)]
+    return float(torch.nn.functional.cosine_similarity(*(pattern - pattern.mean() for pattern in patterns), dim=0))
+
+
+def expected_power(aperture: SparseAperture, grid: Grid) -> Tensor:
+    """Return the sum (H, W) of |OTF|^2 over the pairs of holes, its mean for independent pistons.
+
+    It is one patch convolved with all baselines, whose transform is |sum of exp(2 pi i x . nu_m)|^2 - N.
+    """
+    nu_y, nu_x = grid.frequencies(torch.float64, aperture.centers.device)
+    shift = torch.stack(torch.broadcast_tensors(nu_x, nu_y), -1) * grid.period
+    patch = torch.fft.ifft2(aperture.shape.otf(shift, aperture.subaperture_diameter) ** 2)
+    x, y = nu_x * grid.shape[1], nu_y * grid.shape[0]  # whole pixels, in FFT order
+    phase = 2 * math.pi / grid.period * aperture.centers.detach().double()
+    waves = [phasor(angle) for angle in (phase[:, 1:] * y.T, phase[:, :1] * x)]
+    pairs = (waves[0].T @ waves[1]).abs() ** 2 - len(phase)
+    return torch.fft.fft2(patch * pairs).real
+
+
+def _smoothed(power: Tensor) -> Tensor:
+    """Return a power spectrum (H, W) as seen through a Hann window, up to a factor: its transform squared is short."""
+    for dim in (0, 1):
+        power = (power.roll(1, dim) + 4 * power + power.roll(-1, dim)) / 6
+    return power

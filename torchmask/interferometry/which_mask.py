@@ -1,0 +1,142 @@
+"""Which mask was in the beam, and how it lay, as far as the power of fringes in frames of any object tells."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from torch import Tensor
+
+from torchmask.grid import Grid
+from torchmask.interferometry.fringe_power import FringePower, Match, likeness
+from torchmask.optics import catalog
+from torchmask.optics.aperture import Aperture, SparseAperture
+from torchmask.optics.geometry import MaskGeometry
+
+ORIENTATIONS = {
+    "with x reversed": MaskGeometry(mirrored=True),
+    "with x and y swapped": MaskGeometry(math.pi / 2, mirrored=True),
+    "turned by 90 degrees": MaskGeometry(math.pi / 2),
+}
+"""Orientations besides the given one; these four turned by 180 degrees make the same fringes."""
+
+_NAMED = 2.5  # standard errors of the share by which another orientation must show
+_RIGHT = 0.6  # least share of the right mask, with two standard errors added, see docs/method.md
+_FOUND = 4.0  # standard errors by which one of some hundred candidates must show
+_SCALES = 0.7, 1.4  # range of magnifications that are tried
+_ALIKE = 0.95  # correlation of two patterns above which frames do not tell them apart
+
+
+class MaskLook(NamedTuple):
+    """What the fringes in frames say about the mask as given.
+
+    contradiction : what speaks against it, and what fits better; empty if nothing
+    unseen : which other orientations would make the same fringes; empty if there are none
+    """
+
+    contradiction: str = ""
+    unseen: str = ""
+
+    def warn(self, stacklevel: int) -> None:
+        """Issue a warning if the fringes contradict the mask as given."""
+        if self.contradiction:
+            warnings.warn(self.contradiction, stacklevel=stacklevel + 1)
+
+
+def look_at_mask(frames: Tensor, aperture: Aperture, grid: Grid) -> MaskLook:
+    """Compare the fringes of frames (T, H, W) with the mask as given, and with others if it does not fit.
+
+    Others are its mirrored and turned orientations first, then the masks of the catalogue, and the given mask at any
+    angle or at another scale. Nothing is said of a full pupil, of two holes, or where frames do not tell.
+    """
+    if not isinstance(aperture, SparseAperture) or aperture.n_subapertures < 3:
+        return MaskLook()
+    others = {name: geometry.apply(aperture) for name, geometry in ORIENTATIONS.items()}
+    unseen = " or ".join(name for name, other in others.items() if likeness(aperture, other, grid) > _ALIKE)
+    power = FringePower.of(frames, aperture, grid)
+    return MaskLook("" if power is None else _contradiction(power, aperture, others), unseen)
+
+
+def require_mask(frames: Tensor, aperture: SparseAperture, grid: Grid) -> None:
+    """Raise ValueError if the fringes in frames (T, H, W) of a star are not those of the mask.
+
+    The message names the mask of the catalogue that they fit, if one fits clearly.
+    """
+    power = FringePower.of(frames, aperture, grid)
+    if power is None or _may_be(told := power.match(aperture)):
+        return
+    found = _clearest(power, _catalogue(aperture, grid))
+    raise ValueError(
+        f"the fringes of the frames are not those of this mask at any angle ({_shown(told)} of its pattern): "
+        + (f"they fit {found[0]} ({_shown(found[1])})" if found else "no mask of the catalogue fits clearly either")
+    )
+
+
+def _contradiction(power: FringePower, aperture: SparseAperture, others: dict[str, SparseAperture]) -> str:
+    told = power.match(aperture)
+    matches = {name: power.match(other) for name, other in others.items()}
+    name = max(matches, key=lambda key: matches[key].share)
+    best = matches[name]
+    if best.share > max(told.share + best.error, _NAMED * best.error) and _may_be(best):
+        return (
+            f"the fringes of the frames fit the mask better {name} than as given (they show {best.share:.2f} of its "
+            f"pattern instead of {told.share:.2f}): check its orientation, or measure it with calibrate_mask on frames "
+            "of a star"
+        )
+    if _may_be(told):
+        return ""
+    seen = f"the fringes of the frames are not those of the mask in any of its eight orientations ({_shown(told)}"
+    found = _clearest(power, _catalogue(aperture, power.grid)) or _clearest(power, _moved(aperture))
+    if found is not None:
+        return f"{seen} of its pattern), but fit {found[0]} ({_shown(found[1])})"
+    return (
+        f"{seen} of its pattern): check which mask was in the beam, its angle, and its scale (wavelength, pixel "
+        "scale); no mask of the catalogue fits clearly"
+    )
+
+
+def _may_be(match: Match) -> bool:
+    """Return whether the fringes may be those of the mask."""
+    return match.share + 2 * match.error > _RIGHT
+
+
+def _shown(match: Match) -> str:
+    return f"{match.share:.2f} +- {match.error:.2f}"
+
+
+def _clearest(power: FringePower, candidates: Iterator[tuple[str, SparseAperture]]) -> tuple[str, Match] | None:
+    """Return name and match of the candidate whose pattern is seen most clearly, if one is seen clearly."""
+    matches = [(name, power.match(mask)) for name, mask in candidates]
+    best = max(matches, key=lambda pair: pair[1].share / pair[1].error, default=None)
+    return best if best is not None and best[1].share > _FOUND * best[1].error else None
+
+
+def _catalogue(aperture: SparseAperture, grid: Grid) -> Iterator[tuple[str, SparseAperture]]:
+    """Return the masks of the catalogue that the grid samples, in their four orientations."""
+    for name in catalog.names():
+        known = catalog.entry(name)
+        size = aperture.mask_diameter if known.pupil_diameter is None else None
+        fill = aperture.fill_factor if size is not None or known.hole_diameter is None else None
+        mask = SparseAperture.from_catalog(name, size, fill).to(aperture.centers)
+        if mask.n_subapertures < 3 or grid.cutoff(mask.extent) > 0.5:
+            continue
+        yield f"{name} of the catalogue", mask
+        for orientation, geometry in ORIENTATIONS.items():
+            yield f"{name} of the catalogue {orientation}", geometry.apply(mask)
+
+
+def _moved(aperture: SparseAperture) -> Iterator[tuple[str, SparseAperture]]:
+    """Return the mask at other angles, also mirrored, and at other scales.
+
+    The farthest fringes of one and the next are a hole's radius apart, half of what they are wide.
+    """
+    step = aperture.subaperture_diameter / aperture.mask_diameter
+    for number in range(1, math.ceil(math.pi / step)):
+        angle = f"turned by about {math.degrees(number * step):.0f} degrees from x to y"
+        yield f"it {angle}", MaskGeometry(number * step).apply(aperture)
+        yield f"it with x reversed, then {angle}", MaskGeometry(number * step, mirrored=True).apply(aperture)
+    for number in range(math.ceil(math.log(_SCALES[0]) / step), math.floor(math.log(_SCALES[1]) / step) + 1):
+        scale = math.exp(number * step)
+        yield f"it magnified by about {scale:.2f}", MaskGeometry(0.0, scale, scale).apply(aperture)
