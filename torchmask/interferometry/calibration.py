@@ -18,6 +18,7 @@ from torchmask.interferometry.star_fit import (
     Information,
     StarFit,
     evaluate,
+    explained_variance,
     fit_frame,
     fit_together,
     start_frame,
@@ -208,7 +209,7 @@ def calibrate_mask(
         geometry=(geometry := MaskGeometry.from_matrix(fit.shared.matrix)),
         aperture=geometry.apply(aperture),
         mirror_seen=look.mirror_seen,
-        explained=_explained(data, counted, fit),
+        explained=explained_variance(data, counted, fit.images),
         **_estimates(model, fit, information, star.middles),
     )
 
@@ -249,16 +250,9 @@ def _variance(data: Tensor, counted: Tensor, fit: StarFit, readout_noise: float)
     return noise + left.clamp(min=0)[:, None]
 
 
-def _explained(data: Tensor, counted: Tensor, fit: StarFit) -> Tensor:
-    """Return the fraction (T,) of the variance of each frame's pixels that the fit explains."""
-    mean = (data * counted).sum(1, keepdim=True) / counted.sum(1, keepdim=True)
-    left, all_of_it = ((counted * (data - level) ** 2).sum(1) for level in (fit.images, mean))
-    return 1 - left / all_of_it
-
-
 def _require_star(data: Tensor, counted: Tensor, fit: StarFit) -> None:
     """Raise ValueError unless the fit of a star explains most of the variance of most frames."""
-    explained = float(_explained(data, counted, fit).median())
+    explained = float(explained_variance(data, counted, fit.images).median())
     if explained < _LEAST_EXPLAINED:
         raise ValueError(
             f"a star behind this mask explains only {100 * max(explained, 0.0):.0f} % of the variance of the frames: "

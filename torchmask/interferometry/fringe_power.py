@@ -18,6 +18,7 @@ from torchmask.optics.phasor import phasor
 
 _AT_A_TIME = 32  # frames
 _RING = 2  # width of a ring of spatial frequencies, in units of their spacing
+_FLOOR = 0.03  # of the mean power of a ring: light between the fringes that the pattern lacks, as of a cut-out's border
 _LEAST = 8  # frequencies needed to tell anything
 
 
@@ -78,23 +79,27 @@ class FringePower:
         the N (N - 1) baselines were one independent measurement.
         """
         pattern = _smoothed(expected_power(aperture, self.grid))[self.chosen].clamp(min=0)
-        light = (self._sums(self.power - self.noise).clamp(min=0) / self._sums(pattern).clamp(min=1e-12))[self.rings]
-        expected = self._within_rings((light * pattern + max(self.noise, 1e-12 * float(self.power.max()))).log())
-        measured = self._within_rings(self.power.log())
+        light = self._means(self.power - self.noise).clamp(min=0)
+        floor = _FLOOR * light + 1e-12 * float(self.power.max())
+        expected = light / self._means(pattern).clamp(min=1e-12) * pattern + self.noise + floor
+        expected, measured = (self._within_rings(values.log()) for values in (expected, self.power + floor))
         contrast, n = float(expected @ expected), aperture.n_subapertures
         if contrast < 1e-12 * len(expected):
             return Match(0.0, math.inf)
         error = math.sqrt(float(measured @ measured) / contrast / (n * (n - 1)))
         return Match(float(measured @ expected) / contrast, error)
 
-    def _sums(self, values: Tensor) -> Tensor:
-        """Return the sum of values (F,) over each ring."""
-        return values.new_zeros(int(self.rings.max()) + 1).index_add_(0, self.rings, values)
+    def _means(self, values: Tensor) -> Tensor:
+        """Return the mean of values (F,) over the ring of each."""
+        sums, counts = (
+            values.new_zeros(int(self.rings.max()) + 1).index_add_(0, self.rings, each)
+            for each in (values, torch.ones_like(values))
+        )
+        return (sums / counts.clamp(min=1))[self.rings]
 
     def _within_rings(self, values: Tensor) -> Tensor:
         """Return values (F,) minus the mean of their ring."""
-        means = self._sums(values) / self._sums(torch.ones_like(values)).clamp(min=1)
-        return values - means[self.rings]
+        return values - self._means(values)
 
 
 def likeness(one: SparseAperture, other: SparseAperture, grid: Grid) -> float:

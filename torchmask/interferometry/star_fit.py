@@ -175,3 +175,10 @@ def _hold(model: StarModel) -> Tensor:
     modes = torch.full((model.n_modes,), high**-2, dtype=torch.float64)
     modes[:3] = low**-2
     return torch.cat([modes.new_zeros(PLACE), modes.repeat(model.n_holes)])
+
+
+def explained_variance(data: Tensor, counted: Tensor, images: Tensor) -> Tensor:
+    """Return the fraction (T,) of the variance of each frame's counted pixels that the fit explains."""
+    mean = (data * counted).sum(1, keepdim=True) / counted.sum(1, keepdim=True)
+    left, all_of_it = ((counted * (data - level) ** 2).sum(1) for level in (images, mean))
+    return 1 - left / all_of_it
