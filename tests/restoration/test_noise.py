@@ -7,7 +7,7 @@ import torch
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture
-from torchmask.restoration.noise import check_errors, expected_variance
+from torchmask.restoration.noise import FrameNoise, check_errors, expected_variance
 
 GRID = Grid.nyquist(1.0, 550e-9, 32)
 PUPIL = FullAperture(1.0)
@@ -64,3 +64,26 @@ def test_errors_are_those_of_every_frame_or_of_each():
     assert float(check_errors(errors, frames, holes)[holes].min()) == 1
     with pytest.raises(ValueError, match="errors has shape"):
         check_errors(errors[:2], frames, valid)
+
+
+@pytest.mark.parametrize(("gain", "readout"), [(1.0, 0.0), (1.0, 6.0), (0.25, 0.0)])
+def test_noise_of_frames_follows_their_light(gain, readout):
+    """Half of the pixels have 3 times the light of the others, and frames 0.5 to 2 times that of the mean.
+
+    The variance of a pixel is its light and that of the read-out noise; without the latter the unit does not matter.
+    Over n = 10000 pixels a mean is known to the pixels' scatter over sqrt(n), their variance to sqrt(2 / n) of itself.
+    """
+    transmission = torch.tensor([0.5, 0.7, 1.0, 1.8], dtype=torch.float64)
+    pattern = torch.cat([torch.full((50, 100), 20.0), torch.full((50, 100), 60.0)]).double()
+    light = transmission[:, None, None] * pattern
+    generator = torch.Generator().manual_seed(0)
+    frames = torch.poisson(light, generator=generator)
+    frames = frames + readout * torch.randn(light.shape, generator=generator, dtype=torch.float64)
+    variance = light + readout**2
+    found = FrameNoise.of(gain * frames, gain**2 * float(variance.mean()))
+    means, scatter = variance.mean((1, 2)), 20.0**2 * transmission**2 + variance.mean((1, 2))
+    of_mean = scatter.sqrt() / 100 / means
+    torch.testing.assert_close(found.level, means / means.mean(), rtol=4 * float(of_mean.max()), atol=0)
+    expected = variance.square().mean((1, 2)) / means**2
+    error = math.sqrt(2 / 10000) * scatter / means**2 + 2 * of_mean * (expected - 1)
+    assert bool(((found.unevenness - expected).abs() < 4 * error).all())

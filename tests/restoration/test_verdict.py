@@ -2,12 +2,14 @@
 
 import json
 import math
+from statistics import NormalDist
 
 import pytest
 import torch
 
 from torchmask.restoration.model_error import ModelError
-from torchmask.restoration.verdict import Finding, Tolerance, Verdict, judge
+from torchmask.restoration.noise import FrameNoise
+from torchmask.restoration.verdict import Finding, FrameFits, Tolerance, Verdict, judge
 
 PIXELS = 1000
 ERROR = ModelError(excess=0.3, fitted=40.0, phase=0.2)
@@ -16,9 +18,15 @@ ERROR = ModelError(excess=0.3, fitted=40.0, phase=0.2)
 TOLERANCE = Tolerance(2.0, 2.0)
 
 
-def verdict_on(*chi_square, contrast=50.0, tolerance=TOLERANCE, at_rest=True):
-    frames = torch.tensor(chi_square, dtype=torch.float64)
-    return judge(frames, torch.full((len(frames),), PIXELS), contrast, ERROR, tolerance, at_rest=at_rest)
+def verdict_on(*chi_square, contrast=50.0, tolerance=TOLERANCE, at_rest=True, error=ERROR, **fits):
+    n_frames = len(chi_square)
+    told = {
+        "chi_square": torch.tensor(chi_square, dtype=torch.float64),
+        "pixels": torch.full((n_frames,), PIXELS),
+        "transmission": torch.ones(n_frames),
+        "noise": FrameNoise.even(n_frames),
+    }
+    return judge(FrameFits(**(told | fits)), contrast, error, tolerance, at_rest=at_rest)
 
 
 def test_chi_square_is_over_its_degrees_of_freedom():
@@ -38,8 +46,7 @@ def test_what_may_be_left_is_the_model_error_and_chance():
 
 
 def test_pixels_that_are_not_valid_do_not_count():
-    each = torch.tensor([1.0, 9.0], dtype=torch.float64)
-    verdict = judge(each, torch.tensor([1000, 40]), 50.0, ERROR, TOLERANCE, at_rest=True)
+    verdict = verdict_on(1.0, 9.0, pixels=torch.tensor([1000, 40]))
     assert verdict.degrees_of_freedom == 961  # a frame that tells nothing has one left
     assert verdict.chi_square == pytest.approx((1000 + 360) / 961)
 
@@ -53,6 +60,32 @@ def test_single_frames_may_be_lost():
     assert not verdict.explained
     assert verdict.frames == (1, 2)
     assert "frames 1, 2 are not explained; check those frames" in str(verdict)
+
+
+def test_a_frame_may_have_the_noise_of_its_own_light_and_the_model_error_of_its_brightness():
+    """Limits of single frames: noise level + 2 E g^2 + z level (2 unevenness / free)^(1/2)."""
+    transmission = torch.tensor([0.5, 1.0, 1.5, 1.0])
+    noise = FrameNoise(torch.tensor([0.6, 1.0, 1.4, 1.0]), torch.tensor([1.0, 3.0, 2.0, 1.0]))
+    z = NormalDist().inv_cdf(1 - 0.01 / 4)
+    limits = noise.level + 2 * 0.3 * transmission**2 + z * noise.level * (2 * noise.unevenness / 960).sqrt()
+    at_limit = 0.96 * limits  # per pixel
+    for frame in range(4):
+        for sign in (-1, 1):
+            chi_square = at_limit - 1e-5
+            chi_square[frame] += 1e-5 + sign * 1e-5
+            found = verdict_on(*chi_square.tolist(), transmission=transmission, noise=noise)
+            assert found.frames == ((frame,) if sign > 0 else ())
+    deviations = noise.level * (2 * noise.unevenness / 960).sqrt()
+    assert found.limit == pytest.approx(1.6 + 2 * float(deviations.square().mean().sqrt()) / 2, rel=1e-6)
+
+
+def test_of_good_stacks_one_in_a_hundred_has_a_frame_that_is_named():
+    """Chi-square of Gaussian noise over many pixels is normal: of 1500 stacks 15, which scatters by sqrt(15)."""
+    generator = torch.Generator().manual_seed(3)
+    pixels, error = torch.full((20,), 10**6), ModelError(0.0, 0.0, 0.0)
+    draws = 1 + math.sqrt(2e-6) * torch.randn(1500, 20, dtype=torch.float64, generator=generator)
+    named = sum(bool(verdict_on(*draw, pixels=pixels, error=error).frames) for draw in draws.tolist())
+    assert abs(named - 15) < 4 * math.sqrt(15)  # some at least
 
 
 def test_of_many_frames_it_is_the_instrument_that_is_to_be_checked():

@@ -13,7 +13,7 @@ from torchmask.grid import Grid
 from torchmask.observation import check_frames
 from torchmask.optics.aperture import Aperture
 from torchmask.restoration.background import Background, check_known_level
-from torchmask.restoration.noise import check_errors, expected_variance
+from torchmask.restoration.noise import FrameNoise, check_errors, expected_variance
 
 Array = Tensor | np.ndarray
 
@@ -113,6 +113,13 @@ class FrameStack:
         mean = (weight * self.frames).sum(0) / total.clamp(min=torch.finfo(total.dtype).tiny)
         level = (total * mean).sum() / total.sum()
         return float((total * (mean - level) ** 2).sum() / (total > 0).sum())
+
+    @property
+    def noise_of_frames(self) -> FrameNoise:
+        """Noise of each frame relative to what `precision` says."""
+        if self.errors is not None:
+            return FrameNoise.even(len(self))
+        return FrameNoise.of(self.frames * self.unit + self.known, self.variance)
 
     @property
     def photon_share(self) -> float:

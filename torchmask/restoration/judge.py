@@ -10,11 +10,12 @@ from torchmask.restoration.checkpoint import Ending, Status
 from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.model_error import NO_MODEL_ERROR, LeftOut, ModelError, expected_error, fitted_parameters
 from torchmask.restoration.motion import Setting
+from torchmask.restoration.noise import FrameNoise
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.state import State
 from torchmask.restoration.traits import Traits
-from torchmask.restoration.verdict import Tolerance, Verdict, judge
+from torchmask.restoration.verdict import FrameFits, Tolerance, Verdict, judge
 
 
 class Comparison(NamedTuple):
@@ -35,6 +36,7 @@ class Judge:
         self.traits: Traits = traits
         self.alike: float = schedule.alike
         self.contrast: float = stack.contrast
+        self.noise: FrameNoise = stack.noise_of_frames
         self.tolerance: Tolerance = Tolerance(schedule.model_errors, schedule.chance, least)
 
     def verdict(self, objective: MyopicObjective, ending: Ending) -> Verdict:
@@ -48,7 +50,8 @@ class Judge:
         error = NO_MODEL_ERROR
         if not self.traits.many_minima:
             error = self._expected_error(objective, state)
-        return judge(chi_square, pixels, self.contrast, error, self.tolerance, at_rest=at_rest)
+        frames = FrameFits(chi_square, pixels, state.calibration.transmission, self.noise)
+        return judge(frames, self.contrast, error, self.tolerance, at_rest=at_rest)
 
     def compare(self, objective: MyopicObjective, now: Ending, rival: Ending | None) -> Comparison:
         """Compare the present ending with the best of the earlier ones, if there is one."""

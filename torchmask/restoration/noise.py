@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,6 +16,36 @@ from torchmask.optics.aperture import Aperture
 from torchmask.optics.noise import noise_variance
 
 _CLEARLY_MORE = 1.1  # times the expected variance, a few times the error of the estimate from one small frame
+
+
+class FrameNoise(NamedTuple):
+    """Noise of single frames, which photons make larger where there is more light.
+
+    level : (T,) mean variance of a frame's pixels, over that of the stack
+    unevenness : (T,) mean square of the variances of a frame's pixels, over the square of their mean
+    """
+
+    level: Tensor
+    unevenness: Tensor
+
+    @classmethod
+    def of(cls, frames: Tensor, variance: float) -> FrameNoise:
+        """Return the noise of frames (T, H, W) [electrons], whose mean variance is known [electrons^2].
+
+        The variance of a pixel is a constant plus its light. That of the light over a frame is the variance of its
+        pixels less their noise.
+        """
+        frames = frames.double()
+        light, mean = frames.mean((1, 2)), float(frames.mean())
+        share = min(1.0, mean / variance)  # of photons in the noise
+        level = 1 + share * (light / mean - 1)
+        spread = (frames.var((1, 2)) - level * variance).clamp(min=0) / mean**2
+        return cls(level, 1 + share**2 * spread / level**2)
+
+    @classmethod
+    def even(cls, n_frames: int) -> FrameNoise:
+        """Return the noise of frames whose residuals are in units of each pixel's own noise."""
+        return cls(torch.ones(n_frames, dtype=torch.float64), torch.ones(n_frames, dtype=torch.float64))
 
 
 def expected_variance(

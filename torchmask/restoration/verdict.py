@@ -6,14 +6,17 @@ import json
 import math
 from dataclasses import asdict, dataclass
 from enum import Enum
-from typing import Any
+from statistics import NormalDist
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
 from torchmask.restoration.model_error import ModelError
+from torchmask.restoration.noise import FrameNoise
 
 _SURE = 5.0  # standard deviations of the noise above which the mean frame shows an object
-_LOST = 2.0  # times the tolerance of the stack is allowed for a single frame
+_LOST = 2.0  # times the minimum tolerance of a stack is allowed for single frames: they end in minima of their own
+_BY_CHANCE = 0.01  # of the good stacks have a frame that is named because of its noise
 
 
 class Finding(Enum):
@@ -110,21 +113,39 @@ class Tolerance:
     least: float = -math.inf
 
 
-def judge(
-    chi_square: Tensor, pixels: Tensor, contrast: float, error: ModelError, tolerance: Tolerance, *, at_rest: bool
-) -> Verdict:
-    """Return the verdict on frames with mean square residuals `chi_square` (T,) over `pixels` (T,) valid pixels.
+class FrameFits(NamedTuple):
+    """How well single frames are fitted, and what their light lets expect.
 
-    Its frames are counted from 0. `contrast` is the chi-square per pixel of the mean frame against a uniform one;
-    `at_rest` says whether the search ran to its end.
+    chi_square : (T,) mean square of the residuals, in units of the stack's noise
+    pixels : (T,) number of valid pixels
+    transmission : (T,) transmission of each frame, 1 on average
+    noise : noise of each frame
     """
-    chi_square, pixels = chi_square.double().cpu(), pixels.double().cpu()
+
+    chi_square: Tensor
+    pixels: Tensor
+    transmission: Tensor
+    noise: FrameNoise
+
+
+def judge(frames: FrameFits, contrast: float, error: ModelError, tolerance: Tolerance, *, at_rest: bool) -> Verdict:
+    """Return the verdict on frames.
+
+    `contrast` is the chi-square per pixel of the mean frame against a uniform one; `at_rest` says whether the search
+    ran to its end. Noise gives a frame the chi-square of its own noise level, whose variance is 2 over the degrees of
+    freedom times `unevenness`; what the model lacks adds in proportion to the square of its transmission.
+    """
+    chi_square, pixels, transmission, level, unevenness = (
+        values.double().cpu() for values in (*frames[:3], *frames.noise)
+    )
     free = (pixels - error.fitted).clamp(min=1)
     total = float(free.sum())
     found = float((chi_square * pixels).sum()) / total
-    expected = max(tolerance.model_errors * error.excess, tolerance.least)
-    limit = 1 + expected + tolerance.chance * math.sqrt(2 / total)
-    each = 1 + _LOST * (expected + tolerance.chance * (2 / free).sqrt())
+    deviation = level * (2 * unevenness / free).sqrt()
+    expected = tolerance.model_errors * error.excess
+    limit = 1 + max(expected, tolerance.least) + tolerance.chance * float((free * deviation).norm()) / total
+    each = level + max(expected, _LOST * tolerance.least) * transmission**2
+    each += NormalDist().inv_cdf(1 - _BY_CHANCE / len(pixels)) * deviation
     lost = tuple((chi_square * pixels / free > each).nonzero().flatten().tolist())
     if contrast - 1 < _SURE * math.sqrt(2 / float(pixels.max())):
         finding = Finding.ONLY_NOISE
