@@ -91,7 +91,11 @@ def test_a_restoration_takes_the_pixels_of_its_star(tmp_path, capsys):
     seen = Observation(seen.frames, TOLD, GRID, 1.0)
     seen.save(tmp_path / "star.npz")
     given = ["restore", str(tmp_path / "star.npz"), "--max-iterations", "2", "--estimate-pixel"]
-    for more, message in (([], "give --star"), (["--star", "x.npz", "--pixel-fill", "1"], "give one of them")):
+    for more, message in (
+        ([], "give --star"),
+        (["--star", "x.npz", "--pixel-fill", "1"], "give one of them"),
+        (["--star", "x.npz", "--jitter", "1"], "does not tell jitter"),
+    ):
         assert main([*given, *more]) == 1
         assert message in capsys.readouterr().err
     main([*given, "--star", str(tmp_path / "star.npz"), "--out", str(tmp_path / "run")])

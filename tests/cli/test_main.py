@@ -81,6 +81,7 @@ UNITS = {
     "exposure_tau0": r"\[tau0",
     "wind": r"\[m/s\]",
     "pixel_fill": "fraction of the area",
+    "jitter": r"\[pixels\]",
     "gain": "[Ee]lectrons per adu",
     "saturation": "in its unit",
     "readout_noise": "[Ee]lectrons rms",

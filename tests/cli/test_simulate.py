@@ -74,6 +74,7 @@ def test_options_are_the_turbulence_that_they_name():
         (["--pixel-scale-arcsec", "0.5"], r"\(0\.5 arcsec\) undersamples .* at most .* \(0\.06\d+ arcsec\)"),
         (["--scene.path", "none.png"], "none.png"),
         (["--pixel-fill", "1.5"], r"--pixel-fill is 1\.5"),
+        (["--jitter", "-1"], r"--jitter is -1\.0"),
         (["--true-mask.magnification", "0"], "--true-mask.magnification is"),
     ],
 )

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from torchmask.optics.pixel import MappedPixel, SquarePixel
+from torchmask.optics.pixel import JitteredPixel, MappedPixel, SquarePixel, jittered, pixel_record, read_pixel
 
 
 def frequencies(rows=12, columns=10):
@@ -55,3 +55,34 @@ def test_a_fill_factor_is_a_part_of_the_pitch(fill):
 def test_a_map_must_be_one(sensitivity, samples):
     with pytest.raises(ValueError, match="sensitivity"):
         MappedPixel(sensitivity, samples)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_jitter_takes_from_a_wave_what_its_mean_over_the_motion_loses(dtype):
+    """The mean of cos(2 pi nu . s) over normal s, on a grid that reaches so far that the rest is below rounding."""
+    rms, nu = 0.4, (0.31, -0.44)
+    places = torch.linspace(-10, 10, 4001, dtype=torch.float64) * rms
+    weights = torch.exp(-(places**2) / (2 * rms**2))
+    mean = 1.0
+    for frequency in nu:
+        mean *= float((weights * torch.cos(2 * math.pi * frequency * places)).sum() / weights.sum())
+    at = [torch.tensor([[value]], dtype=dtype) for value in nu]
+    rounding = 1e-6 if dtype is torch.float32 else 1e-12
+    assert float(JitteredPixel(rms).transfer(*at)) == pytest.approx(mean, rel=rounding)
+    square = float(SquarePixel(0.8).transfer(*at))
+    assert float(JitteredPixel(rms, SquarePixel(0.8)).transfer(*at)) == pytest.approx(mean * square, rel=rounding)
+    assert float(JitteredPixel(0.0).transfer(*at)) == 1
+
+
+@pytest.mark.parametrize("pixel", [None, SquarePixel(0.7)])
+def test_jitter_is_kept_in_files_and_replaced_not_added(pixel):
+    moving = JitteredPixel(0.25, pixel)
+    assert read_pixel(pixel_record(moving)) == moving
+    assert jittered(moving, 0.5) == JitteredPixel(0.5, pixel)
+    assert jittered(moving, 0.0) == pixel
+
+
+@pytest.mark.parametrize("rms", [-0.1, math.nan, math.inf])
+def test_a_jitter_is_a_number_of_pixels(rms):
+    with pytest.raises(ValueError, match="pixels rms"):
+        JitteredPixel(rms)

@@ -49,9 +49,11 @@ def run(options: Options) -> None:
 
 
 def require_one_pixel(options: StackOptions, estimate: bool) -> None:
-    """Raise ValueError if the size of the pixels is both given and to be estimated."""
+    """Raise ValueError if the blur by pixels is both given and to be estimated."""
     if estimate and options.pixel_fill is not None:
         raise ValueError("--pixel-fill says how large pixels are, and --estimate-pixel asks for it: give one of them")
+    if estimate and options.jitter:
+        raise ValueError("--estimate-pixel does not tell jitter from large pixels: give --jitter with --pixel-fill")
 
 
 def calibrate_on(

@@ -30,7 +30,7 @@ from torchmask.optics.band import Band
 from torchmask.optics.detector import Detector
 from torchmask.optics.geometry import MaskGeometry
 from torchmask.optics.passband import Passband
-from torchmask.optics.pixel import square_pixel
+from torchmask.optics.pixel import jittered, square_pixel
 from torchmask.optics.pupil import Aperture
 from torchmask.simulation.conditions import Conditions
 from torchmask.simulation.exposures import simulate_observation
@@ -164,6 +164,8 @@ class Options(InstrumentOptions, MaskOptions, RunOptions):
     """Read-out noise [electrons rms per pixel and frame]."""
     pixel_fill: float = 0.0
     """Sensitive fraction of the area of a pixel, 1 for pixels without gaps; 0: pixels are points."""
+    jitter: float = 0.0
+    """Motion of the image during a frame, as by vibrations: standard deviation along each axis [pixels]."""
     seed: int = 0
     """Random seed of the turbulence and the noise."""
 
@@ -225,7 +227,7 @@ def run(options: Options) -> None:
         grid = Grid(options.n_pixels, finest.pixel_scale, wavelength)
     else:
         grid = Grid(options.n_pixels, pixel_scale, wavelength)
-    detector = Detector(options.readout_noise, pixel=square_pixel(options.pixel_fill))
+    detector = Detector(options.readout_noise, pixel=jittered(square_pixel(options.pixel_fill), options.jitter))
     scene = make_scene(grid.shape, n_photons, options.scene)
     with new_run("simulate", options, options.seed) as output:
         generator = torch.Generator().manual_seed(options.seed)

@@ -15,7 +15,7 @@ from torchmask.data.light import usable_frames
 from torchmask.data.observe import read_observation
 from torchmask.grid import Grid
 from torchmask.observation import Observation, check_frames
-from torchmask.optics.pixel import square_pixel
+from torchmask.optics.pixel import jittered, square_pixel
 from torchmask.restoration.noise import check_errors
 
 
@@ -60,6 +60,9 @@ class StackOptions(MaskOptions, FITSOptions):
     pixel_fill: float | None = None
     """Sensitive fraction of the area of a pixel, 1 for pixels without gaps, 0 for points; None: from the file or its
     instrument, or else points."""
+    jitter: float | None = None
+    """Known motion of the image during a frame, as by vibrations, standard deviation along each axis [pixels]; None:
+    from the file, or else none."""
     skip: tuple[int, ...] = ()
     """Numbers of frames to leave out, counted from 0 through all files of a stack."""
     errors: bool = True
@@ -87,6 +90,8 @@ def read_stack(files: Sequence[Path], options: StackOptions) -> Observation:
     observation = _read(files, options)
     if options.pixel_fill is not None:
         observation = dataclasses.replace(observation, pixel=pixel)
+    if options.jitter is not None:
+        observation = dataclasses.replace(observation, pixel=jittered(observation.pixel, options.jitter))
     numbers = observation.frame_numbers
     try:
         frames, valid = check_frames(observation.frames, observation.valid, observation.grid, numbers)

@@ -98,6 +98,41 @@ class MappedPixel:
         return (torch.arange(size) - (size - 1) / 2) / self.samples
 
 
+@dataclass(frozen=True)
+class JitteredPixel:
+    """Pixels before which the image jitters while a frame lasts, as by vibrations of the telescope.
+
+    Motion that is fast and normally distributed convolves every image with a Gaussian, so that it is a part of the
+    response of the pixels.
+
+    rms : standard deviation of the motion along each axis [pixels]
+    pixel : response of the pixels at rest; None: they are points
+
+    Raises ValueError unless `rms` is finite and not negative.
+
+    Examples
+    --------
+    >>> nu = torch.tensor([0.0, 0.5])
+    >>> round(float(JitteredPixel(0.3).transfer(nu[:, None], nu)[0, 1]), 4)  # exp(-2 pi^2 0.3^2 0.5^2)
+    0.6414
+    """
+
+    rms: float
+    pixel: PixelResponse | None = None
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.rms) and self.rms >= 0):
+            raise ValueError(f"jitter is {self.rms}: it must be finite and at least 0, in pixels rms")
+
+    def __str__(self) -> str:
+        return f"{self.pixel or 'points'}, jitter of {self.rms:.4g} pixels rms"
+
+    def transfer(self, nu_y: Tensor, nu_x: Tensor) -> Tensor:
+        """Return exp(-2 pi^2 rms^2 (nu_y^2 + nu_x^2)) times the transfer function of the pixels at rest."""
+        blur = torch.exp(-2 * (math.pi * self.rms) ** 2 * (nu_y**2 + nu_x**2))
+        return blur if self.pixel is None else blur * self.pixel.transfer(nu_y, nu_x)
+
+
 def square_pixel(fill_factor: float) -> SquarePixel | None:
     """Return square pixels, or None, which means points, for a fill factor of 0. Raises ValueError above 1 or below 0.
 
@@ -109,10 +144,22 @@ def square_pixel(fill_factor: float) -> SquarePixel | None:
     return SquarePixel(fill_factor) if fill_factor else None
 
 
+def jittered(pixel: PixelResponse | None, rms: float) -> PixelResponse | None:
+    """Return pixels with a jitter of `rms` [pixels] in place of what they have; with 0 they are at rest.
+
+    Examples
+    --------
+    >>> print(jittered(SquarePixel(), 0.2), jittered(JitteredPixel(0.3, SquarePixel()), 0.0), sep="; ")
+    square, fill factor 1, jitter of 0.2 pixels rms; square, fill factor 1
+    """
+    at_rest = pixel.pixel if isinstance(pixel, JitteredPixel) else pixel
+    return JitteredPixel(rms, at_rest) if rms else at_rest
+
+
 def pixel_record(pixel: PixelResponse | None) -> dict[str, Any]:
     """Return a pixel response as values for a file, none of them for points.
 
-    Raises ValueError for a response that is neither a `SquarePixel` nor a `MappedPixel`.
+    Raises ValueError for a response that is neither a `SquarePixel` nor a `MappedPixel`, at rest or jittered.
     """
     if pixel is None:
         return {}
@@ -120,11 +167,16 @@ def pixel_record(pixel: PixelResponse | None) -> dict[str, Any]:
         return {"pixel_fill": pixel.fill_factor}
     if isinstance(pixel, MappedPixel):
         return {"pixel_map": pixel.sensitivity, "pixel_samples": pixel.samples}
+    if isinstance(pixel, JitteredPixel):
+        return {"pixel_jitter": pixel.rms} | pixel_record(pixel.pixel)
     raise ValueError(f"a {type(pixel).__name__} cannot be written to a file: give a SquarePixel or a MappedPixel")
 
 
 def read_pixel(record: Mapping[str, Any]) -> PixelResponse | None:
     """Return the pixel response that a `pixel_record` describes. Raises ValueError for numbers out of range."""
+    if "pixel_jitter" in record:
+        at_rest = {name: value for name, value in record.items() if name != "pixel_jitter"}
+        return JitteredPixel(float(record["pixel_jitter"]), read_pixel(at_rest))
     if "pixel_fill" in record:
         return SquarePixel(float(record["pixel_fill"]))
     if "pixel_map" in record:
