@@ -47,8 +47,8 @@ def read_observation(
 ) -> Observation:
     """Read a telescope's exposures from FITS files: cubes (T, H, W) or images, in the order given.
 
-    Options that are not given are read from the header; those that are take precedence. The pixels are points, or those
-    of a known INSTRUME (`torchmask.data.keywords.PIXEL_FILL`). Needs astropy (extra `data`).
+    Options that are not given are read from the header; those that are take precedence. The pixels are points, or
+    squares without gaps if INSTRUME is NIRISS or NIRCAM. Needs astropy (extra `data`).
 
     Parameters
     ----------
