@@ -128,6 +128,12 @@ class Observation(Brief):
         matrix = pixel_matrix(self.header) if self.header else None
         return None if matrix is None else torch.from_numpy(matrix)
 
+    @property
+    def exposure_time(self) -> float | None:
+        """Exposure time of a frame [s], which is XPOSURE in the header; None if it is not known."""
+        time = self.header.get("XPOSURE")
+        return float(time) if isinstance(time, int | float) else None
+
     def take(self, frames: Sequence[int] | np.ndarray) -> Observation:
         """Return the observation reduced to frames at these positions, from 0; `frame_numbers` keeps their numbers."""
         chosen = torch.as_tensor(np.asarray(frames, dtype=np.int64), device=self.frames.device)

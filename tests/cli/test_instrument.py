@@ -9,13 +9,14 @@ import pytest
 import torch
 import yaml
 
-from torchmask.cli import design, plan, rank
+from torchmask.cli import design, plan, rank, restore
 from torchmask.cli.main import main
 from torchmask.cli.options import MaskOptions, load_aperture
 from torchmask.cli.program import parse
+from torchmask.cli.stacks import StackOptions, read_stack
 from torchmask.design.manufacture import load_mask, mask_wavelength, save_json
 from torchmask.design.observed import instrument_criterion
-from torchmask.grid import ARCSEC
+from torchmask.grid import ARCSEC, Grid
 from torchmask.instrument.instrument import Instrument
 from torchmask.instrument.parts import Camera, Site, Source, Telescope
 from torchmask.observation import Observation
@@ -65,6 +66,83 @@ def test_frames_are_simulated_as_the_instrument_takes_them(folder, capsys):
     again = ["simulate", "--config", str(folder / "run/config.yaml"), "--out", str(folder / "again")]
     assert main(again) == 0
     assert Observation.load(folder / "again/stack.npz").frames.equal(stack.frames)
+
+
+def stack_of(folder, **changes):
+    """Frames as the instrument takes them, in a file, but for some changes."""
+    generator = torch.Generator().manual_seed(0)
+    frames = 50 + 5 * torch.rand(2, 32, 32, dtype=torch.float64, generator=generator)
+    frames[:, 12:20, 12:20] += 1000
+    seen = Observation(frames, MASK, KNOWN.grid(32), 2.5, pixel=KNOWN.camera.pixel, header={"XPOSURE": 3e-3})
+    dataclasses.replace(seen, **changes).save(folder / "stack.npz")
+    return [folder / "stack.npz"]
+
+
+def test_an_instrument_fills_in_what_a_stack_lacks_and_what_is_given_wins(folder):
+    told = {"instrument": folder / "instrument.json"}
+    bare = read_stack(stack_of(folder, readout_noise=None, pixel=None), StackOptions(**told))
+    assert (bare.readout_noise, bare.pixel) == (2.5, SquarePixel(0.9))
+    (folder / "stack.npz").unlink()
+    other = {"readout_noise": 4.0, "pixel": SquarePixel(0.5), "grid": Grid(32, KNOWN.pixel_scale, 550e-9)}
+    files = stack_of(folder, **other)
+    with pytest.raises(
+        ValueError, match=r"wavelength \(5.5e-07 against 7e-07 m\) and --readout-noise \(4 against 2.5 "
+    ) as told_all:
+        read_stack(files, StackOptions(**told))
+    assert "and --pixel-fill (0.5 against 0.9 of the area): give these options" in str(told_all.value)
+    given = StackOptions(**told, wavelength=550e-9, readout_noise=4.0, pixel_fill=0.5, exposure_time=0.01)
+    seen = read_stack(files, given)
+    assert (seen.readout_noise, seen.pixel, seen.grid.wavelength) == (4.0, SquarePixel(0.5), 550e-9)
+    assert seen.exposure_time == 0.01
+    with pytest.raises(ValueError, match="--exposure-time is -1"):
+        read_stack(files, StackOptions(exposure_time=-1.0))
+
+
+def test_headers_without_grid_are_completed(folder, write_fits, fits_cube):
+    files = [write_fits("bare.fits", fits_cube, WAVELEN=None, PIXELSCL=None)]
+    camera = dataclasses.replace(KNOWN.camera, pixel_scale=0.03)
+    dataclasses.replace(KNOWN, camera=camera).save(folder / "scaled.json")
+    seen = read_stack(
+        files, StackOptions(mask=folder / "mask.json", instrument=folder / "scaled.json", readout_noise=1.0)
+    )
+    assert (seen.grid.wavelength, seen.pixel) == (700e-9, SquarePixel(0.9))
+    assert seen.grid.pixel_scale == pytest.approx(0.03 * ARCSEC, rel=1e-12)
+
+
+def test_a_restoration_is_told_band_pixels_noise_and_motion_of_an_instrument(folder):
+    told = dataclasses.replace(restore.Options.of_instrument(KNOWN), instrument=folder / "instrument.json")
+    seen = read_stack(stack_of(folder), told)
+    method = restore.deconvolution(seen, told)
+    tau0 = KNOWN.seeing.tau0
+    assert method.recipe.band == KNOWN.band
+    assert (method.recipe.pixel, method.readout_noise, method.known_r0) == (SquarePixel(0.9), 2.5, False)
+    assert method.recipe.exposure_tau0 == pytest.approx(3e-3 / tau0, rel=1e-12)
+    faster = dataclasses.replace(told, wind=10.0, r0=0.15)
+    assert restore.motion(seen, faster) == pytest.approx(3e-3 * 10.0 / (0.314 * 0.15), rel=1e-3)
+    assert restore.motion(dataclasses.replace(seen, aperture=FullAperture(1.2)), told) == 0
+    assert restore.motion(seen, dataclasses.replace(told, prior=False)) == 0
+    assert restore.motion(seen, restore.Options(r0=0.1)) == 0
+    slow = dataclasses.replace(seen, header={"XPOSURE": 0.02})
+    with pytest.raises(ValueError, match=r"disagree on --exposure-time \(0.02 against 0.003 s\): give it"):
+        restore.motion(slow, told)
+    assert restore.motion(slow, dataclasses.replace(told, exposure_time=0.02)) == pytest.approx(0.02 / tau0, rel=1e-12)
+    for options, message in (
+        (restore.Options(wind=5.0), r"needs --r0 too \[m\]"),
+        (restore.Options(wind=5.0, r0=0.1), r"needs --exposure-time too \[s\]"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            restore.motion(dataclasses.replace(seen, header={}), options)
+    with pytest.raises(ValueError, match="--wind is for masks"):
+        restore.motion(dataclasses.replace(seen, aperture=FullAperture(1.2)), restore.Options(wind=5.0, r0=0.1))
+
+
+def test_a_restoration_is_not_told_the_turbulence_of_a_simulated_stack(folder):
+    seen = read_stack(stack_of(folder, r0=0.2, outer_scale=7.0), StackOptions())
+    method = restore.deconvolution(seen, restore.Options())
+    assert not method.known_r0
+    assert method.recipe.outer_scale == 20 * MASK.mask_diameter
+    told = restore.deconvolution(seen, restore.Options(r0=0.2, outer_scale=7.0))
+    assert (told.known_r0, told.recipe.r0, told.recipe.outer_scale) == (True, 0.2, 7.0)
 
 
 def test_a_full_pupil_is_that_of_the_telescope(folder, capsys):

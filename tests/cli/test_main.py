@@ -78,7 +78,6 @@ UNITS = {
     "most_arcsec": r"\[arcsec\]",
     "exposure_time": r"\[s\]",
     "crop": r"\[pixels\]",
-    "exposure_tau0": r"\[tau0",
     "wind": r"\[m/s\]",
     "pixel_fill": "fraction of the area",
     "jitter": r"\[pixels\]",

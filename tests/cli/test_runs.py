@@ -212,7 +212,7 @@ def test_errors_of_a_cube_and_the_sky_are_those_of_the_library_call(runs, cube, 
     wrong = ["restore", tmp_path / "wrong.fits", *known]
     refused(wrong, tmp_path, capsys, r"wrong.fits: errors is not positive at 1 valid .* \(1, 2, 3\).* --no-errors")
     refused([*wrong, "--no-errors", "--sky", "-1"], tmp_path, capsys, "--sky is -1: it must be finite and at least 0")
-    refused([*wrong, "--no-errors", "--exposure-tau0", "-1"], tmp_path, capsys, "exposure-tau0 is -1.*units of tau0")
+    refused([*wrong, "--no-errors", "--wind", "9"], tmp_path, capsys, "for how long needs --exposure-time too")
 
 
 def test_every_assumption_about_the_sky_has_its_word():

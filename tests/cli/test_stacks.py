@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchmask.cli.options import BandOptions
+from torchmask.cli.band_options import BandOptions
 from torchmask.cli.stacks import StackOptions, group_files, read_stack
 from torchmask.design.manufacture import save_json
 from torchmask.grid import Grid

@@ -13,6 +13,7 @@ from torchmask.cli.options import RunOptions
 from torchmask.cli.run import Run, new_run
 from torchmask.cli.stacks import StackOptions, read_stack
 from torchmask.design.manufacture import save_json
+from torchmask.instrument.instrument import Instrument
 from torchmask.interferometry.calibration import MaskCalibration, calibrate_mask
 from torchmask.io import write_json
 from torchmask.observation import Observation
@@ -35,6 +36,11 @@ class Options(StackOptions, RunOptions):
     """Estimate the sensitive fraction of a pixel too; exposures must be short, as motion looks like larger pixels."""
     n_modes: int = 6
     """Number of Zernike modes per hole and frame, from Noll mode 1 (piston)."""
+
+    @classmethod
+    def of_instrument(cls, known: Instrument) -> Options:
+        """Return the options that an instrument sets: none, as it completes what the exposures say."""
+        return cls()
 
 
 def run(options: Options) -> None:

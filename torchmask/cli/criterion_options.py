@@ -6,7 +6,8 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Self
 
-from torchmask.cli.options import DEFAULT_PHOTONS, BandOptions, InstrumentOptions, pixel_angle
+from torchmask.cli.band_options import BandOptions, band_of_instrument
+from torchmask.cli.options import DEFAULT_PHOTONS, InstrumentOptions, pixel_angle
 from torchmask.design.conditions import ExposureConditions
 from torchmask.design.criterion import AsymptoticMSE
 from torchmask.design.turbulent import TurbulentMSE
@@ -46,7 +47,8 @@ class ExposureOptions(BandOptions, InstrumentOptions):
             return None
         sky = self.sky
         if sky is None:
-            sky = 0.0 if self.instrument is None else Instrument.load(self.instrument).sky(area)
+            known = self.known_instrument()
+            sky = 0.0 if known is None else known.sky(area)
         speeds = tuple(self.wind)
         return ExposureConditions(
             exposure=self.exposure_time,
@@ -71,16 +73,10 @@ class ExposureOptions(BandOptions, InstrumentOptions):
 
 def exposure_options(known: Instrument) -> dict[str, Any]:
     """Return the values of `ExposureOptions` that an instrument gives; its sky depends on the collecting area."""
-    band, filtered = known.band, known.filter is not None
-    return {
+    return band_of_instrument(known) | {
         "criterion": "turbulent",
         "exposure_time": known.exposure,
         "wind": (known.site.wind,),
-        "filter": known.filter,
-        "temperature": known.source.temperature if filtered else None,
-        "n_wavelengths": known.n_wavelengths,
-        "wavelengths": () if filtered else band.wavelengths,
-        "weights": () if filtered else band.shares,
         "pixel_fill": known.camera.pixel_fill,
     }
 
@@ -174,7 +170,8 @@ class ObservationOptions(CriterionOptions):
         area = math.pi / 4 * fill_factor * self.mask_diameter**2
         photons = self.n_photons
         if photons is None:
-            photons = DEFAULT_PHOTONS if self.instrument is None else Instrument.load(self.instrument).photons(area)
+            known = self.known_instrument()
+            photons = DEFAULT_PHOTONS if known is None else known.photons(area)
         turbulence = self.turbulence(self.wavelength, area)
         return Observed(
             self._grid(n_frequencies, turbulence),

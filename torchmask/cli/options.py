@@ -11,12 +11,11 @@ import tyro
 
 from torchmask.design.manufacture import load_mask, mask_wavelength
 from torchmask.grid import ARCSEC
+from torchmask.instrument.instrument import Instrument
 from torchmask.instrument.parts import Telescope
 from torchmask.optics import catalog
 from torchmask.optics.aperture import Aperture, FullAperture, SparseAperture
-from torchmask.optics.band import Band
 from torchmask.optics.overlaps import check_overlaps
-from torchmask.optics.passband import Passband
 from torchmask.record import Callback
 
 DEFAULT_PHOTONS = 1e7  # per frame, if neither an option nor an instrument says it
@@ -46,6 +45,10 @@ class InstrumentOptions:
 
     instrument: Path | None = None
     """An instrument.json of `torchmask plan`, or a YAML file with its keys; used for all options not given here."""
+
+    def known_instrument(self) -> Instrument | None:
+        """Return the instrument of the file, None without one."""
+        return None if self.instrument is None else Instrument.load(self.instrument)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,55 +107,6 @@ def pixel_angle(arcsec: float | None) -> float | None:
     if not (math.isfinite(arcsec) and arcsec > 0):
         raise ValueError(f"--pixel-scale-arcsec is {arcsec:g}: it must be finite and positive, in arcsec")
     return arcsec * ARCSEC
-
-
-@dataclass(frozen=True, kw_only=True)
-class FilterOptions:
-    """A broad band, given by a filter."""
-
-    filter: str | None = None
-    """Filter: its name (bessell-V, twomass-Ks, ...), or a text file with columns wavelength [m] and transmission."""
-    n_wavelengths: int = 5
-    """Number of wavelengths that represent the band: 3 suffice for a width of 5 percent of the wavelength, 5 for 15."""
-    temperature: float | None = None
-    """Temperature of the source's black-body spectrum inside the filter [K]; None: equally many photons at each
-    wavelength."""
-
-    def filter_band(self, wavelength: float) -> Band | None:
-        """Return the band of the filter, None without one. Raises ValueError if it does not pass `wavelength` [m]."""
-        if self.filter is None:
-            return None
-        passband = Passband.find(self.filter)
-        first, last = passband.wavelengths[0], passband.wavelengths[-1]
-        if not first < wavelength < last:
-            raise ValueError(
-                f"filter {self.filter} passes {first:.4g} to {last:.4g} m, and not the wavelength {wavelength:.4g} m, "
-                f"at which r0 is quoted: give one in between, such as its mean, {passband.mean_wavelength:.4g} m"
-            )
-        return Band.from_filter(passband, self.n_wavelengths, self.temperature)
-
-
-@dataclass(frozen=True, kw_only=True)
-class BandOptions(FilterOptions):
-    """A broad band, given by a filter or by wavelengths."""
-
-    wavelengths: tuple[float, ...] = ()
-    """Wavelengths that represent a broad band, instead of a filter [m]; none: --filter, or --wavelength alone."""
-    weights: tuple[float, ...] = ()
-    """Relative amount of light at each of --wavelengths, any positive numbers; none: equal amounts."""
-
-    def band(self, wavelength: float) -> dict[str, Any]:
-        """Return the band as `MyopicDeconvolution` takes it. Raises ValueError for two bands or another filter."""
-        if self.weights and not self.wavelengths:
-            raise ValueError("--weights are those of --wavelengths: give both")
-        band = self.filter_band(wavelength)
-        if band is None:
-            if self.temperature is not None:
-                raise ValueError("--temperature is that of light through --filter: give one, or leave it out")
-            return {"wavelengths": self.wavelengths or None, "weights": self.weights or None}
-        if self.wavelengths or self.weights:
-            raise ValueError("--filter and --wavelengths are both given: give only one of them")
-        return {"wavelengths": band.wavelengths, "weights": band.shares}
 
 
 @dataclass(frozen=True)

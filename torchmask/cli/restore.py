@@ -13,14 +13,17 @@ from typing import Any, Literal
 import tyro
 
 from torchmask import __version__
+from torchmask.cli.agreement import exposure_in_tau0
+from torchmask.cli.band_options import BandOptions, band_of_instrument
 from torchmask.cli.calibrate import read_star, require_one_pixel, write_calibration
 from torchmask.cli.config import stored
 from torchmask.cli.oifits import OIFITSOptions, measure_frames, write_frames
-from torchmask.cli.options import BandOptions, RunOptions, WorkerOptions
+from torchmask.cli.options import RunOptions, WorkerOptions
 from torchmask.cli.outcome import log_outcome, pixel_text, summarise_outcome, write_outcome
 from torchmask.cli.program import NOT_EXPLAINED
 from torchmask.cli.run import CHECKPOINT, new_run
 from torchmask.cli.stacks import StackOptions, group_files, read_stack
+from torchmask.instrument.instrument import Instrument
 from torchmask.interferometry.calibration import MaskCalibration
 from torchmask.interferometry.observables import Observables
 from torchmask.io import new_folder, write_json
@@ -56,9 +59,9 @@ class Options(BandOptions, StackOptions, OIFITSOptions, WorkerOptions, RunOption
     join: tyro.conf.FlagCreatePairsOff[bool] = False
     """Treat all FITS files together as one stack."""
     r0: float | None = None
-    """Fried parameter of the turbulence at the wavelength [m]; None: that of a simulated stack, or else estimated."""
+    """Fried parameter of the turbulence at the wavelength [m]; None: estimated."""
     outer_scale: float | None = None
-    """Outer scale of the turbulence [m]; None: that of a simulated stack, or else 20 mask diameters."""
+    """Outer scale of the turbulence [m]; None: 20 mask diameters."""
     n_modes: int | None = None
     """Number of Zernike modes per hole, from Noll mode 1 (piston); None: 6, more at the end, or 231 for a full
     pupil."""
@@ -67,8 +70,9 @@ class Options(BandOptions, StackOptions, OIFITSOptions, WorkerOptions, RunOption
     sky: float | Literal["if-seen", "per-frame", "common", "none"] = "if-seen"
     """Known sky [electrons per pixel]; or per-frame to fit a constant in each frame, common to fit one for all frames,
     if-seen: per-frame if the frames show a sky."""
-    exposure_tau0: float = 0.0
-    """Exposure time of a frame [tau0 = 0.314 r0 / wind], during which the model lets holes move; 0: snapshots."""
+    wind: float | None = None
+    """Speed of the wind [m/s]; with --r0 and the exposure time it says how much turbulence changes during a frame, for
+    which the model then allows; None: that of --instrument, or else frames are snapshots."""
     star: Path | None = None
     """Exposures of a star through the same mask, .npz or .fits, which give its geometry (`torchmask calibrate`)."""
     estimate_pixel: tyro.conf.FlagCreatePairsOff[bool] = False
@@ -89,6 +93,11 @@ class Options(BandOptions, StackOptions, OIFITSOptions, WorkerOptions, RunOption
     resume: Path | None = None
     """Folder of an interrupted run, which is continued with its options from its last checkpoint (every 100 iterations
     have one)."""
+
+    @classmethod
+    def of_instrument(cls, known: Instrument) -> Options:
+        """Return the options that an instrument sets: its band. It completes what the exposures say."""
+        return cls(**band_of_instrument(known))
 
     @staticmethod
     def from_v01(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -218,20 +227,31 @@ def deconvolution(observation: Observation, options: Options) -> MyopicDeconvolu
         observation.aperture,
         observation.grid,
         options.n_modes,
-        r0=observation.r0 if options.r0 is None else options.r0,
-        outer_scale=observation.outer_scale if options.outer_scale is None else options.outer_scale,
+        r0=options.r0,
+        outer_scale=options.outer_scale,
         readout_noise=observation.readout_noise,
         background=SKIES[options.sky] if isinstance(options.sky, str) else known_sky(options),
         **options.band(observation.grid.wavelength),
         static_modes=options.static_modes,
         pixel=observation.pixel,
-        exposure_tau0=options.exposure_tau0,
+        exposure_tau0=motion(observation, options),
         refine_geometry=REFINEMENTS[options.refine_geometry],
         prior=TotalVariation(options.tv_weight),
         aberration_prior=options.prior,
         max_iterations=options.max_iterations,
         tolerance=options.tolerance,
     )
+
+
+def motion(observation: Observation, options: Options) -> float:
+    """Return the exposure time of a frame [tau0]; 0 where an instrument tells a wind, but the model has no motion."""
+    has_motion = options.prior and not observation.aperture.is_full
+    if options.wind is None and not has_motion:
+        return 0.0
+    if options.wind is not None and observation.aperture.is_full:
+        raise ValueError("--wind is for masks: the model of a full pupil does not move during a frame, leave it out")
+    known = options.known_instrument()
+    return exposure_in_tau0(observation, known, options.exposure_time, options.wind, options.r0)
 
 
 def known_sky(options: Options) -> float:

@@ -10,9 +10,9 @@ import torch
 from torchmask.atmosphere.layers import Layers
 from torchmask.atmosphere.phase import LayeredPhase, TurbulencePhase
 from torchmask.atmosphere.profiles import named_layers
+from torchmask.cli.band_options import FilterOptions
 from torchmask.cli.options import (
     DEFAULT_PHOTONS,
-    FilterOptions,
     InstrumentOptions,
     MaskOptions,
     RunOptions,
@@ -209,7 +209,7 @@ def observing_wavelength(options: Options) -> float:
 
 def run(options: Options) -> None:
     """Simulate, and write the stack."""
-    known = None if options.instrument is None else Instrument.load(options.instrument)
+    known = options.known_instrument()
     told = load_aperture(options, None if known is None else known.telescope)
     true = options.true_mask.apply(told)
     aperture = true or told

@@ -10,10 +10,19 @@ from typing import Any, Literal
 
 import torch
 
-from torchmask.cli.options import MaskOptions, load_aperture, pixel_angle, require_wavelength, told_wavelength
+from torchmask.cli.agreement import complete, planned_scale, require_time
+from torchmask.cli.options import (
+    InstrumentOptions,
+    MaskOptions,
+    load_aperture,
+    pixel_angle,
+    require_wavelength,
+    told_wavelength,
+)
 from torchmask.data.light import usable_frames
 from torchmask.data.observe import read_observation
 from torchmask.grid import Grid
+from torchmask.instrument.instrument import Instrument
 from torchmask.observation import Observation, check_frames
 from torchmask.optics.pixel import jittered, square_pixel
 from torchmask.restoration.noise import check_errors
@@ -27,8 +36,6 @@ class FITSOptions:
     """Unit of the pixels, such as "adu", "electron / s" or "250 electron"; None: from the header (BUNIT), else adu."""
     gain: float | None = None
     """Gain [electrons per adu]; None: from the header (EGAIN, GAIN)."""
-    exposure_time: float | None = None
-    """Exposure time of one frame [s], for units per second; None: from the header."""
     saturation: float | None = None
     """Value in the file, in its unit, at which pixels saturate; None: from the header (SATURATE, FULLWELL)."""
     dark: Path | None = None
@@ -48,18 +55,21 @@ class FITSOptions:
 
 
 @dataclass(frozen=True)
-class StackOptions(MaskOptions, FITSOptions):
+class StackOptions(InstrumentOptions, MaskOptions, FITSOptions):
     """Options that override what the files say."""
 
     wavelength: float | None = None
-    """Wavelength of the observation [m]; None: from the file, or else from the mask's .json file."""
+    """Wavelength of the observation [m]; None: from the file, or else from --instrument or the mask's .json file."""
     pixel_scale_arcsec: float | None = None
-    """Angle on the sky of one pixel [arcsec]; None: from the file."""
+    """Angle on the sky of one pixel [arcsec]; None: from the file, or else from --instrument."""
+    exposure_time: float | None = None
+    """Exposure time of one frame [s]; None: from the file, or else from --instrument."""
     readout_noise: float | None = None
-    """Read-out noise [electrons rms per pixel and frame]; None: from the file, or else measured on the frames."""
+    """Read-out noise [electrons rms per pixel and frame]; None: from the file or --instrument, or else measured on the
+    frames."""
     pixel_fill: float | None = None
-    """Sensitive fraction of the area of a pixel, 1 for pixels without gaps, 0 for points; None: from the file or its
-    instrument, or else points."""
+    """Sensitive fraction of the area of a pixel, 1 for pixels without gaps, 0 for points; None: from the file or
+    --instrument, or else points."""
     jitter: float | None = None
     """Known motion of the image during a frame, as by vibrations, standard deviation along each axis [pixels]; None:
     from the file, or else none."""
@@ -87,9 +97,12 @@ def read_stack(files: Sequence[Path], options: StackOptions) -> Observation:
     if options.wavelength is not None:
         require_wavelength(options.wavelength)
     pixel = None if options.pixel_fill is None else square_pixel(options.pixel_fill)
-    observation = _read(files, options)
+    known = options.known_instrument()
+    observation = _read(files, options, known)
     if options.pixel_fill is not None:
         observation = dataclasses.replace(observation, pixel=pixel)
+    if known is not None:
+        observation = complete(observation, known, _given(options), files[0])
     if options.jitter is not None:
         observation = dataclasses.replace(observation, pixel=jittered(observation.pixel, options.jitter))
     numbers = observation.frame_numbers
@@ -106,9 +119,15 @@ def read_stack(files: Sequence[Path], options: StackOptions) -> Observation:
     return observation
 
 
-def _read(files: Sequence[Path], options: StackOptions) -> Observation:
+def _given(options: StackOptions) -> set[str]:
+    """Return the names of the options that have a value."""
+    return {item.name for item in dataclasses.fields(options) if getattr(options, item.name) is not None}
+
+
+def _read(files: Sequence[Path], options: StackOptions, known: Instrument | None) -> Observation:
+    telescope = None if known is None else known.telescope
     if files[0].suffix.lower() != ".npz":
-        return _from_fits(files, options)
+        return _from_fits(files, options, known)
     if len(files) > 1:
         raise ValueError(f"--join is for FITS files, but {files[0]} is a stack by itself: leave it out")
     _refuse(options, FITSOptions, f"is for FITS files, but {files[0]} is not one: leave it out")
@@ -120,7 +139,10 @@ def _read(files: Sequence[Path], options: StackOptions) -> Observation:
         "grid": Grid(grid.n_pixels, scale or grid.pixel_scale, options.wavelength or grid.wavelength)
     }
     if options.mask is not None:
-        changes["aperture"] = load_aperture(options)
+        changes["aperture"] = load_aperture(options, telescope)
+    if options.exposure_time is not None:
+        require_time(options.exposure_time)
+        changes["header"] = {**observation.header, "XPOSURE": options.exposure_time}
     if options.readout_noise is not None:
         changes["readout_noise"] = options.readout_noise
     return _usable(dataclasses.replace(observation, **changes), files[0], options)
@@ -144,13 +166,15 @@ def _usable(observation: Observation, path: Path, options: StackOptions) -> Obse
         raise ValueError(f"{path}: {error}") from error
 
 
-def _from_fits(files: Sequence[Path], options: StackOptions) -> Observation:
+def _from_fits(files: Sequence[Path], options: StackOptions, known: Instrument | None) -> Observation:
     """Read FITS files. Raises ValueError as `read_observation`, but asks for a missing pixel scale in arcsec."""
-    aperture = load_aperture(options)
+    aperture = load_aperture(options, None if known is None else known.telescope)
     scale = pixel_angle(options.pixel_scale_arcsec)
     given = {item.name: getattr(options, item.name) for item in dataclasses.fields(FITSOptions)}
     given |= {"wavelength": options.wavelength, "readout_noise": options.readout_noise}
-    given |= {"skip": options.skip, "design_wavelength": told_wavelength(options)}
+    given |= {"skip": options.skip, "exposure_time": options.exposure_time}
+    given["design_wavelength"] = told_wavelength(options) if known is None else known.mean_wavelength
+    given["design_pixel_scale"] = None if known is None else planned_scale(known)
     try:
         return read_observation(files, aperture, pixel_scale=scale, **given)
     except ValueError as error:

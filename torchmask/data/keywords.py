@@ -46,10 +46,12 @@ def number(header: Any, names: tuple[str, ...], path: Any) -> float | None:
     return None
 
 
-def pixel_scale(header: Any, path: Any, given: float | None) -> float:
+def pixel_scale(header: Any, path: Any, given: float | None, fallback: float | None = None) -> float:
     """Return the pixel scale [rad]: PIXELSCL or PIXSCALE [arcsec], else the square root of a pixel's area by the WCS.
 
-    Raises ValueError if the header gives none, or if pixels differ from squares by more than 2 %.
+    Without either it is `fallback`.
+
+    Raises ValueError if that is None too, or if pixels differ from squares by more than 2 %.
     """
     if given is not None:
         return given
@@ -57,6 +59,8 @@ def pixel_scale(header: Any, path: Any, given: float | None) -> float:
     if arcsec:
         return arcsec * ARCSEC
     matrix = pixel_matrix(header)
+    if matrix is None and fallback is not None:
+        return fallback
     if matrix is None:
         raise missing(path, "PIXELSCL, CDELT or CD matrix in an angle", "pixel_scale [rad]")
     sides = np.linalg.norm(matrix, axis=0)

@@ -31,6 +31,7 @@ def read_observation(
     wavelength: float | None = None,
     design_wavelength: float | None = None,
     pixel_scale: float | None = None,
+    design_pixel_scale: float | None = None,
     unit: str | None = None,
     gain: float | None = None,
     exposure_time: float | None = None,
@@ -65,6 +66,8 @@ def read_observation(
         Wavelength for which the mask was designed [m], used if there is no other.
     pixel_scale : float, optional
         Angle of a pixel [rad]. Header: PIXELSCL [arcsec], or CD, PC or CDELT.
+    design_pixel_scale : float, optional
+        Angle of a pixel for which the instrument was planned [rad], used if there is no other.
     unit : str, optional
         Unit of the pixels, such as "adu", "electron / s" or "250 electron". Header: BUNIT; without it the pixels
         are in adu, and a gain is needed.
@@ -115,7 +118,7 @@ def read_observation(
     >>> observation.frames.shape, observation.readout_noise
     (torch.Size([5, 32, 32]), 1.5)
     """
-    positive = (wavelength, design_wavelength, pixel_scale, gain, exposure_time, saturation)
+    positive = (wavelength, design_wavelength, pixel_scale, design_pixel_scale, gain, exposure_time, saturation)
     _check_options(positive, readout_noise, crop, keep, keep_by)
     if target is not None and crop is None:
         raise ValueError(f"target is {target}, but there is no field to cut out around it: give crop [pixels] too")
@@ -124,7 +127,7 @@ def read_observation(
         raise ValueError("paths is empty: give at least one FITS file")
     files, numbers, skip = opened_files(files, skip)
     lengths = [keywords.wavelength(file.header, file.path, wavelength, design_wavelength) for file in files]
-    scales = [keywords.pixel_scale(file.header, file.path, pixel_scale) for file in files]
+    scales = [keywords.pixel_scale(file.header, file.path, pixel_scale, design_pixel_scale) for file in files]
     _check_alike(files, lengths, scales)
     options = (unit, gain, exposure_time)
     factors = [keywords.electrons_per_unit(f.header, f.path, f.is_cube, *options) for f in files]
@@ -188,6 +191,7 @@ _POSITIVE = {
     "wavelength": "m",
     "design_wavelength": "m",
     "pixel_scale": "rad",
+    "design_pixel_scale": "rad",
     "gain": "electrons per adu",
     "exposure_time": "s",
     "saturation": "the unit of the file",

@@ -171,6 +171,7 @@ def simulate_observation(
         transmission=transmission,
         true_aperture=None if told is None else aperture.still(),
         pixel=detector.pixel,
+        header={"XPOSURE": conditions.exposure_time} if conditions.exposure_time else {},
     )
 
 
