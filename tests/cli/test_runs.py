@@ -142,9 +142,7 @@ def test_simulate_takes_its_units_as_they_are_called(runs, tmp_path):
 def test_restore_is_the_library_call_and_says_how_well_it_fits(runs):
     folder = runs / "restore"
     observation = Observation.load(runs / "simulate/stack.npz")
-    method = MyopicDeconvolution(
-        observation.aperture, observation.grid, r0=0.3, outer_scale=20.0, readout_noise=1.5, max_iterations=12
-    )
+    method = MyopicDeconvolution(observation.aperture, observation.grid, readout_noise=1.5, max_iterations=12)
     expected = method.restore(observation.frames)
     found = RestorationResult.load(folder / "restored.npz")
     torch.testing.assert_close(found.object, expected.object, rtol=0, atol=0)
@@ -163,7 +161,7 @@ def test_a_fits_cube_restores_to_the_same_image_with_its_sky(runs, cube, tmp_pat
     """A cube that says nothing of mask, wavelength and scale: the options stand for its header."""
     scale = Grid.nyquist(1.0, 1e-6, 32).pixel_scale / ARCSEC
     given = ["--mask", runs / "design/mask.json", "--wavelength", "1e-6", "--pixel-scale-arcsec", repr(scale)]
-    known = ["--r0", "0.3", "--outer-scale", "20", "--readout-noise", "1.5", "--max-iterations", "12"]
+    known = ["--readout-noise", "1.5", "--max-iterations", "12"]
     run("restore", cube, *given, *known, "--out", tmp_path / "restore")
     found = RestorationResult.load(tmp_path / "restore/restored.npz").object
     expected = RestorationResult.load(runs / "restore/restored.npz").object
@@ -498,9 +496,7 @@ def test_several_stacks_are_restored_each_as_by_itself_and_one_failure_harms_no_
     alone = RestorationResult.load(runs / "restore/restored.npz")
     assert torch.equal(RestorationResult.load(several / "stack/restored.npz").object, alone.object)
     other = Observation.load(runs / "other/stack.npz")
-    method = MyopicDeconvolution(
-        other.aperture, other.grid, r0=0.3, outer_scale=20.0, readout_noise=1.5, max_iterations=12
-    )
+    method = MyopicDeconvolution(other.aperture, other.grid, readout_noise=1.5, max_iterations=12)
     found = RestorationResult.load(several / "stack-2/restored.npz")
     assert torch.equal(found.object, method.restore(other.frames).object)
     with fits.open(several / "stack-2/restored.fits") as content:
