@@ -55,7 +55,7 @@ def test_frames_are_simulated_as_the_instrument_takes_them(folder, capsys):
     assert (stack.grid.wavelength, stack.readout_noise, stack.outer_scale) == (700e-9, 2.5, 30.0)
     assert stack.grid.pixel_scale == pytest.approx(KNOWN.pixel_scale, rel=1e-12)
     assert stack.background == pytest.approx(KNOWN.sky(float(MASK.area)), rel=1e-12)
-    assert stack.pixel == KNOWN.camera.pixel == SquarePixel(0.9)
+    assert (stack.pixel, stack.exposure_time) == (SquarePixel(0.9), 3e-3)
     assert stack.r0 == pytest.approx(0.2)  # given beside it
     assert f"{KNOWN.photons(float(MASK.area)):.4g} photons in each" in capsys.readouterr().out
     config = yaml.safe_load((folder / "run/config.yaml").read_text())
