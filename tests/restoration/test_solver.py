@@ -109,7 +109,7 @@ def test_a_plain_course_is_one_cost_lowered_and_nothing_else(many_minima, segmen
 @pytest.mark.parametrize("max_iterations", [1, 3, 6, 7, 13, 18, 40])
 def test_iterations_are_those_of_all_starts(max_iterations, explained):
     """Four starts of six at most; the third and fourth are cut short, or do not begin."""
-    schedule = Schedule(start_iterations=6, alike=-1.0, last_iterations=0, **ALL_MISSED, **BRISK)
+    schedule = Schedule(start_iterations=6, starts=4, alike=-1.0, last_iterations=0, **ALL_MISSED, **BRISK)
     records: list[Record] = []
     solver = solver_of(explained[0], records.append, schedule=schedule, max_iterations=max_iterations)
     progress = solver.solve(Known())
@@ -179,9 +179,9 @@ def test_the_better_of_two_starts_is_kept(rival_is_better, explained):
     now, before = (poor, truth) if rival_is_better else (truth, poor)
     solver = solver_of(objective, schedule=Schedule(start_iterations=1, **BRISK | {"sharp_after": 0}))
     rival = Ending(before, Status.CONVERGED, 1e-9)
-    begun = Progress(Candidates(now, 1), [1.0], starts=4, began=1, rival=rival)
+    begun = Progress(Candidates(now, 1), [1.0], starts=solver.schedule.starts, began=1, rival=rival)
     progress = solver.run(begun, True, lambda _: None)
-    assert progress.starts == 4  # that was the last one
+    assert progress.starts == solver.schedule.starts  # that was the last one
     assert not progress.alike
     if rival_is_better:
         assert progress.state is truth

@@ -29,6 +29,7 @@ class Status(Enum):
 
     RUNNING = "running"
     CONVERGED = "converged"
+    GIVEN_UP = "it was far from the fit of an earlier start"
     START_LIMIT = "the iterations of a start were spent"
     ITERATION_LIMIT = "max_iterations was reached"
 
@@ -111,6 +112,12 @@ class Progress:
                 callback(Record(stage, next(steps), n_steps, {"cost": cost}, {}))
 
         return listen
+
+    def start_again(self, candidates: Candidates, rival: Ending) -> None:
+        """Begin another start with these candidates; `rival` is the best so far."""
+        self.candidates, self.rival = candidates, rival
+        self.began, self.starts, self.escapes = len(self.costs), self.starts + 1, 0
+        self.status, self.decrease = Status.RUNNING, None
 
 
 _NUMBERS = ("n_evaluations", "escapes", "starts", "began", "alike")

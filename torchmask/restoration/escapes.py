@@ -24,6 +24,29 @@ from torchmask.restoration.priors import ObjectPrior
 from torchmask.restoration.projected_lbfgs import Minimizer, minimize_bounded
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.state import State
+from torchmask.restoration.traits import Traits
+
+
+def escape(
+    objective: MyopicObjective,
+    state: State,
+    first_inflation: float,
+    traits: Traits,
+    schedule: Schedule,
+    minimizer: Minimizer,
+    number: int,
+) -> tuple[State, int]:
+    """Try both ways out, for the `number`-th time; return the state, itself if neither gains, and the evaluations.
+
+    Frames of a full pupil already had many starts in the tournament, unless they started from a sensor's estimate.
+    """
+    evaluations = 0
+    if traits.estimated or not traits.many_minima:
+        seed = traits.seed + number
+        state, evaluations = restart_outlier_frames(objective, state, first_inflation, schedule, minimizer, seed)
+    if Free.OBJECT in objective.free:
+        state = centre_on_pixels(objective, state, schedule)
+    return state, evaluations
 
 
 def restart_outlier_frames(

@@ -35,6 +35,7 @@ class Judge:
         self.setting: Setting = setting
         self.traits: Traits = traits
         self.alike: float = schedule.alike
+        self.promising: float = schedule.promising
         self.contrast: float = stack.contrast
         self.noise: FrameNoise = stack.noise_of_frames
         self.tolerance: Tolerance = Tolerance(schedule.model_errors, schedule.chance, least)
@@ -61,7 +62,13 @@ class Judge:
         before = self.verdict(objective, rival)
         best, verdict = (rival, before) if before.excess < after.excess else (now, after)
         scale = max(verdict.excess, verdict.limit - 1)
-        return Comparison(best, verdict, after, abs(before.excess - after.excess) < self.alike * scale)
+        near = abs(before.excess - after.excess) < self.alike * scale
+        return Comparison(best, verdict, after, near and now.status is not Status.GIVEN_UP)
+
+    def is_promising(self, objective: MyopicObjective, now: Ending, rival: Ending) -> bool:
+        """Return whether a start that is under way leaves much less than the best of the earlier ones."""
+        left, least = (self.verdict(objective, ending).excess for ending in (now, rival))
+        return left < self.promising * least
 
     def _expected_error(self, objective: MyopicObjective, state: State) -> ModelError:
         """Return the model error that is allowed for, which is that of the modes of the search.

@@ -19,7 +19,7 @@ class Schedule:
     sharp_after : number of iterations after which the object is sharp enough to escape from local minima
     escapes : maximum number of escapes in one start, each of which restarts outlying frames and shifts the object
     first_inflation : the initial noise variance is the residual variance of the mean frame divided by this
-    start_rms : rms of the initial whitened aberrations of a full pupil, and of further starts of a mask
+    start_rms : rms of the initial whitened aberrations of a full pupil
     start_rms_unwhitened : the same in rad, for aberrations without a prior
     candidates : stages of a full pupil's tournament, as (candidates for each frame, iterations); each stage keeps
         the better half of the candidates, the last stage the best one
@@ -28,6 +28,8 @@ class Schedule:
     chance : allowance for chance that is added to this limit, in standard deviations of the stack's chi-square
     missed : for a full pupil, minimum of the allowed excess, as a fraction of the change from frame to frame
     starts : maximum number of starts, where the object was missed
+    glance : number of iterations after which a further start of a mask is given up
+    promising : unless its excess chi-square is below this fraction of that of the best start so far
     averaged : for a full pupil, number of starts that explain the frames, the mean of whose objects is the result
     alike : relative difference of the excess chi-square of two starts below which they count as the same
     outlying : a frame is outlying if its residual variance is larger than this number times that of well-fitted frames
@@ -64,7 +66,9 @@ class Schedule:
     model_errors: float = 2.0
     chance: float = 2.0
     missed: float = 0.0013
-    starts: int = 4
+    starts: int = 9
+    glance: int = 200
+    promising: float = 0.5
     averaged: int = 3
     alike: float = 0.03
     outlying: float = 1.25

@@ -5,25 +5,24 @@ proceeds in segments. Between two of them, the scales of the variables, the tran
 turbulence and the noise are updated; the assumed noise falls from the residual of the mean frame to the true noise, or
 to the residual of the model, if that is larger. Once the object is sharp, frames and object escape from local minima;
 when nothing changes any more, each frame is weighted by how well it fits. A start ends when a segment gains nothing or
-its iterations are used up. If its verdict is that it missed the object, another one starts from random aberrations, and
-the best is kept. At the end, the aberrations of faint frames are integrated out, those of others gain modes. For a full
-pupil, whose starts end in many minima, the objects of several that explain the frames are averaged.
+its iterations are used up. If its verdict is that it missed the object, another one starts, from random aberrations for
+a full pupil and from a twin of the object for a mask, and the best is kept. At the end, the aberrations of faint frames
+are integrated out, those of others gain modes. For a full pupil the objects of several good starts are averaged.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 from torchmask.optics.geometry import MaskGeometry
 from torchmask.record import Callback, Record
-from torchmask.restoration import escapes
 from torchmask.restoration.aberrations import AberrationBasis, MakesBasis
 from torchmask.restoration.calibration import recalibrate
 from torchmask.restoration.candidates import Candidates, play_stage
 from torchmask.restoration.checkpoint import Checkpoint, Ending, Progress, Status
 from torchmask.restoration.consensus import average_starts
 from torchmask.restoration.descent import Variables, descend
+from torchmask.restoration.escapes import escape
 from torchmask.restoration.finish import finish
 from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.judge import Judge
@@ -45,6 +44,7 @@ from torchmask.restoration.starts import (
 )
 from torchmask.restoration.state import State
 from torchmask.restoration.traits import Refinement, Traits
+from torchmask.restoration.twins import twin_of
 from torchmask.restoration.verdict import Finding, Verdict
 
 
@@ -143,7 +143,7 @@ class Solver:
             else:
                 self._advance(progress)
             ended = progress.status is not Status.RUNNING
-            if ended and may_start_again and progress.iterations > self.schedule.sharp_after:
+            if ended and may_start_again:
                 self._judge_start(progress)
             save(progress)
         if progress.status is Status.ITERATION_LIMIT and progress.rival is not None:  # the last start was cut short
@@ -197,6 +197,9 @@ class Solver:
         progress.state, decrease = state, (before - after) / abs(after)
         at_rest = decrease <= self.traits.tolerance and distance(place, state.geometry) < schedule.still
         self._look_at_place(progress)
+        if self._is_hopeless(progress):
+            progress.status = Status.GIVEN_UP
+            return
         limit = self._limit(progress)
         goes_on = limit is Status.RUNNING
         if goes_on and Free.ABERRATIONS in objective.free and progress.escapes < schedule.escapes:
@@ -212,6 +215,11 @@ class Solver:
             progress.state = self._recalibrate(objective, progress.state, sharpen=sharpen)
         if goes_on and (at_rest or progress.iterations >= schedule.sharp_after):
             progress.state = self.setting.in_motion(progress.state, self.traits.seed)
+
+    def _is_hopeless(self, progress: Progress) -> bool:
+        if self.traits.many_minima or progress.rival is None or progress.iterations != self.schedule.glance:
+            return False
+        return not self.judge.is_promising(self.objective, progress.ending, progress.rival)
 
     def _limit(self, progress: Progress) -> Status:
         """Return which limit on iterations has been reached, or RUNNING."""
@@ -241,19 +249,9 @@ class Solver:
         return recalibrate(objective, state, power, follow_r0=self.traits.r0_is_open)
 
     def _escape(self, progress: Progress) -> None:
-        """Restart outlying frames, and shift the object by a fraction of a pixel; if nothing changes, never try again.
-
-        Frames of a full pupil already had many starts in the tournament, unless they started from a sensor's estimate.
-        """
-        progress.escapes, state = progress.escapes + 1, progress.state
-        if self.traits.estimated or not self.traits.many_minima:
-            seed = self.traits.seed + progress.escapes
-            state, evaluations = escapes.restart_outlier_frames(
-                self.objective, state, self.first_inflation, self.schedule, self.minimizer, seed
-            )
-            progress.n_evaluations += evaluations
-        if Free.OBJECT in self.objective.free:
-            state = escapes.centre_on_pixels(self.objective, state, self.schedule)
+        progress.escapes, how = progress.escapes + 1, (self.traits, self.schedule, self.minimizer)
+        state, evaluations = escape(self.objective, progress.state, self.first_inflation, *how, progress.escapes)
+        progress.n_evaluations += evaluations
         if state is progress.state:  # nothing has changed: no further attempt
             progress.escapes = self.schedule.escapes
         progress.state = state
@@ -261,8 +259,11 @@ class Solver:
     def _judge_start(self, progress: Progress) -> None:
         """At the end of a start, keep the best so far, and begin another one if that has missed the object.
 
-        If two starts agree, no further one is made. For a full pupil, others begin until enough explain the frames.
+        If two starts agree, no further one is made. For a full pupil, others begin until enough explain the frames. A
+        start whose object is not sharp yet, and was not given up, is not judged.
         """
+        if progress.iterations <= self.schedule.sharp_after and progress.status is not Status.GIVEN_UP:
+            return
         best, verdict, now, progress.alike = self.judge.compare(self.objective, progress.ending, progress.rival)
         if self.averages and now.explained:
             progress.explained += (progress.ending,)
@@ -271,13 +272,18 @@ class Solver:
             again, needed = len(progress.explained) < self.schedule.averaged, self.schedule.start_iterations
         spent = len(progress.costs) + needed > self.traits.max_iterations or progress.starts >= self.schedule.starts
         if again and not spent:
-            seed, found = self.traits.seed + progress.starts, progress.state.geometry
-            progress.rival, progress.began, progress.starts = best, len(progress.costs), progress.starts + 1
-            progress.escapes, progress.status, progress.decrease = 0, Status.RUNNING, None
-            state = replace(self._first_state(Known()), geometry=found)
-            progress.candidates = first_candidates(self.objective, state, self.traits, self.schedule, seed)
+            self._start_again(progress, best)
         else:
             progress.state, progress.status, progress.decrease = best.state, best.status, best.decrease
+
+    def _start_again(self, progress: Progress, best: Ending) -> None:
+        seed, state = self.traits.seed + progress.starts, best.state
+        if self.traits.many_minima:
+            first = self._first_state(Known())
+            again = first_candidates(self.objective, first, self.traits, self.schedule, seed)
+        else:
+            again = Candidates(twin_of(self._place(state), state, self.first_inflation, seed), 1)
+        progress.start_again(again, best)
 
     def verdict(self, ending: Ending) -> Verdict:
         """Return the verdict on whether the ending of one start, or of all, explains the frames."""
