@@ -57,7 +57,7 @@ def test_a_result_is_in_electrons_and_rad(ended):
     [
         ({"decrease": 3.2e-5}, "converged: the last segment lowered the cost by a fraction 3.2e-05"),
         ({"status": Status.ITERATION_LIMIT}, "stopped at max_iterations = 2"),
-        ({"status": Status.START_LIMIT, "began": 1}, "stopped at the limit of 1 iterations for a start"),
+        ({"status": Status.START_LIMIT, "began": 1}, "stopped at the limit of iterations for a start"),
         ({"status": Status.ITERATION_LIMIT, "starts": 3}, "stopped at max_iterations = 2; the best of 3 starts"),
         (
             {"decrease": 0.0, "starts": 2, "alike": True},

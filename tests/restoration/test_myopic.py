@@ -262,7 +262,7 @@ def test_a_prior_of_ones_own_loses_nothing(observation, tmp_path):
     ours, theirs = made[True], made[False]
     assert theirs.noise == ours.noise
     torch.testing.assert_close(theirs.transmission, ours.transmission, rtol=0.05, atol=0)
-    assert theirs.message == "stopped at the limit of 20 iterations for a start; the best of 2 starts"
+    assert theirs.message == "stopped at the limit of iterations for a start; the best of 2 starts"
     assert len(theirs.cost) == 40
     assert theirs.prior == "Smooth()"
     assert not torch.equal(theirs.object, ours.object)

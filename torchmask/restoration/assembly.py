@@ -94,7 +94,7 @@ def _message(progress: Progress) -> str:
     elif progress.status is Status.ITERATION_LIMIT:
         message = f"stopped at max_iterations = {iterations}"
     else:
-        message = f"stopped at the limit of {progress.iterations} iterations for a start"
+        message = "stopped at the limit of iterations for a start"
     if progress.averaged > 1:
         message += f"; the mean object of {progress.averaged} starts, of {progress.starts} made"
     elif progress.starts > 1:

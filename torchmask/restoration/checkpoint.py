@@ -29,7 +29,7 @@ class Status(Enum):
 
     RUNNING = "running"
     CONVERGED = "converged"
-    GIVEN_UP = "it was far from the fit of an earlier start"
+    GIVEN_UP = "an earlier start had a better fit"
     START_LIMIT = "the iterations of a start were spent"
     ITERATION_LIMIT = "max_iterations was reached"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import cached_property
 from typing import NamedTuple
 
@@ -15,72 +16,4 @@ from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.state import State
 from torchmask.restoration.traits import Traits
-from torchmask.restoration.verdict import FrameFits, Tolerance, Verdict, judge
-
-
-class Comparison(NamedTuple):
-    """The better of two endings, the verdict on it and on the later one, and whether both leave the same residual."""
-
-    best: Ending
-    verdict: Verdict
-    now: Verdict
-    alike: bool
-
-
-class Judge:
-    """Judges the endings of a stack's starts, each with the mask geometry and motion that it found."""
-
-    def __init__(self, setting: Setting, stack: FrameStack, traits: Traits, schedule: Schedule) -> None:
-        least = schedule.missed * stack.change if traits.many_minima else 0.0  # allows for its usual minima
-        self.setting: Setting = setting
-        self.traits: Traits = traits
-        self.alike: float = schedule.alike
-        self.promising: float = schedule.promising
-        self.contrast: float = stack.contrast
-        self.noise: FrameNoise = stack.noise_of_frames
-        self.tolerance: Tolerance = Tolerance(schedule.model_errors, schedule.chance, least)
-
-    def verdict(self, objective: MyopicObjective, ending: Ending) -> Verdict:
-        """Return the verdict on whether the ending of one start, or of all, explains the frames."""
-        state = ending.state
-        objective = self.setting.objective_at(objective, state)
-        pixels = (objective.precision.expand_as(objective.frames) > 0).sum((1, 2))
-        chi_square = fit_of_frames(objective, state)[1]
-        at_rest = ending.status is not Status.ITERATION_LIMIT
-        # For a full pupil poor minima, not modes left out, dominate the residual; `tolerance` allows for them.
-        error = NO_MODEL_ERROR
-        if not self.traits.many_minima:
-            error = self._expected_error(objective, state)
-        frames = FrameFits(chi_square, pixels, state.calibration.transmission, self.noise)
-        return judge(frames, self.contrast, error, self.tolerance, at_rest=at_rest)
-
-    def compare(self, objective: MyopicObjective, now: Ending, rival: Ending | None) -> Comparison:
-        """Compare the present ending with the best of the earlier ones, if there is one."""
-        after = self.verdict(objective, now)
-        if rival is None:
-            return Comparison(now, after, after, alike=False)
-        before = self.verdict(objective, rival)
-        best, verdict = (rival, before) if before.excess < after.excess else (now, after)
-        scale = max(verdict.excess, verdict.limit - 1)
-        near = abs(before.excess - after.excess) < self.alike * scale
-        return Comparison(best, verdict, after, near and now.status is not Status.GIVEN_UP)
-
-    def is_promising(self, objective: MyopicObjective, now: Ending, rival: Ending) -> bool:
-        """Return whether a start that is under way leaves much less than the best of the earlier ones."""
-        left, least = (self.verdict(objective, ending).excess for ending in (now, rival))
-        return left < self.promising * least
-
-    def _expected_error(self, objective: MyopicObjective, state: State) -> ModelError:
-        """Return the model error that is allowed for, which is that of the modes of the search.
-
-        The last descent is too short to bring all its modes to rest, so the fit is not held to what they could explain;
-        the degrees of freedom count them nonetheless.
-        """
-        first = self.setting.in_first_modes(state)
-        error = expected_error(self.setting.objective_at(objective, first), first, self._left_out)
-        return error if first is state else error._replace(fitted=fitted_parameters(objective, state))
-
-    @cached_property
-    def _left_out(self) -> LeftOut:
-        n_modes = self.setting.still.n_modes
-        return LeftOut.of(self.setting.told, n_modes, self.traits.r0, self.traits.outer_scale)
+from torchmask.restoration.verdict import Finding, FrameFits, Tolerance, Verdict, judge

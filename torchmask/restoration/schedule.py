@@ -28,8 +28,9 @@ class Schedule:
     chance : allowance for chance that is added to this limit, in standard deviations of the stack's chi-square
     missed : for a full pupil, minimum of the allowed excess, as a fraction of the change from frame to frame
     starts : maximum number of starts, where the object was missed
-    glance : number of iterations after which a further start of a mask is given up
-    promising : unless its excess chi-square is below this fraction of that of the best start so far
+    doubtful : the fit of a mask is doubted if its excess chi-square is larger than this number times that expected
+    doubtful_starts : maximum number of starts, where the fit is doubted
+    glance : number of iterations after which a further start of a mask is given up if it is not the best yet
     averaged : for a full pupil, number of starts that explain the frames, the mean of whose objects is the result
     alike : relative difference of the excess chi-square of two starts below which they count as the same
     outlying : a frame is outlying if its residual variance is larger than this number times that of well-fitted frames
@@ -66,9 +67,10 @@ class Schedule:
     model_errors: float = 2.0
     chance: float = 2.0
     missed: float = 0.0013
-    starts: int = 9
-    glance: int = 200
-    promising: float = 0.5
+    starts: int = 7
+    doubtful: float = 0.8
+    doubtful_starts: int = 3
+    glance: int = 300
     averaged: int = 3
     alike: float = 0.03
     outlying: float = 1.25
@@ -117,6 +119,7 @@ class Schedule:
             first_inflation=math.inf,
             candidates=(),
             starts=1,
+            doubtful_starts=1,
             averaged=1,
             faint=0.0,
             last_modes=0,

@@ -45,7 +45,7 @@ from torchmask.restoration.starts import (
 from torchmask.restoration.state import State
 from torchmask.restoration.traits import Refinement, Traits
 from torchmask.restoration.twins import twin_of
-from torchmask.restoration.verdict import Finding, Verdict
+from torchmask.restoration.verdict import Verdict
 
 
 class Solver:
@@ -219,7 +219,7 @@ class Solver:
     def _is_hopeless(self, progress: Progress) -> bool:
         if self.traits.many_minima or progress.rival is None or progress.iterations != self.schedule.glance:
             return False
-        return not self.judge.is_promising(self.objective, progress.ending, progress.rival)
+        return not self.judge.is_ahead(self.objective, progress.ending, progress.rival)
 
     def _limit(self, progress: Progress) -> Status:
         """Return which limit on iterations has been reached, or RUNNING."""
@@ -257,7 +257,7 @@ class Solver:
         progress.state = state
 
     def _judge_start(self, progress: Progress) -> None:
-        """At the end of a start, keep the best so far, and begin another one if that has missed the object.
+        """At the end of a start, keep the best so far, and begin another one if that may have missed the object.
 
         If two starts agree, no further one is made. For a full pupil, others begin until enough explain the frames. A
         start whose object is not sharp yet, and was not given up, is not judged.
@@ -267,11 +267,10 @@ class Solver:
         best, verdict, now, progress.alike = self.judge.compare(self.objective, progress.ending, progress.rival)
         if self.averages and now.explained:
             progress.explained += (progress.ending,)
-        again, needed = verdict.finding is Finding.NOT_EXPLAINED and not progress.alike, 1  # iterations
+        again, needed = progress.starts < self.judge.most_starts(verdict) and not progress.alike, 1  # iterations
         if progress.explained:
             again, needed = len(progress.explained) < self.schedule.averaged, self.schedule.start_iterations
-        spent = len(progress.costs) + needed > self.traits.max_iterations or progress.starts >= self.schedule.starts
-        if again and not spent:
+        if again and len(progress.costs) + needed <= self.traits.max_iterations:
             self._start_again(progress, best)
         else:
             progress.state, progress.status, progress.decrease = best.state, best.status, best.decrease
