@@ -68,7 +68,7 @@ class Schedule:
     chance: float = 2.0
     missed: float = 0.0013
     starts: int = 7
-    doubtful: float = 0.8
+    doubtful: float = 1.0
     doubtful_starts: int = 3
     glance: int = 300
     averaged: int = 3
