@@ -209,7 +209,7 @@ def test_two_starts_that_end_alike_are_the_last(alike, n_starts, explained):
 
 
 def test_a_twin_that_is_behind_is_given_up(explained):
-    """At a glance; one that is ahead of the best so far goes on."""
+    """At a glance; one that is well ahead of the best so far goes on."""
     objective, truth = explained
     poor = replace(truth, z=0 * truth.z)
     schedule = Schedule(starts=2, glance=5, **ALL_MISSED, **BRISK)

@@ -17,3 +17,79 @@ from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.state import State
 from torchmask.restoration.traits import Traits
 from torchmask.restoration.verdict import Finding, FrameFits, Tolerance, Verdict, judge
+
+
+class Comparison(NamedTuple):
+    """The better of two endings, the verdict on it and on the later one, and whether both leave the same residual."""
+
+    best: Ending
+    verdict: Verdict
+    now: Verdict
+    alike: bool
+
+
+class Judge:
+    """Judges the endings of a stack's starts, each with the mask geometry and motion that it found."""
+
+    def __init__(self, setting: Setting, stack: FrameStack, traits: Traits, schedule: Schedule) -> None:
+        least = schedule.missed * stack.change if traits.many_minima else 0.0  # allows for its usual minima
+        self.setting: Setting = setting
+        self.traits: Traits = traits
+        self.schedule: Schedule = schedule
+        self.contrast: float = stack.contrast
+        self.noise: FrameNoise = stack.noise_of_frames
+        self.tolerance: Tolerance = Tolerance(schedule.model_errors, schedule.chance, least)
+
+    def verdict(self, objective: MyopicObjective, ending: Ending) -> Verdict:
+        """Return the verdict on whether the ending of one start, or of all, explains the frames."""
+        state = ending.state
+        objective = self.setting.objective_at(objective, state)
+        pixels = (objective.precision.expand_as(objective.frames) > 0).sum((1, 2))
+        chi_square = fit_of_frames(objective, state)[1]
+        at_rest = ending.status is not Status.ITERATION_LIMIT
+        # For a full pupil poor minima, not modes left out, dominate the residual; `tolerance` allows for them.
+        error = NO_MODEL_ERROR
+        if not self.traits.many_minima:
+            error = self._expected_error(objective, state)
+        frames = FrameFits(chi_square, pixels, state.calibration.transmission, self.noise)
+        return judge(frames, self.contrast, error, self.tolerance, at_rest=at_rest)
+
+    def compare(self, objective: MyopicObjective, now: Ending, rival: Ending | None) -> Comparison:
+        """Compare the present ending with the best of the earlier ones, if there is one."""
+        after = self.verdict(objective, now)
+        if rival is None:
+            return Comparison(now, after, after, alike=False)
+        before = self.verdict(objective, rival)
+        if now.status is Status.GIVEN_UP:
+            return Comparison(rival, before, after, alike=False)
+        best, verdict = (rival, before) if before.excess < after.excess else (now, after)
+        scale = max(verdict.excess, verdict.limit - 1)
+        return Comparison(best, verdict, after, abs(before.excess - after.excess) < self.schedule.alike * scale)
+
+    def most_starts(self, verdict: Verdict) -> int:
+        """Return the maximum number of starts, if this is the verdict on the best."""
+        if verdict.finding is Finding.NOT_EXPLAINED:
+            return self.schedule.starts
+        excess = verdict.excess - self.schedule.chance * math.sqrt(2 / verdict.degrees_of_freedom)
+        is_doubtful = excess > self.schedule.doubtful * verdict.model_error and not self.traits.many_minima
+        return self.schedule.doubtful_starts if is_doubtful and verdict.explained else 1
+
+    def is_promising(self, objective: MyopicObjective, now: Ending, rival: Ending) -> bool:
+        """Return whether a start that is under way leaves much less already than the best of the earlier ones."""
+        left, least = (self.verdict(objective, ending).excess for ending in (now, rival))
+        return left < self.schedule.promising * least
+
+    def _expected_error(self, objective: MyopicObjective, state: State) -> ModelError:
+        """Return the model error that is allowed for, which is that of the modes of the search.
+
+        The last descent is too short to bring all its modes to rest, so the fit is not held to what they could explain;
+        the degrees of freedom count them nonetheless.
+        """
+        first = self.setting.in_first_modes(state)
+        error = expected_error(self.setting.objective_at(objective, first), first, self._left_out)
+        return error if first is state else error._replace(fitted=fitted_parameters(objective, state))
+
+    @cached_property
+    def _left_out(self) -> LeftOut:
+        n_modes = self.setting.still.n_modes
+        return LeftOut.of(self.setting.told, n_modes, self.traits.r0, self.traits.outer_scale)

@@ -30,7 +30,8 @@ class Schedule:
     starts : maximum number of starts, where the object was missed
     doubtful : the fit of a mask is doubted if its excess chi-square is larger than this number times that expected
     doubtful_starts : maximum number of starts, where the fit is doubted
-    glance : number of iterations after which a further start of a mask is given up if it is not the best yet
+    glance : number of iterations after which a further start of a mask is given up
+    promising : unless its excess chi-square is below this fraction of that of the best start so far
     averaged : for a full pupil, number of starts that explain the frames, the mean of whose objects is the result
     alike : relative difference of the excess chi-square of two starts below which they count as the same
     outlying : a frame is outlying if its residual variance is larger than this number times that of well-fitted frames
@@ -71,6 +72,7 @@ class Schedule:
     doubtful: float = 1.0
     doubtful_starts: int = 3
     glance: int = 300
+    promising: float = 0.7
     averaged: int = 3
     alike: float = 0.03
     outlying: float = 1.25

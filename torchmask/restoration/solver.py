@@ -219,7 +219,7 @@ class Solver:
     def _is_hopeless(self, progress: Progress) -> bool:
         if self.traits.many_minima or progress.rival is None or progress.iterations != self.schedule.glance:
             return False
-        return not self.judge.is_ahead(self.objective, progress.ending, progress.rival)
+        return not self.judge.is_promising(self.objective, progress.ending, progress.rival)
 
     def _limit(self, progress: Progress) -> Status:
         """Return which limit on iterations has been reached, or RUNNING."""
