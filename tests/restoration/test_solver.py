@@ -146,14 +146,16 @@ def test_noise_falls_from_a_share_of_the_change(explained):
 
 def test_the_truth_is_explained_as_far_as_the_schedule_asks(explained):
     objective, state = explained
-    verdict = solver_of(objective).verdict(Ending(state, Status.CONVERGED))
+    solver = solver_of(objective)
+    verdict = solver.verdict(Ending(state, Status.CONVERGED))
     chi_square = fit_of_frames(objective, state)[1]
     total, freedom = float(chi_square.sum()) * 32**2, verdict.degrees_of_freedom
     assert verdict.explained
     assert verdict.chi_square == pytest.approx(total / freedom, rel=1e-4)  # whole degrees of freedom
     assert 0 < 4 * 32**2 - freedom <= 4 * (1 + 14)  # a transmission and 14 aberrations of each frame
     assert abs(verdict.chi_square - 1) < 4 * math.sqrt(2 / freedom)
-    noise = math.sqrt(2 / freedom)
+    level, unevenness = solver.judge.noise
+    noise = math.sqrt(2 * float((level**2 * unevenness).mean()) / freedom)
     assert verdict.limit == pytest.approx(1 + 2 * verdict.model_error + 2 * noise, rel=1e-4)
     other = solver_of(objective, schedule=Schedule(model_errors=3.0, chance=1.0)).verdict(
         Ending(state, Status.CONVERGED)
@@ -221,22 +223,22 @@ def test_a_twin_that_is_behind_is_given_up(explained):
         assert (progress.state is rival) is not goes_on
 
 
-def test_a_doubted_fit_gets_a_second_start(explained):
-    """Though it is explained, if it leaves more than is expected."""
+def test_a_doubted_fit_gets_few_starts_and_a_lost_one_many(explained):
+    """Though it may be explained, if it leaves more than is expected."""
     objective, truth = explained
     solver = solver_of(objective)
     verdict, schedule = solver.verdict(Ending(truth, Status.CONVERGED)), solver.schedule
-    noise = schedule.chance * math.sqrt(2 / verdict.degrees_of_freedom)
-    just = 1 + schedule.doubtful * verdict.model_error + noise
-    assert just < verdict.limit
+    noise = verdict.limit - 1 - schedule.model_errors * verdict.model_error
+    doubtful, lost = (1 + times * verdict.model_error + noise for times in (schedule.doubtful, schedule.lost))
+    assert doubtful < verdict.limit < lost
+    few, many = schedule.doubtful_starts, schedule.starts
     for chi_square, n_starts in (
-        (just - 1e-6, 1),
-        (just + 1e-6, schedule.doubtful_starts),
-        (verdict.limit - 1e-6, schedule.doubtful_starts),
+        *((doubtful - 1e-6, 1), (doubtful + 1e-6, few)),
+        *((lost - 1e-6, few), (lost + 1e-6, many)),
     ):
         assert solver.judge.most_starts(replace(verdict, chi_square=chi_square)) == n_starts
-    missed = replace(verdict, finding=Finding.NOT_EXPLAINED)
-    assert solver.judge.most_starts(missed) == schedule.starts
+    noisy = replace(verdict, chi_square=lost + 1, finding=Finding.ONLY_NOISE)
+    assert solver.judge.most_starts(noisy) == 1
 
 
 def test_a_start_too_short_to_tell_is_not_judged(explained):

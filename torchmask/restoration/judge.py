@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from functools import cached_property
 from typing import NamedTuple
 
@@ -67,12 +66,16 @@ class Judge:
         return Comparison(best, verdict, after, abs(before.excess - after.excess) < self.schedule.alike * scale)
 
     def most_starts(self, verdict: Verdict) -> int:
-        """Return the maximum number of starts, if this is the verdict on the best."""
-        if verdict.finding is Finding.NOT_EXPLAINED:
+        """Return the maximum number of starts if this is the verdict on the best, which is small for a doubtful fit."""
+        if verdict.finding is Finding.ONLY_NOISE:
+            return 1
+        if self.traits.many_minima:
+            return 1 if verdict.explained else self.schedule.starts
+        noise = verdict.limit - 1 - self.schedule.model_errors * verdict.model_error
+        left = verdict.excess - noise
+        if left > self.schedule.lost * verdict.model_error:
             return self.schedule.starts
-        excess = verdict.excess - self.schedule.chance * math.sqrt(2 / verdict.degrees_of_freedom)
-        is_doubtful = excess > self.schedule.doubtful * verdict.model_error and not self.traits.many_minima
-        return self.schedule.doubtful_starts if is_doubtful and verdict.explained else 1
+        return self.schedule.doubtful_starts if left > self.schedule.doubtful * verdict.model_error else 1
 
     def is_promising(self, objective: MyopicObjective, now: Ending, rival: Ending) -> bool:
         """Return whether a start that is under way leaves much less already than the best of the earlier ones."""

@@ -27,9 +27,10 @@ class Schedule:
         of modes beyond the aberration basis
     chance : allowance for chance that is added to this limit, in standard deviations of the stack's chi-square
     missed : for a full pupil, minimum of the allowed excess, as a fraction of the change from frame to frame
-    starts : maximum number of starts, where the object was missed
-    doubtful : the fit of a mask is doubted if its excess chi-square is larger than this number times that expected
-    doubtful_starts : maximum number of starts, where the fit is doubted
+    starts : maximum number of starts, for a full pupil where the object was missed, for a mask where it was lost
+    lost : the object behind a mask counts as lost if the excess is larger than this number times that expected
+    doubtful : and its fit as doubtful, for this number
+    doubtful_starts : maximum number of starts of a mask whose fit is doubtful
     glance : number of iterations after which a further start of a mask is given up
     promising : unless its excess chi-square is below this fraction of that of the best start so far
     averaged : for a full pupil, number of starts that explain the frames, the mean of whose objects is the result
@@ -69,6 +70,7 @@ class Schedule:
     chance: float = 2.0
     missed: float = 0.0013
     starts: int = 7
+    lost: float = 4.0
     doubtful: float = 1.0
     doubtful_starts: int = 3
     glance: int = 300
