@@ -195,19 +195,37 @@ def test_the_better_of_two_starts_is_kept(rival_is_better, explained):
         assert solver.verdict(progress.ending).excess < worse.excess
 
 
-@pytest.mark.parametrize(("alike", "n_starts"), [(0.03, 2), (-1.0, 3)])
-def test_two_starts_that_end_alike_are_the_last(alike, n_starts, explained):
+@pytest.mark.parametrize(("alike", "full", "n_starts"), [(0.03, True, 2), (-1.0, True, 3), (0.03, False, 3)])
+def test_two_starts_of_a_full_pupil_that_end_alike_are_the_last(alike, full, n_starts, explained):
+    """Those of a mask may both have ended at a wrong twin."""
     objective, truth = explained
     poor = replace(truth, z=0 * truth.z)
 
     def run(starts: int, rival: Ending | None) -> Progress:
-        schedule = Schedule(start_iterations=1, starts=starts, alike=alike, **ALL_MISSED, **BRISK | {"sharp_after": 0})
+        brief = {"start_iterations": 1, "candidates": (), **ALL_MISSED, **BRISK | {"sharp_after": 0}}
         begun = Progress(Candidates(poor, 1), [1.0], starts=min(starts, 2), began=1, rival=rival)
-        return solver_of(objective, schedule=schedule).run(begun, True, lambda _: None)
+        solver = solver_of(objective, schedule=Schedule(starts=starts, alike=alike, **brief), many_minima=full)
+        return solver.run(begun, True, lambda _: None)
 
     progress = run(3, run(1, None).ending)
     assert progress.starts == n_starts
-    assert progress.alike == (alike > 0)
+    assert progress.alike == (n_starts == 2)
+
+
+def test_every_fourth_further_start_of_a_mask_is_from_random_aberrations(explained, monkeypatch):
+    """The others are from twins of the best."""
+    objective, truth = explained
+    brief = {"start_iterations": 5, "starts": 9, **ALL_MISSED, **BRISK}
+    solver, twins = solver_of(objective, schedule=Schedule(**brief)), []
+
+    def twin(objective, state, inflation, seed):
+        twins.append(seed)
+        return replace(truth, z=0 * truth.z)
+
+    monkeypatch.setattr("torchmask.restoration.solver.twin_of", twin)
+    progress = solver.run(solver.begin(Known(), None), True, lambda _: None)
+    assert progress.starts == 9
+    assert twins == [1, 2, 3, 5, 6, 7]
 
 
 def test_a_twin_that_is_behind_is_given_up(explained):
@@ -223,22 +241,18 @@ def test_a_twin_that_is_behind_is_given_up(explained):
         assert (progress.state is rival) is not goes_on
 
 
-def test_a_doubted_fit_gets_few_starts_and_a_lost_one_many(explained):
-    """Though it may be explained, if it leaves more than is expected."""
+def test_a_doubted_fit_gets_few_starts_and_a_missed_one_many(explained):
+    """A fit is doubted, though explained, if it leaves more than is expected."""
     objective, truth = explained
     solver = solver_of(objective)
     verdict, schedule = solver.verdict(Ending(truth, Status.CONVERGED)), solver.schedule
     noise = verdict.limit - 1 - schedule.model_errors * verdict.model_error
-    doubtful, lost = (1 + times * verdict.model_error + noise for times in (schedule.doubtful, schedule.lost))
-    assert doubtful < verdict.limit < lost
-    few, many = schedule.doubtful_starts, schedule.starts
-    for chi_square, n_starts in (
-        *((doubtful - 1e-6, 1), (doubtful + 1e-6, few)),
-        *((lost - 1e-6, few), (lost + 1e-6, many)),
-    ):
+    doubtful = 1 + schedule.doubtful * verdict.model_error + noise
+    assert doubtful < verdict.limit
+    for chi_square, n_starts in ((doubtful - 1e-6, 1), (doubtful + 1e-6, schedule.doubtful_starts)):
         assert solver.judge.most_starts(replace(verdict, chi_square=chi_square)) == n_starts
-    noisy = replace(verdict, chi_square=lost + 1, finding=Finding.ONLY_NOISE)
-    assert solver.judge.most_starts(noisy) == 1
+    for finding, n_starts in ((Finding.NOT_EXPLAINED, schedule.starts), (Finding.ONLY_NOISE, 1)):
+        assert solver.judge.most_starts(replace(verdict, finding=finding)) == n_starts
 
 
 def test_a_start_too_short_to_tell_is_not_judged(explained):

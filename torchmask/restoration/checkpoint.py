@@ -113,9 +113,9 @@ class Progress:
 
         return listen
 
-    def start_again(self, candidates: Candidates, rival: Ending) -> None:
-        """Begin another start with these candidates; `rival` is the best so far."""
-        self.candidates, self.rival = candidates, rival
+    def start_again(self, rival: Ending) -> None:
+        """Begin another start, whose candidates are to be given; `rival` is the best so far."""
+        self.rival = rival
         self.began, self.starts, self.escapes = len(self.costs), self.starts + 1, 0
         self.status, self.decrease = Status.RUNNING, None
 

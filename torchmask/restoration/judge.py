@@ -6,7 +6,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 from torchmask.restoration.calibration import fit_of_frames
-from torchmask.restoration.checkpoint import Ending, Status
+from torchmask.restoration.checkpoint import Ending, Progress, Status
 from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.model_error import NO_MODEL_ERROR, LeftOut, ModelError, expected_error, fitted_parameters
 from torchmask.restoration.motion import Setting
@@ -62,25 +62,24 @@ class Judge:
         if now.status is Status.GIVEN_UP:
             return Comparison(rival, before, after, alike=False)
         best, verdict = (rival, before) if before.excess < after.excess else (now, after)
-        scale = max(verdict.excess, verdict.limit - 1)
+        # The starts of a mask end alike at a wrong twin, which is no reason to stop.
+        scale = max(verdict.excess, verdict.limit - 1) if self.traits.many_minima else 0.0
         return Comparison(best, verdict, after, abs(before.excess - after.excess) < self.schedule.alike * scale)
 
     def most_starts(self, verdict: Verdict) -> int:
-        """Return the maximum number of starts if this is the verdict on the best, which is small for a doubtful fit."""
-        if verdict.finding is Finding.ONLY_NOISE:
-            return 1
-        if self.traits.many_minima:
-            return 1 if verdict.explained else self.schedule.starts
-        noise = verdict.limit - 1 - self.schedule.model_errors * verdict.model_error
-        left = verdict.excess - noise
-        if left > self.schedule.lost * verdict.model_error:
+        """Return the maximum number of starts if this is the verdict on the best."""
+        if verdict.finding is Finding.NOT_EXPLAINED:
             return self.schedule.starts
-        return self.schedule.doubtful_starts if left > self.schedule.doubtful * verdict.model_error else 1
+        noise = verdict.limit - 1 - self.schedule.model_errors * verdict.model_error
+        is_doubtful = verdict.excess - noise > self.schedule.doubtful * verdict.model_error
+        return self.schedule.doubtful_starts if is_doubtful and verdict.explained and not self.traits.many_minima else 1
 
-    def is_promising(self, objective: MyopicObjective, now: Ending, rival: Ending) -> bool:
-        """Return whether a start that is under way leaves much less already than the best of the earlier ones."""
-        left, least = (self.verdict(objective, ending).excess for ending in (now, rival))
-        return left < self.schedule.promising * least
+    def gives_up(self, objective: MyopicObjective, progress: Progress) -> bool:
+        """Return whether it is time to see that the present start is not well ahead of the best earlier one."""
+        if progress.rival is None or progress.iterations != self.schedule.glance:
+            return False
+        left, least = (self.verdict(objective, ending).excess for ending in (progress.ending, progress.rival))
+        return left >= self.schedule.promising * least
 
     def _expected_error(self, objective: MyopicObjective, state: State) -> ModelError:
         """Return the model error that is allowed for, which is that of the modes of the search.

@@ -19,7 +19,7 @@ class Schedule:
     sharp_after : number of iterations after which the object is sharp enough to escape from local minima
     escapes : maximum number of escapes in one start, each of which restarts outlying frames and shifts the object
     first_inflation : the initial noise variance is the residual variance of the mean frame divided by this
-    start_rms : rms of the initial whitened aberrations of a full pupil
+    start_rms : rms of random initial whitened aberrations
     start_rms_unwhitened : the same in rad, for aberrations without a prior
     candidates : stages of a full pupil's tournament, as (candidates for each frame, iterations); each stage keeps
         the better half of the candidates, the last stage the best one
@@ -27,14 +27,14 @@ class Schedule:
         of modes beyond the aberration basis
     chance : allowance for chance that is added to this limit, in standard deviations of the stack's chi-square
     missed : for a full pupil, minimum of the allowed excess, as a fraction of the change from frame to frame
-    starts : maximum number of starts, for a full pupil where the object was missed, for a mask where it was lost
-    lost : the object behind a mask counts as lost if the excess is larger than this number times that expected
-    doubtful : and its fit as doubtful, for this number
-    doubtful_starts : maximum number of starts of a mask whose fit is doubtful
-    glance : number of iterations after which a further start of a mask is given up
+    starts : maximum number of starts, where the object was missed
+    twins : number of further starts of a mask from twins of its object before one from random aberrations
+    doubtful : the fit of a mask is doubted if the excess is larger than this number times that expected
+    doubtful_starts : maximum number of starts of a mask whose fit is explained but doubted
+    glance : number of iterations after which a start from a twin is given up
     promising : unless its excess chi-square is below this fraction of that of the best start so far
     averaged : for a full pupil, number of starts that explain the frames, the mean of whose objects is the result
-    alike : relative difference of the excess chi-square of two starts below which they count as the same
+    alike : relative difference of the excess chi-square of two starts of a full pupil below which they are the same
     outlying : a frame is outlying if its residual variance is larger than this number times that of well-fitted frames
     restarts : number of random starts of the aberrations of an outlying frame
     restart_rounds : number of rounds of such a start, over which the assumed noise falls
@@ -69,8 +69,8 @@ class Schedule:
     model_errors: float = 2.0
     chance: float = 2.0
     missed: float = 0.0013
-    starts: int = 7
-    lost: float = 4.0
+    starts: int = 9
+    twins: int = 3
     doubtful: float = 1.0
     doubtful_starts: int = 3
     glance: int = 300

@@ -5,14 +5,15 @@ proceeds in segments. Between two of them, the scales of the variables, the tran
 turbulence and the noise are updated; the assumed noise falls from the residual of the mean frame to the true noise, or
 to the residual of the model, if that is larger. Once the object is sharp, frames and object escape from local minima;
 when nothing changes any more, each frame is weighted by how well it fits. A start ends when a segment gains nothing or
-its iterations are used up. If its verdict is that it missed the object, another one starts, from random aberrations for
-a full pupil and from a twin of the object for a mask, and the best is kept. At the end, the aberrations of faint frames
-are integrated out, those of others gain modes. For a full pupil the objects of several good starts are averaged.
+its iterations are used up. If its verdict is that it missed the object, another one starts, from random aberrations or,
+for a mask, from twins of the object, and the best is kept. At the end, the aberrations of faint frames are integrated
+out, those of others gain modes. For a full pupil the objects of several good starts are averaged.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from torchmask.optics.geometry import MaskGeometry
 from torchmask.record import Callback, Record
@@ -42,7 +43,7 @@ from torchmask.restoration.starts import (
     start_from_result,
     start_rms,
 )
-from torchmask.restoration.state import State
+from torchmask.restoration.state import Modes, State
 from torchmask.restoration.traits import Refinement, Traits
 from torchmask.restoration.twins import twin_of
 from torchmask.restoration.verdict import Verdict
@@ -197,7 +198,7 @@ class Solver:
         progress.state, decrease = state, (before - after) / abs(after)
         at_rest = decrease <= self.traits.tolerance and distance(place, state.geometry) < schedule.still
         self._look_at_place(progress)
-        if self._is_hopeless(progress):
+        if self._is_twin(progress) and self.judge.gives_up(objective, progress):
             progress.status = Status.GIVEN_UP
             return
         limit = self._limit(progress)
@@ -216,10 +217,9 @@ class Solver:
         if goes_on and (at_rest or progress.iterations >= schedule.sharp_after):
             progress.state = self.setting.in_motion(progress.state, self.traits.seed)
 
-    def _is_hopeless(self, progress: Progress) -> bool:
-        if self.traits.many_minima or progress.rival is None or progress.iterations != self.schedule.glance:
-            return False
-        return not self.judge.is_promising(self.objective, progress.ending, progress.rival)
+    def _is_twin(self, progress: Progress) -> bool:
+        """Return whether the present start is from a twin: those of a mask are, but for its first and few others."""
+        return not self.traits.many_minima and (progress.starts - 1) % (self.schedule.twins + 1) > 0
 
     def _limit(self, progress: Progress) -> Status:
         """Return which limit on iterations has been reached, or RUNNING."""
@@ -259,11 +259,10 @@ class Solver:
     def _judge_start(self, progress: Progress) -> None:
         """At the end of a start, keep the best so far, and begin another one if that may have missed the object.
 
-        If two starts agree, no further one is made. For a full pupil, others begin until enough explain the frames. A
-        start whose object is not sharp yet, and was not given up, is not judged.
+        For a full pupil others begin until enough explain the frames, unless two agree.
         """
         if progress.iterations <= self.schedule.sharp_after and progress.status is not Status.GIVEN_UP:
-            return
+            return  # its object is not sharp enough to be judged
         best, verdict, now, progress.alike = self.judge.compare(self.objective, progress.ending, progress.rival)
         if self.averages and now.explained:
             progress.explained += (progress.ending,)
@@ -276,16 +275,17 @@ class Solver:
             progress.state, progress.status, progress.decrease = best.state, best.status, best.decrease
 
     def _start_again(self, progress: Progress, best: Ending) -> None:
-        seed, state = self.traits.seed + progress.starts, best.state
-        if self.traits.many_minima:
-            first = self._first_state(Known())
-            again = first_candidates(self.objective, first, self.traits, self.schedule, seed)
+        progress.start_again(best)
+        seed, state = self.traits.seed + progress.starts - 1, best.state
+        if self._is_twin(progress):
+            progress.candidates = Candidates(twin_of(self._place(state), state, self.first_inflation, seed), 1)
         else:
-            again = Candidates(twin_of(self._place(state), state, self.first_inflation, seed), 1)
-        progress.start_again(again, best)
+            objective = self._place(replace(state, modes=Modes.STILL))
+            first = replace(self._first_state(Known()), geometry=state.geometry)
+            progress.candidates = first_candidates(objective, first, self.traits, self.schedule, seed)
 
     def verdict(self, ending: Ending) -> Verdict:
-        """Return the verdict on whether the ending of one start, or of all, explains the frames."""
+        """Return the verdict on the ending of one start, or of all."""
         return self.judge.verdict(self.objective, ending)
 
     def _report(self, progress: Progress, variables: Variables) -> None:

@@ -120,10 +120,13 @@ def start_rms(traits: Traits, schedule: Schedule) -> float:
 def first_candidates(
     objective: MyopicObjective, state: State, traits: Traits, schedule: Schedule, seed: int
 ) -> Candidates:
-    """Return the candidates of a start: random aberrations for a full pupil, or else those of `state`."""
-    if not has_tournament(objective, traits):
+    """Return the candidates of a start: zero aberrations for a mask's first one, random ones for every other."""
+    rms = start_rms(traits, schedule)
+    if has_tournament(objective, traits):
+        return random_candidates(objective, state, schedule.n_candidates, rms, seed)
+    if seed == traits.seed:
         return Candidates(state, 1)
-    return random_candidates(objective, state, schedule.n_candidates, start_rms(traits, schedule), seed)
+    return random_candidates(objective, state, 1, rms, seed)
 
 
 def random_candidates(objective: MyopicObjective, state: State, n_each: int, rms: float, seed: int) -> Candidates:
