@@ -8,7 +8,7 @@ from enum import Enum
 import torch
 from torch import Tensor
 
-_PRICE = 0.1  # relative to a weight of 1 of total variation, see docs/tried.md
+_PRICE = 1.0  # relative to a weight of 1 of total variation, see docs/tried.md
 _BLOCKS = 8  # blocks along each side of the field, of which the darkest is sought
 _SEEN = 0.1  # of the mean light in the darkest part, where holes scatter up to 0.06, see docs/tried.md
 
