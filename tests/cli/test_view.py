@@ -80,7 +80,7 @@ def test_mistakes_about_masks(tmp_path, capsys):
     refused(capsys, "did you mean 'golay6'", "masks", "golay66")
     refused(capsys, "give its name", "masks", "--out", tmp_path / "x.json")
     refused(capsys, "does not end in one of", "masks", "golay6", "--out", tmp_path / "x.doc")
-    refused(capsys, "mask_diameter is -1", "masks", "golay6", "--mask-diameter", "-1")
+    refused(capsys, "--mask-diameter is -1", "masks", "golay6", "--mask-diameter", "-1")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -107,16 +107,16 @@ def test_a_tiny_run_writes_numbers_table_picture_and_log(name, tmp_path, monkeyp
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [
-        ("anisoplanatism", ["--fields", "0", "1"], "fields is (0.0, 1.0): all values must be positive"),
-        ("anisoplanatism", ["--shares", "0.5", "1.5"], "shares is (0.5, 1.5)"),
+        ("anisoplanatism", ["--fields", "0", "1"], "--fields is (0.0, 1.0): all values must be positive"),
+        ("anisoplanatism", ["--shares", "0.5", "1.5"], "--shares is (0.5, 1.5)"),
         (
             "exposure",
             ["--exposures", "1", "1"],
-            "exposures is (1.0, 1.0): it must hold at least one value, and none tw",
+            "--exposures is (1.0, 1.0): it must hold at least one value, and none tw",
         ),
         ("exposure", ["--instruments", "slit"], "instruments is ('slit',): known ones are mask, full"),
-        ("band", ["--widths", "1.5"], "widths is (1.5,): a filter must be narrower"),
-        ("band", ["--n-photons", "0"], "n_photons is 0.0: it must be positive"),
+        ("band", ["--widths", "1.5"], "--widths is (1.5,): a filter must be narrower"),
+        ("band", ["--n-photons", "0"], "--n-photons is 0.0: it must be positive"),
     ],
 )
 def test_a_bad_setting_is_one_line(name, options, message, tmp_path, capsys):

@@ -46,4 +46,4 @@ def pistons(options, grid, photons, n_frames, r0):
 
 def test_too_few_draws_are_refused(tmp_path, capsys):
     assert jensen.main(["--n-draws", "30", "--out", str(tmp_path / "run")]) == 1
-    assert "n_draws is 30" in capsys.readouterr().err
+    assert "--n-draws is 30" in capsys.readouterr().err

@@ -67,7 +67,7 @@ def test_nothing_is_overwritten(finished, name, capsys):
 def test_a_bad_setting_is_one_line(tmp_path, name, capsys):
     assert SCRIPTS[name].main([*tiny(tmp_path, "new/run"), "--workers", "0"]) == 1
     err = capsys.readouterr().err
-    assert err.startswith(f"{name}: error: n_workers is 0")
+    assert err.startswith(f"{name}: error: --workers is 0")
     assert err.count("\n") == 1
     assert not list(tmp_path.iterdir())
 
@@ -211,10 +211,10 @@ def test_the_scripts_share_their_searches(tmp_path):
     ("options", "message"),
     [
         (["--frames"], "frames is ()"),
-        (["--frames", "5", "0"], "frames is (5, 0)"),
-        (["--d-over-r0", "0"], "d_over_r0 is 0.0"),
-        (["--outer-scale", "0"], "outer_scale is 0.0"),
-        (["--piston-stacks", "1"], "piston_stacks is 1"),
+        (["--frames", "5", "0"], "--frames is (5, 0)"),
+        (["--d-over-r0", "0"], "--d-over-r0 is 0.0"),
+        (["--outer-scale", "0"], "--outer-scale is 0.0"),
+        (["--piston-stacks", "1"], "--piston-stacks is 1"),
         (["--n-pixels", "2"], "a sub-aperture"),
     ],
 )

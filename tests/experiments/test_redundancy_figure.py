@@ -99,10 +99,10 @@ def test_picture_and_table_are_written_once(finished, capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--d-over-r0", "0"], "d_over_r0 is 0.0"),
-        (["--outer-scale", "-1"], "outer_scale is -1.0"),
-        (["--n-frames", "1"], "n_frames is 1"),
-        (["--row-holes", "1"], "row_holes is 1"),
+        (["--d-over-r0", "0"], "--d-over-r0 is 0.0"),
+        (["--outer-scale", "-1"], "--outer-scale is -1.0"),
+        (["--n-frames", "1"], "--n-frames is 1"),
+        (["--row-holes", "1"], "--row-holes is 1"),
     ],
 )
 def test_a_bad_setting_is_one_line(tmp_path, capsys, options, message):

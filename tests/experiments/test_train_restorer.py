@@ -79,11 +79,11 @@ def test_an_existing_folder_is_refused(finished, capsys):
     ("options", "message"),
     [
         (["--mask", "none"], "no mask is called 'none'"),
-        (["--fill-factor", "0"], "fill_factor is 0.0"),
-        (["--ranges.r0", "-1", "2"], "r0 is (-1.0, 2.0)"),
-        (["--n-train", "0"], "n_train is 0"),
-        (["--depth", "1"], "depth is 1"),
-        (["--workers", "-1"], "workers is -1"),
+        (["--fill-factor", "0"], "--fill-factor is 0.0"),
+        (["--ranges.r0", "-1", "2"], "--ranges.r0 is (-1.0, 2.0)"),
+        (["--n-train", "0"], "--n-train is 0"),
+        (["--depth", "1"], "--depth is 1"),
+        (["--workers", "-1"], "--workers is -1"),
     ],
 )
 def test_a_bad_setting_is_one_line_and_leaves_nothing(tmp_path, capsys, options, message):

@@ -114,7 +114,7 @@ def restore(explained, schedule, **given):
     [
         (1e9, 3, "the mean object of 3 starts", 24),  # all explain the frames
         (1e9, 1, None, 8),
-        (-1e9, 3, "the best of 4 starts", 32),  # none does
+        (-1e9, 3, "the best of 9 starts", 72),  # none does
     ],
 )
 def test_starts_that_explain_the_frames_are_averaged(chance, averaged, message, iterations, explained):
