@@ -138,9 +138,9 @@ def test_spelling_does_not_matter(spelling):
     [
         (("golay7",), "did you mean 'golay.*known masks are golay3"),
         (("Hubble",), "known masks are golay3, .*keck_nirc2_9"),
-        (("golay6",), "both mask_diameter and fill_factor"),
-        (("golay6", 1.0), "both mask_diameter and fill_factor"),
-        (("golay6", None, 0.15), "both mask_diameter and fill_factor"),
+        (("golay6",), r"both mask_diameter \[m\] and fill_factor"),
+        (("golay6", 1.0), r"both mask_diameter \[m\] and fill_factor"),
+        (("golay6", None, 0.15), r"both mask_diameter \[m\] and fill_factor"),
         (("golay6", 1.0, 7.0), "lower fill_factor"),
         (("vlt_eris_7",), "no source gives the hole diameter of vlt_eris_7: give fill_factor"),
         (("golay6", -1.0, 0.15), "mask_diameter is -1.0"),
