@@ -1,5 +1,7 @@
 """Endings are judged with the mask where each has found it."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -47,11 +49,16 @@ def test_each_ending_is_judged_where_it_has_found_the_mask(explain):
     there = Ending(moved(state, TURN), Status.CONVERGED)
     here = Ending(state, Status.CONVERGED)
     assert judge.verdict(objective, there).chi_square == pytest.approx(expected.chi_square, rel=1e-9)
+    assert judge.verdict(objective, there) is judge.verdict(objective, there)  # which is not simulated again
     assert judge.verdict(objective, here).chi_square > 1.5 * expected.chi_square
     for now, rival in ((here, there), (there, here)):
         found = judge.compare(objective, now, rival)
         assert found.best is there
+        assert not found.alike
         assert found.verdict == judge.verdict(objective, there)
+    assert not judge.compare(objective, here, here).alike  # two starts of a mask may have found one wrong twin
+    full = Judge(Setting.of(objective), stack, replace(TRAITS, many_minima=True), Schedule())
+    assert full.compare(objective, here, here).alike
 
 
 def test_the_last_descent_is_held_to_the_modes_of_the_search(explain, five_holes):

@@ -38,14 +38,19 @@ class Judge:
         self.contrast: float = stack.contrast
         self.noise: FrameNoise = stack.noise_of_frames
         self.tolerance: Tolerance = Tolerance(schedule.model_errors, schedule.chance, least)
+        self._given: dict[tuple[int, bool], tuple[State, Verdict]] = {}  # with the state, which keeps its id
 
     def verdict(self, objective: MyopicObjective, ending: Ending) -> Verdict:
         """Return the verdict on whether the ending of one start, or of all, explains the frames."""
-        state = ending.state
+        key = id(ending.state), ending.status is not Status.ITERATION_LIMIT
+        if key not in self._given:  # the best start is judged beside each later one
+            self._given[key] = ending.state, self._verdict(objective, ending.state, at_rest=key[1])
+        return self._given[key][1]
+
+    def _verdict(self, objective: MyopicObjective, state: State, *, at_rest: bool) -> Verdict:
         objective = self.setting.objective_at(objective, state)
         pixels = (objective.precision.expand_as(objective.frames) > 0).sum((1, 2))
         chi_square = fit_of_frames(objective, state)[1]
-        at_rest = ending.status is not Status.ITERATION_LIMIT
         # For a full pupil poor minima, not modes left out, dominate the residual; `tolerance` allows for them.
         error = NO_MODEL_ERROR
         if not self.traits.many_minima:
@@ -62,9 +67,10 @@ class Judge:
         if now.status is Status.GIVEN_UP:
             return Comparison(rival, before, after, alike=False)
         best, verdict = (rival, before) if before.excess < after.excess else (now, after)
-        # The starts of a mask end alike at a wrong twin, which is no reason to stop.
-        scale = max(verdict.excess, verdict.limit - 1) if self.traits.many_minima else 0.0
-        return Comparison(best, verdict, after, abs(before.excess - after.excess) < self.schedule.alike * scale)
+        near = self.schedule.alike * max(verdict.excess, verdict.limit - 1)
+        # Starts of a mask end alike at a wrong twin too, which is no reason to stop.
+        alike = self.traits.many_minima and abs(before.excess - after.excess) < near
+        return Comparison(best, verdict, after, alike)
 
     def most_starts(self, verdict: Verdict) -> int:
         """Return the maximum number of starts if this is the verdict on the best."""
