@@ -23,7 +23,8 @@ def ended(explained):
     frames = objective.frames * transmission[:, None, None]
     valid = torch.ones_like(frames, dtype=torch.bool)
     valid[1, 4:8] = False
-    stack = FrameStack(frames, valid, UNIT, (UNIT * NOISE) ** 2)
+    variance = (UNIT * NOISE) ** 2
+    stack = FrameStack(frames, valid, UNIT, variance, slope=variance / UNIT)  # of photons alone
     objective = type(objective)(objective.model, frames, stack.precision, objective.prior)
     state = state.calibrated(transmission=transmission, aberration_weight=1.7)
     return objective, stack, Progress(Candidates(state, 1), [5.0, 4.0], n_evaluations=9, status=Status.CONVERGED)
@@ -83,7 +84,8 @@ def test_deviations_are_of_what_is_free(ended):
     assert float(whole.object_std.mean()) > 0
     of_object = add_deviations(result, objective.with_changes(free=Free.OBJECT), stack, progress, 2)
     assert float(of_object.coefficients_std.abs().max()) == 0
-    brighter = replace(stack, unit=2 * UNIT, variance=4 * stack.variance)
+    brighter = replace(stack, unit=2 * UNIT, variance=4 * stack.variance, slope=2 * stack.slope)
     twice = add_deviations(result, objective.with_changes(free=Free.OBJECT), brighter, progress, 2)
-    assert stack.photon_share == 1  # of both
+    assert bool((stack.photon_share[stack.valid] == 1).all())
+    torch.testing.assert_close(brighter.photon_share, stack.photon_share)
     torch.testing.assert_close(twice.object_std, 2 * of_object.object_std)

@@ -31,7 +31,7 @@ def test_a_stack_is_in_units_of_its_mean_pixel():
     assert float(stack.frames.mean()) == pytest.approx(1, rel=1e-12)
     torch.testing.assert_close(stack.frames * stack.unit, frames)
     assert stack.variance == pytest.approx(float(frames.mean()) + READOUT**2, rel=1e-12)
-    assert stack.photon_share == pytest.approx(stack.unit / (stack.unit + READOUT**2), rel=1e-12)
+    assert stack.photon_share.item() == pytest.approx(stack.unit / (stack.unit + READOUT**2), rel=1e-12)
 
 
 def test_precision_is_the_inverse_variance_of_valid_pixels():
@@ -76,13 +76,28 @@ def test_a_bright_border_is_noticed():
         FrameStack.of(exposures() + 100.0, None, GRID, PUPIL, None)
 
 
-def test_errors_weigh_every_pixel_by_itself():
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_errors_with_photon_noise_weigh_pixels_as_if_they_had_not_been_given(dtype):
+    frames = exposures()
+    told = FrameStack.of(frames, None, GRID, PUPIL, READOUT)
+    errors = (frames.clamp(min=0) + READOUT**2).sqrt().to(dtype)
+    stack = FrameStack.of(frames, None, GRID, PUPIL, None, errors=errors)
+    close = {"rtol": 100 * torch.finfo(dtype).eps, "atol": 0}
+    torch.testing.assert_close(stack.precision, told.precision.expand_as(frames), **close)
+    torch.testing.assert_close(stack.photon_share, told.photon_share.expand_as(frames), **close)
+    for found, expected in zip(stack.noise_of_frames, told.noise_of_frames, strict=True):
+        torch.testing.assert_close(found, expected, **close)
+
+
+def test_errors_without_photons_weigh_every_pixel_by_itself():
     frames, valid = exposures(), torch.ones(GRID.shape, dtype=torch.bool)
     valid[3, 4] = False
-    errors = (frames.clamp(min=0) + READOUT**2).sqrt()
+    errors = READOUT * (0.8 + torch.arange(32.0).double() / 64).expand(GRID.shape).clone()
+    errors[3, 4] = math.nan
     stack = FrameStack.of(frames, valid, GRID, PUPIL, None, errors=errors)
     assert bool((stack.precision[:, 3, 4] == 0).all())
-    torch.testing.assert_close(stack.precision[:, valid], (stack.unit / errors[:, valid]) ** 2)
-    assert stack.photon_share == 0  # the weights know which pixels are bright
+    torch.testing.assert_close(stack.precision[:, valid], ((stack.unit / errors[valid]) ** 2).expand(4, -1))
+    assert float(stack.photon_share.abs().max()) == 0
+    assert bool((stack.noise_of_frames.level == 1).all())
     single = stack.to(torch.float32, torch.device("cpu"))
     assert single.precision.dtype == torch.float32

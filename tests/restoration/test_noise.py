@@ -7,7 +7,7 @@ import torch
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture
-from torchmask.restoration.noise import FrameNoise, check_errors, expected_variance
+from torchmask.restoration.noise import FrameNoise, check_errors, even_photons, expected_variance, photon_slope
 
 GRID = Grid.nyquist(1.0, 550e-9, 32)
 PUPIL = FullAperture(1.0)
@@ -67,11 +67,14 @@ def test_errors_are_those_of_every_frame_or_of_each():
 
 
 @pytest.mark.parametrize(("gain", "readout"), [(1.0, 0.0), (1.0, 6.0), (0.25, 0.0)])
-def test_noise_of_frames_follows_their_light(gain, readout):
+@pytest.mark.parametrize("even", [True, False])
+def test_noise_of_frames_follows_their_light(gain, readout, even):
     """Half of the pixels have 3 times the light of the others, and frames 0.5 to 2 times that of the mean.
 
-    The variance of a pixel is its light and that of the read-out noise; without the latter the unit does not matter.
-    Over n = 10000 pixels a mean is known to the pixels' scatter over sqrt(n), their variance to sqrt(2 / n) of itself.
+    The variance of a pixel is its light and that of the read-out noise, which is assumed with the mean light. Without
+    read-out noise the unit does not matter. If `even` is False, some rows have more read-out noise, and another
+    row is not valid. Over n = 10000 pixels a mean is known to the pixels' scatter over sqrt(n), their variance to
+    sqrt(2 / n) of itself.
     """
     transmission = torch.tensor([0.5, 0.7, 1.0, 1.8], dtype=torch.float64)
     pattern = torch.cat([torch.full((50, 100), 20.0), torch.full((50, 100), 60.0)]).double()
@@ -79,11 +82,79 @@ def test_noise_of_frames_follows_their_light(gain, readout):
     generator = torch.Generator().manual_seed(0)
     frames = torch.poisson(light, generator=generator)
     frames = frames + readout * torch.randn(light.shape, generator=generator, dtype=torch.float64)
-    variance = light + readout**2
-    found = FrameNoise.of(gain * frames, gain**2 * float(variance.mean()))
-    means, scatter = variance.mean((1, 2)), 20.0**2 * transmission**2 + variance.mean((1, 2))
+    readouts, valid = torch.full_like(light, readout**2), torch.ones_like(light, dtype=torch.bool)
+    if not even:
+        readouts[:, 60:70], valid[:, 3] = 400.0, False
+        frames[:, 60:70] = light[:, 60:70] + 20 * torch.randn(4, 10, 100, generator=generator, dtype=torch.float64)
+    assumed = light.mean() + readouts
+    frames, found_in = gain * frames, gain**2 * assumed
+    found = FrameNoise.of(frames, valid, torch.where(valid, 1 / found_in, 0.0), gain)
+    variance = (light + readouts) / assumed
+    means = torch.stack([variance[t][valid[t]].mean() for t in range(4)])
+    scatter = torch.stack([((light.var((1, 2)).mean() + variance * assumed) / assumed**2)[t].mean() for t in range(4)])
     of_mean = scatter.sqrt() / 100 / means
-    torch.testing.assert_close(found.level, means / means.mean(), rtol=4 * float(of_mean.max()), atol=0)
-    expected = variance.square().mean((1, 2)) / means**2
+    torch.testing.assert_close(found.level, means, rtol=5 * float(of_mean.max()), atol=0)
+    expected = torch.stack([(variance[t][valid[t]] ** 2).mean() for t in range(4)]) / means**2
     error = math.sqrt(2 / 10000) * scatter / means**2 + 2 * of_mean * (expected - 1)
     assert bool(((found.unevenness - expected).abs() < 4 * error).all())
+
+
+def photons_on_a_map(slope, dtype=torch.float64, n_frames=6):
+    """Frames of changing light, and the variances that a pipeline writes: `slope` times the counts and a map."""
+    generator = torch.Generator().manual_seed(1)
+    light = 60 * torch.rand(n_frames, 40, 40, generator=generator, dtype=torch.float64)
+    detector = 2 + 100 * torch.rand(40, 40, generator=generator, dtype=torch.float64) ** 8
+    frames = torch.poisson(light, generator=generator)
+    frames += detector.sqrt() * torch.randn(frames.shape, generator=generator, dtype=torch.float64)
+    return frames.to(dtype), (slope * frames.clamp(min=0) + detector).to(dtype), detector.to(dtype)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("slope", [0.0, 0.25, 1.0, 2.0])
+def test_photons_in_errors_are_found_and_evened_out(slope, dtype):
+    frames, variance, detector = photons_on_a_map(slope, dtype)
+    errors, valid = variance.sqrt(), torch.ones_like(frames, dtype=torch.bool)
+    rounding = 20 * torch.finfo(dtype).eps
+    found = photon_slope(frames, errors, valid)
+    # a difference of two variances of at most 200, over one of counts, most of which are above 1
+    assert found == pytest.approx(slope, abs=200 * rounding)
+    even = even_photons(frames, errors, found)
+    expected = (slope * frames.mean() + detector).sqrt().expand_as(frames)
+    torch.testing.assert_close(even, expected, rtol=200 * rounding, atol=0)
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.25, 1.0])
+def test_slope_of_photons_is_right_within_its_statistical_error(slope):
+    """Variances that scatter by sigma: least absolute deviations are normal, of variance 1 / (4 f(0)^2 sum of run^2).
+
+    A difference of two such variances has the density f(0) = 1 / (2 sigma sqrt(pi)) at 0 (Bassett & Koenker 1978).
+    """
+    frames, variance, _ = photons_on_a_map(slope)
+    sigma = 1.5
+    noise = sigma * torch.randn(frames.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    run = (frames[0::2] - frames[1::2])[(frames[0::2] > 0) & (frames[1::2] > 0)]
+    deviation = sigma * math.sqrt(math.pi) / float(run.norm())
+    found = photon_slope(frames, (variance + noise).clamp(min=0).sqrt(), torch.ones_like(frames, dtype=torch.bool))
+    assert abs(found - slope) < 4 * deviation
+    assert 4 * deviation < 0.02  # which tells 0 from 0.25
+
+
+def test_cosmic_rays_and_dead_pixels_do_not_change_the_slope_and_keep_their_errors():
+    frames, variance, _ = photons_on_a_map(1.0)
+    errors, valid = variance.sqrt(), torch.ones_like(frames, dtype=torch.bool)
+    errors[:, 3], errors[2, 10:14, 5:30] = 1e6, 1e5  # a dead row, and a hit of one frame
+    errors[:, 7], valid[:, 7] = math.nan, False
+    slope = photon_slope(frames, errors, valid)
+    assert slope == pytest.approx(1.0, abs=1e-9)
+    even = even_photons(frames, errors, slope)
+    torch.testing.assert_close(even[:, 3], errors[:, 3], rtol=1e-9, atol=0)
+    torch.testing.assert_close(even[2, 10:14, 5:30], errors[2, 10:14, 5:30], rtol=1e-7, atol=0)
+    assert float(even[3, 10:14, 5:30].max()) < 15
+
+
+def test_errors_that_are_the_same_in_all_frames_hold_no_photons():
+    frames, variance, detector = photons_on_a_map(1.0)
+    valid = torch.ones_like(frames, dtype=torch.bool)
+    assert photon_slope(frames, detector.sqrt().expand_as(frames), valid) == 0
+    assert photon_slope(frames[:1], variance[:1].sqrt(), valid[:1]) == 0  # one frame does not tell
+    assert photon_slope(-frames.abs(), variance.sqrt(), valid) == 0

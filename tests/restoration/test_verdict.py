@@ -24,7 +24,8 @@ def verdict_on(*chi_square, contrast=50.0, tolerance=TOLERANCE, at_rest=True, er
         "chi_square": torch.tensor(chi_square, dtype=torch.float64),
         "pixels": torch.full((n_frames,), PIXELS),
         "transmission": torch.ones(n_frames),
-        "noise": FrameNoise.even(n_frames),
+        "noise": FrameNoise(torch.ones(n_frames), torch.ones(n_frames)),
+        "parameters": 100.0,
     }
     return judge(FrameFits(**(told | fits)), contrast, error, tolerance, at_rest=at_rest)
 
@@ -107,6 +108,30 @@ def test_frames_of_noise_alone_are_not_explained():
     assert "nothing but noise" in str(verdict_on(1.0, 1.0, contrast=noise))
     assert "counts as explained" not in str(verdict_on(1.0, 1.0, contrast=noise))
     assert verdict_on(1.0, 1.0, contrast=noise + 0.01).explained
+
+
+def test_noise_that_the_frames_do_not_show_is_told():
+    """100 parameters take 100 pixels of noise, or those of three times the noise where it is uneven."""
+    for unevenness in (1.0, 3.0):
+        noise = FrameNoise(torch.ones(2), torch.full((2,), unevenness))
+        least = 1 - 100 * unevenness / 1920 - 5 * math.sqrt(2 * unevenness / 1920)
+        at_least = 0.96 * least  # per pixel
+        good = verdict_on(at_least + 1e-6, at_least + 1e-6, noise=noise)
+        assert good.finding is Finding.EXPLAINED
+        assert good.least == pytest.approx(least, rel=1e-9)
+        told = verdict_on(at_least - 1e-6, at_least - 1e-6, noise=noise)
+        assert told.finding is Finding.TOO_MUCH_NOISE
+        assert not told.explained
+    assert str(told).startswith("not judged, the frames show less noise than assumed: check read-out noise, gain")
+    assert f"a fit leaves {least:.2g} at least if the noise is right" in str(told)
+    assert verdict_on(0.01, 0.01, parameters=1900.0).least == 0  # so few frames do not tell
+    assert verdict_on(0.01, 0.01, parameters=1900.0).explained
+
+
+def test_noise_that_light_makes_uneven_does_not_make_a_good_fit_worse():
+    noise = FrameNoise(torch.tensor([1.5, 1.7]), torch.ones(2))
+    limit = 1.6 + 2 * 0.3 + 2 * math.hypot(1.5, 1.7) * math.sqrt(2 / 960) / 2
+    assert verdict_on(1.5, 1.7, noise=noise).limit == pytest.approx(limit, rel=1e-6)
 
 
 def test_it_is_kept_as_json():

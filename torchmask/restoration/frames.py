@@ -13,7 +13,7 @@ from torchmask.grid import Grid
 from torchmask.observation import check_frames
 from torchmask.optics.aperture import Aperture
 from torchmask.restoration.background import Background, check_known_level
-from torchmask.restoration.noise import FrameNoise, check_errors, expected_variance
+from torchmask.restoration.noise import FrameNoise, check_errors, even_photons, expected_variance, photon_slope
 
 Array = Tensor | np.ndarray
 
@@ -31,7 +31,9 @@ class FrameStack:
     variance : mean noise variance of a pixel [electrons^2], including that of the background
     known : known background [electrons], which broadcasts to the frames
     free : unknown background, not `IF_SEEN`
-    errors : (T, H, W) measured standard deviations of the pixels [electrons]; None if all pixels have `variance`
+    errors : (T, H, W) standard deviations of the pixels [electrons], with even photon noise; None if all pixels have
+        `variance`
+    slope : variance of the photon noise per electron of light, at most 1 without errors
     """
 
     frames: Tensor
@@ -41,6 +43,7 @@ class FrameStack:
     known: Tensor = field(default_factory=lambda: torch.zeros(1, 1, 1, device="cpu"))
     free: Background = Background.NONE
     errors: Tensor | None = None
+    slope: float = 0.0
 
     @classmethod
     def of(
@@ -61,6 +64,10 @@ class FrameStack:
         frames, valid = check_frames(frames, valid, grid)
         errors = None if errors is None else check_errors(errors, frames, valid)
         variance = expected_variance(frames, grid, aperture, readout_noise, valid, errors)
+        slope = min(1.0, variance / float(frames.mean()))
+        if errors is not None:
+            slope = photon_slope(frames, errors, valid)
+            errors = even_photons(frames, errors, slope)
         free = background.of(frames) if isinstance(background, Background) else Background.NONE
         known = check_known_level(0.0 if isinstance(background, Background) else background, frames)
         frames = frames - known
@@ -75,7 +82,7 @@ class FrameStack:
                 "level as background [electrons per pixel]",
                 stacklevel=3,
             )
-        return cls(frames / unit, valid, unit, variance, known, free, errors)
+        return cls(frames / unit, valid, unit, variance, known, free, errors, slope)
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -115,18 +122,19 @@ class FrameStack:
         return float((total * (mean - level) ** 2).sum() / (total > 0).sum())
 
     @property
-    def noise_of_frames(self) -> FrameNoise:
-        """Noise of each frame relative to what `precision` says."""
-        if self.errors is not None:
-            return FrameNoise.even(len(self))
-        return FrameNoise.of(self.frames * self.unit + self.known, self.variance)
+    def grain(self) -> float:
+        """Variance of the photon noise of a mean pixel, in units of the stack."""
+        return self.slope / self.unit
 
     @property
-    def photon_share(self) -> float:
-        """Fraction of the noise variance that is photon noise, at most 1; 0 if `errors` include it already."""
-        if self.errors is not None:
-            return 0.0
-        return min(1.0, self.unit / self.variance)
+    def noise_of_frames(self) -> FrameNoise:
+        """Noise of each frame relative to what `precision` says."""
+        return FrameNoise.of(self.frames + self.known / self.unit, self.valid, self.precision, self.grain)
+
+    @property
+    def photon_share(self) -> Tensor:
+        """Fraction of the noise variance that is photon noise of the object, (T, H, W) or (1, 1, 1); 0 if not valid."""
+        return self.precision * self.grain
 
 
 def border_brightness(frames: Tensor) -> float:

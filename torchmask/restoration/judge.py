@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import cached_property
 from typing import NamedTuple
 
@@ -55,7 +56,9 @@ class Judge:
         error = NO_MODEL_ERROR
         if not self.traits.many_minima:
             error = self._expected_error(objective, state)
-        frames = FrameFits(chi_square, pixels, state.calibration.transmission, self.noise)
+        frames = FrameFits(
+            chi_square, pixels, state.calibration.transmission, self.noise, _parameters(objective, state)
+        )
         return judge(frames, self.contrast, error, self.tolerance, at_rest=at_rest)
 
     def compare(self, objective: MyopicObjective, now: Ending, rival: Ending | None) -> Comparison:
@@ -101,3 +104,9 @@ class Judge:
     def _left_out(self) -> LeftOut:
         n_modes = self.setting.still.n_modes
         return LeftOut.of(self.setting.told, n_modes, self.traits.r0, self.traits.outer_scale)
+
+
+def _parameters(objective: MyopicObjective, state: State) -> float:
+    """Return the number of parameters: the object's frequencies below the cut-off, and those of every frame."""
+    of_object = min(1.0, math.pi * objective.model.cutoff**2) * state.image.numel()
+    return of_object + state.z.numel() + 2 * len(state.z)  # transmission and background

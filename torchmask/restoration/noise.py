@@ -21,31 +21,29 @@ _CLEARLY_MORE = 1.1  # times the expected variance, a few times the error of the
 class FrameNoise(NamedTuple):
     """Noise of single frames, which photons make larger where there is more light.
 
-    level : (T,) mean variance of a frame's pixels, over that of the stack
-    unevenness : (T,) mean square of the variances of a frame's pixels, over the square of their mean
+    level : (T,) mean variance of a frame's pixels, in units of the assumed ones
+    unevenness : (T,) mean square of these variances, over the square of their mean
     """
 
     level: Tensor
     unevenness: Tensor
 
     @classmethod
-    def of(cls, frames: Tensor, variance: float) -> FrameNoise:
-        """Return the noise of frames (T, H, W) [electrons], whose mean variance is known [electrons^2].
+    def of(cls, frames: Tensor, valid: Tensor, precision: Tensor, grain: float) -> FrameNoise:
+        """Return the noise of frames (T, H, W) over their valid pixels.
 
-        The variance of a pixel is a constant plus its light. That of the light over a frame is the variance of its
-        pixels less their noise.
+        The assumed variance is 1 / `precision`, (T, H, W) or (1, 1, 1), of which the photons of a mean pixel are
+        `grain` times its light. Where the light is more by d, the variance is 1 + precision grain d of the assumed one.
+        Of the mean square of that, the part that the noise in d makes is taken off.
         """
-        frames = frames.double()
-        light, mean = frames.mean((1, 2)), float(frames.mean())
-        share = min(1.0, mean / variance)  # of photons in the noise
-        level = 1 + share * (light / mean - 1)
-        spread = (frames.var((1, 2)) - level * variance).clamp(min=0) / mean**2
-        return cls(level, 1 + share**2 * spread / level**2)
-
-    @classmethod
-    def even(cls, n_frames: int) -> FrameNoise:
-        """Return the noise of frames whose residuals are in units of each pixel's own noise."""
-        return cls(torch.ones(n_frames, dtype=torch.float64), torch.ones(n_frames, dtype=torch.float64))
+        mean, squares, levels = float(frames.mean()), [], []
+        for frame, seen, weight in zip(frames, valid, precision.expand_as(frames), strict=True):
+            by_light = grain * weight[seen].double()
+            variance = 1 + by_light * (frame[seen].double() - mean)
+            levels.append(variance.mean())
+            squares.append((variance**2 - grain * by_light * variance).mean())
+        level = torch.stack(levels)
+        return cls(level, (torch.stack(squares) / level**2).clamp(min=1))
 
 
 def expected_variance(
@@ -105,3 +103,32 @@ def check_errors(errors: Tensor | np.ndarray, frames: Tensor, valid: Tensor, num
             f"{(number, row, column)}: standard deviations in electrons are needed, or False in `valid`"
         )
     return given
+
+
+def photon_slope(frames: Tensor, errors: Tensor, valid: Tensor) -> float:
+    """Return by how much the variance `errors`**2 (T, H, W) rises with the counts of `frames`, at least 0.
+
+    It is 1 for errors in electrons that include photon noise, and 0 for those of the detector alone. Only changes from
+    one frame to the next count, as a map of the detector may resemble the object by chance; the slope has the least
+    absolute deviations from them, so that cosmic rays do not matter. Errors that are the same in all frames, or of a
+    single frame, have slope 0.
+    """
+    pairs = 2 * (len(frames) // 2)
+    lit = valid & (frames > 0)  # many pipelines take negative counts for none
+    seen = lit[0:pairs:2] & lit[1:pairs:2] & (frames[0:pairs:2] != frames[1:pairs:2])
+    run, rise = ((values[0:pairs:2] - values[1:pairs:2])[seen] for values in (frames, errors.square()))
+    slopes, order = (rise / run).sort()
+    weight = run.abs()[order].cumsum(0)
+    if not len(weight):
+        return 0.0
+    return max(0.0, float(slopes[int((weight < weight[-1] / 2).sum())]))
+
+
+def even_photons(frames: Tensor, errors: Tensor, slope: float) -> Tensor:
+    """Return `errors` (T, H, W) [electrons] whose photon noise is that of a mean pixel in all pixels.
+
+    True photon noise would weigh bright pixels least, where most of the object is to be seen. Restorations lose by it,
+    see docs/tried.md. `slope` is that of `photon_slope`; the rest of the variance stays as it is.
+    """
+    rest = (errors.square() - slope * frames.clamp(min=0)).clamp(min=0)
+    return (slope * frames.mean() + rest).sqrt()

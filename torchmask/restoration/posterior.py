@@ -34,7 +34,7 @@ _ITERATIONS = 50  # of conjugate gradients: variances below the cut-off are then
 
 
 def standard_deviations(
-    objective: MyopicObjective, state: State, cutoff: float, photon_share: float, n_samples: int
+    objective: MyopicObjective, state: State, cutoff: float, photon_share: Tensor | float, n_samples: int
 ) -> tuple[Tensor, Tensor]:
     """Return standard deviations (H', W') of the object below `cutoff` [cycles/pixel], and samples of the aberrations.
 
@@ -99,7 +99,7 @@ def _sample(
     state: State,
     power: Tensor,
     prior: Tensor,
-    photon_share: float,
+    photon_share: Tensor | float,
     n_samples: int,
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchmask.restoration.model_error import ModelError
 from torchmask.restoration.noise import FrameNoise
 
-_SURE = 5.0  # standard deviations of the noise above which the mean frame shows an object
+_SURE = 5.0  # standard deviations of the noise that do not occur by chance
 _LOST = 2.0  # times the minimum tolerance of a stack is allowed for single frames: they end in minima of their own
 _BY_CHANCE = 0.01  # of the good stacks have a frame that is named because of its noise
 
@@ -25,6 +25,7 @@ class Finding(Enum):
     EXPLAINED = "explained"
     NOT_EXPLAINED = "not explained"
     ONLY_NOISE = "not explained, the frames show nothing but noise"
+    TOO_MUCH_NOISE = "not judged, the frames show less noise than assumed"
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,7 @@ class Verdict:
     check : what may be wrong; empty if everything is explained
     contradiction : what the fringes say against the mask as given, and which fits better; empty if nothing
     unseen : other orientations of the mask that would make the same fringes; empty if there are none
+    least : chi-square below which no fit comes; 0 if that cannot be told
 
     Examples
     --------
@@ -62,6 +64,7 @@ class Verdict:
     check: str
     contradiction: str = ""
     unseen: str = ""
+    least: float = 0.0
 
     @property
     def explained(self) -> bool:
@@ -75,7 +78,9 @@ class Verdict:
 
     def __str__(self) -> str:
         numbers = f"chi-square is {self.chi_square:.4g} over {self.degrees_of_freedom} degrees of freedom"
-        if self.finding is not Finding.ONLY_NOISE:  # whose chi-square explains nothing, however small
+        if self.finding is Finding.TOO_MUCH_NOISE:
+            numbers += f"; a fit leaves {self.least:.2g} at least if the noise is right"
+        elif self.finding is not Finding.ONLY_NOISE:  # whose chi-square explains nothing, however small
             numbers += f"; up to {self.limit:.4g} counts as explained"
             if self.phase_error:
                 numbers += f", since modes left out ({self.phase_error:.2g} rad rms) add about {self.model_error:.2g}"
@@ -116,16 +121,18 @@ class Tolerance:
 class FrameFits(NamedTuple):
     """How well single frames are fitted, and what their light lets expect.
 
-    chi_square : (T,) mean square of the residuals, in units of the stack's noise
+    chi_square : (T,) mean square of the residuals, in units of the assumed noise
     pixels : (T,) number of valid pixels
     transmission : (T,) transmission of each frame, 1 on average
     noise : noise of each frame
+    parameters : number of free parameters of the object and all frames; infinite if unknown
     """
 
     chi_square: Tensor
     pixels: Tensor
     transmission: Tensor
     noise: FrameNoise
+    parameters: float = math.inf
 
 
 def judge(frames: FrameFits, contrast: float, error: ModelError, tolerance: Tolerance, *, at_rest: bool) -> Verdict:
@@ -133,7 +140,8 @@ def judge(frames: FrameFits, contrast: float, error: ModelError, tolerance: Tole
 
     `contrast` is the chi-square per pixel of the mean frame against a uniform one; `at_rest` says whether the search
     ran to its end. Noise gives a frame the chi-square of its own noise level, whose variance is 2 over the degrees of
-    freedom times `unevenness`; what the model lacks adds in proportion to the square of its transmission.
+    freedom times `unevenness`; what the model lacks adds in proportion to the square of its transmission. Each free
+    parameter takes the noise of one pixel at most, of a bright one where noise is uneven.
     """
     chi_square, pixels, transmission, level, unevenness = (
         values.double().cpu() for values in (*frames[:3], *frames.noise)
@@ -143,21 +151,29 @@ def judge(frames: FrameFits, contrast: float, error: ModelError, tolerance: Tole
     found = float((chi_square * pixels).sum()) / total
     deviation = level * (2 * unevenness / free).sqrt()
     expected = tolerance.model_errors * error.excess
-    limit = 1 + max(expected, tolerance.least) + tolerance.chance * float((free * deviation).norm()) / total
+    noise, chance = float((free * level).sum()) / total, float((free * deviation).norm()) / total
+    limit = noise + max(expected, tolerance.least) + tolerance.chance * chance
+    taken = frames.parameters * float((level * unevenness).max()) / total
+    least = max(0.0, noise - taken - _SURE * chance)
     each = level + max(expected, _LOST * tolerance.least) * transmission**2
     each += NormalDist().inv_cdf(1 - _BY_CHANCE / len(pixels)) * deviation
     lost = tuple((chi_square * pixels / free > each).nonzero().flatten().tolist())
     if contrast - 1 < _SURE * math.sqrt(2 / float(pixels.max())):
         finding = Finding.ONLY_NOISE
+    elif found < least:
+        finding = Finding.TOO_MUCH_NOISE
     else:
         finding = Finding.EXPLAINED if found <= limit else Finding.NOT_EXPLAINED
     check = _what_to_check(finding, len(lost), len(pixels), at_rest)
-    return Verdict(finding, found, round(total), error.excess, limit, error.phase, lost, len(pixels), check)
+    numbers = (found, round(total), error.excess, limit, error.phase)
+    return Verdict(finding, *numbers, lost, len(pixels), check, least=least)
 
 
 def _what_to_check(finding: Finding, n_lost: int, n_frames: int, at_rest: bool) -> str:
     if finding is Finding.ONLY_NOISE:
         return "the pointing, the crop and the exposure time"
+    if finding is Finding.TOO_MUCH_NOISE:
+        return "read-out noise, gain and errors of pixels"
     few = 0 < n_lost <= n_frames / 2
     if finding is Finding.EXPLAINED:
         return "those frames for clouds and tracking errors" if n_lost else ""
