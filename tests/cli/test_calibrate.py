@@ -31,7 +31,7 @@ def star(tmp_path):
     scene = torch.zeros(64, 64, dtype=torch.float64)
     scene[32, 32] = 1e7
     seen = simulate_observation(scene, TRUE.apply(TOLD), GRID, None, Detector(), n_frames=1)
-    Observation(seen.frames, TOLD, GRID, 1.0).save(tmp_path / "star.npz")
+    Observation(seen.frames, TOLD, GRID, 1.0, frame_numbers=(3,)).save(tmp_path / "star.npz")
     return tmp_path / "star.npz"
 
 
@@ -39,6 +39,8 @@ def test_the_mask_where_it_lies_is_written(star, tmp_path, capsys):
     assert main(["calibrate", str(star), "--out", str(tmp_path / "run")]) == 0
     numbers = json.loads((tmp_path / "run" / "calibration.json").read_text())
     assert abs(numbers["rotation"] - 0.02) < 4 * numbers["errors"]["rotation"] + 1e-4
+    assert numbers["frame_numbers"] == [3]  # as the file has them
+    assert len(numbers["explained"]) == 1
     mask = load_mask(tmp_path / "run" / "mask.json")
     assert mask_wavelength(tmp_path / "run" / "mask.json") == GRID.wavelength
     expected = MaskGeometry(**{name: numbers[name] for name in TRUE.__dataclass_fields__}).apply(TOLD)

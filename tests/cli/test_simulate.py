@@ -68,6 +68,10 @@ def test_options_are_the_turbulence_that_they_name():
         (["--turbulence.exposure-time", "0.1"], "no wind"),
         (["--turbulence.profile", "hv58"], "profile 'hv58' is unknown: known ones are hv57, las_campanas, mauna_kea"),
         (["--turbulence.frame-interval", "0.1"], "--turbulence.frame-interval needs --turbulence.wind"),
+        (
+            ["--conditions.temperature", "3000"],
+            r"--conditions.temperature is that of light in a band: give --conditions",
+        ),
         (["--conditions.band-width", "-1e-9"], r"--conditions.band-width is -1e-09: it must be at least 0 m"),
         (["--conditions.band-width", "8e-8", "--pixel-scale-arcsec", f"{FINE_ENOUGH:.6f}"], r"undersamples .* 5\.1\d"),
         (["--pixel-scale-arcsec", "0"], "--pixel-scale-arcsec is 0: it must be finite and positive, in arcsec"),

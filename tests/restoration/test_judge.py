@@ -1,5 +1,6 @@
 """Endings are judged with the mask where each has found it."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -11,10 +12,12 @@ from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.judge import Judge
 from torchmask.restoration.model_error import LeftOut, expected_error, fitted_parameters
 from torchmask.restoration.motion import Setting
+from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.placed import moved_centers
 from torchmask.restoration.placement import moved
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.traits import Refinement, Traits
+from torchmask.restoration.verdict import Finding
 
 TURN = torch.tensor([0.02, 0.0], dtype=torch.float64)
 TRAITS = Traits(
@@ -59,6 +62,22 @@ def test_each_ending_is_judged_where_it_has_found_the_mask(explain):
     assert not judge.compare(objective, here, here).alike  # two starts of a mask may have found one wrong twin
     full = Judge(Setting.of(objective), stack, replace(TRAITS, many_minima=True), Schedule())
     assert full.compare(objective, here, here).alike
+
+
+def test_noise_told_too_large_is_no_explanation(explain):
+    """Of ten times the noise, a hundredth of the chi-square is left; of the right noise, more than is asked for."""
+    objective, state = explain(noise=0.003)
+    ending = Ending(state, Status.CONVERGED)
+    for factor, finding in ((1.0, Finding.EXPLAINED), (10.0, Finding.TOO_MUCH_NOISE)):
+        stack = replace(stack_of(objective), variance=(factor * 0.003) ** 2)
+        told = MyopicObjective(objective.model, stack.frames, stack.precision, objective.prior)
+        verdict = Judge(Setting.of(told), stack, TRAITS, Schedule()).verdict(told, ending)
+        assert verdict.finding is finding
+        pixels, n = objective.frames.numel(), state.z.numel() + 2 * len(state.z)
+        of_object = math.pi * objective.model.cutoff**2 * state.image.numel()
+        chance = 5 * math.sqrt(2 / verdict.degrees_of_freedom)
+        assert verdict.least == pytest.approx(1 - (of_object + n) / verdict.degrees_of_freedom - chance, rel=1e-3)
+        assert verdict.chi_square * verdict.degrees_of_freedom < pixels * 1.1 / factor**2
 
 
 def test_the_last_descent_is_held_to_the_modes_of_the_search(explain, five_holes):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +71,7 @@ def calibrate_on(
     """Measure the mask's geometry on exposures of a star. Raises ValueError as `calibrate_mask` or for a full pupil."""
     if not isinstance(star.aperture, SparseAperture):
         raise ValueError("--mask is a full pupil: only a mask has fringes, which calibration needs")
-    return calibrate_mask(
+    found = calibrate_mask(
         star.frames,
         star.aperture,
         star.grid,
@@ -82,6 +82,7 @@ def calibrate_on(
         n_modes=n_modes,
         callback=callback,
     )
+    return replace(found, frame_numbers=star.frame_numbers)
 
 
 def read_star(path: Path, options: StackOptions, estimate_pixel: bool) -> MaskCalibration:
@@ -111,6 +112,7 @@ def estimates(found: MaskCalibration, files: Sequence[Path]) -> dict[str, Any]:
         "transmission_errors": found.transmission_errors.tolist(),
         "offset": found.offset.tolist(),
         "offset_errors": found.offset_errors.tolist(),
+        "frame_numbers": list(found.frame_numbers),
         "explained": found.explained.tolist(),
         "fill_factor": found.fill_factor,
         "fill_factor_error": found.fill_factor_error,

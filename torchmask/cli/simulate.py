@@ -92,6 +92,11 @@ class ConditionOptions(FilterOptions):
             )
         if self.band_width and self.filter is not None:
             raise ValueError("--conditions.band-width and --conditions.filter are both given: give only one of them")
+        if self.temperature is not None and not self.band_width and self.filter is None:
+            raise ValueError(
+                "--conditions.temperature is that of light in a band: give --conditions.filter or "
+                "--conditions.band-width, or leave it out"
+            )
         even = None
         if self.band_width:
             passband = Passband.top_hat(wavelength, self.band_width)

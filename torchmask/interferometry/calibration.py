@@ -54,6 +54,7 @@ class MaskCalibration:
     explained : (T,) fraction of the variance of each frame's pixels around the star that the fit explains
     fill_factor, fill_factor_error : sensitive fraction of a pixel's area, which noise may take out of its range of 0
         to 1, and its error; None if it was not estimated
+    frame_numbers : numbers of the frames in their files, as `Observation.frame_numbers`; empty if not known
 
     Examples
     --------
@@ -83,6 +84,7 @@ class MaskCalibration:
     explained: Tensor
     fill_factor: float | None = None
     fill_factor_error: float | None = None
+    frame_numbers: tuple[int, ...] = ()
 
     @property
     def pixel(self) -> SquarePixel | None:
