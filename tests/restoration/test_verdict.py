@@ -122,6 +122,7 @@ def test_noise_that_the_frames_do_not_show_is_told():
         told = verdict_on(at_least - 1e-6, at_least - 1e-6, noise=noise)
         assert told.finding is Finding.TOO_MUCH_NOISE
         assert not told.explained
+    assert verdict_on(0.01, 0.01, contrast=0.01).finding is Finding.TOO_MUCH_NOISE  # which hides the object
     assert str(told).startswith("not judged, the frames show less noise than assumed: check read-out noise, gain")
     assert f"a fit leaves {least:.2g} at least if the noise is right" in str(told)
     assert verdict_on(0.01, 0.01, parameters=1900.0).least == 0  # so few frames do not tell

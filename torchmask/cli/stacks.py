@@ -76,7 +76,7 @@ class StackOptions(InstrumentOptions, MaskOptions, FITSOptions):
     skip: tuple[int, ...] = ()
     """Numbers of frames to leave out, counted from 0 through all files of a stack."""
     errors: bool = True
-    """Weight pixels by the standard deviations in the file (FITS extension ERR), if it has them."""
+    """Weight pixels by the standard deviations in the file (FITS extension ERR), if any; photon noise counts evenly."""
 
 
 def group_files(files: Sequence[Path], join: bool) -> dict[str, list[Path]]:

@@ -222,7 +222,8 @@ class MyopicDeconvolution:
         valid : (H, W) or (T, H, W) boolean tensor or array, optional
             False where a pixel is dead or saturated; it is ignored, whatever its value.
         errors : (H, W) or (T, H, W) tensor or array, optional
-            Measured standard deviations of the pixels' noise [electrons]. None: the same for all pixels.
+            Standard deviations of the pixels' noise [electrons]. Photon noise in them, which follows the frames, is
+            evened out (`even_photons`), so that bright pixels keep their weight. None: the same for all pixels.
         coefficients : (T, N, J) tensor, optional
             Known aberrations [rad rms], which stay fixed: non-blind deconvolution.
         covariance : (N J, N J) tensor, optional
@@ -239,8 +240,7 @@ class MyopicDeconvolution:
         seed : int
             Seed of the random starts and candidates, and of the samples of aberrations that are integrated out.
         checkpoint : path, optional
-            An .npz file, written every 100 iterations. If it exists, the restoration resumes from it, and ends in the
-            same result as if it had not been interrupted.
+            An .npz file, written every 100 iterations. If it exists, the restoration resumes from it to the same end.
         callback : callable, optional
             Called with a `Record` after every iteration; every tenth includes the object and the coefficients.
 

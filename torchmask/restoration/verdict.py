@@ -158,10 +158,10 @@ def judge(frames: FrameFits, contrast: float, error: ModelError, tolerance: Tole
     each = level + max(expected, _LOST * tolerance.least) * transmission**2
     each += NormalDist().inv_cdf(1 - _BY_CHANCE / len(pixels)) * deviation
     lost = tuple((chi_square * pixels / free > each).nonzero().flatten().tolist())
-    if contrast - 1 < _SURE * math.sqrt(2 / float(pixels.max())):
-        finding = Finding.ONLY_NOISE
-    elif found < least:
+    if found < least:
         finding = Finding.TOO_MUCH_NOISE
+    elif contrast - 1 < _SURE * math.sqrt(2 / float(pixels.max())):
+        finding = Finding.ONLY_NOISE
     else:
         finding = Finding.EXPLAINED if found <= limit else Finding.NOT_EXPLAINED
     check = _what_to_check(finding, len(lost), len(pixels), at_rest)
