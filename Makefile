@@ -4,6 +4,8 @@ BIN := .venv/bin
 export OMP_NUM_THREADS ?= 1
 # Threads that wait for each other sleep: spinning, they take the time of whatever else runs.
 export OMP_WAIT_POLICY ?= passive
+# Types and manual take over a minute each, on one core.
+MAKEFLAGS += --jobs=2
 
 .venv/.torch: constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv

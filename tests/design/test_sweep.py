@@ -103,13 +103,13 @@ def test_an_interrupted_sweep_ends_and_keeps_what_is_done(tmp_path):
 @pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs Ray: pip install 'torchmask[cluster]'")
 def test_a_local_ray_cluster_computes_the_same(tmp_path):
     process = start(tmp_path, "ray")
-    deadline = time.monotonic() + 90
+    deadline = time.monotonic() + 300  # of a busy machine
     while len(finished(tmp_path)) < 2:  # files appear while the sweep runs, not at its end
         assert process.poll() is None, process.communicate()[1]
         assert time.monotonic() < deadline
         time.sleep(0.01)
     assert len(list((tmp_path / "marks").glob("*.ended"))) < 10
-    _, errors = process.communicate(timeout=90)
+    _, errors = process.communicate(timeout=300)
     assert process.returncode == 0, errors.decode()
     assert len(finished(tmp_path)) == 10
     assert len(list((tmp_path / "marks").glob("*.started"))) == 10

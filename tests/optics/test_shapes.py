@@ -342,12 +342,12 @@ def test_holes_nearer_than_their_separation_overlap(shape):
 @each_outlined
 def test_the_gap_is_never_more_than_the_true_one(shape):
     points = edge_points(shape)[:: max(1, len(edge_points(shape)) // 400)]
-    along = np.linspace(0, 1, 200)[:, None, None]
-    side = (points + along * (np.roll(points, -1, axis=0) - points)).reshape(-1, 2)[::7]
+    along = np.linspace(0, 1, 50)[:, None, None]
+    side = (points + along * (np.roll(points, -1, axis=0) - points)).reshape(-1, 2)[::23]
     for difference in random_points(6, scale=4.0, seed=4):
         gap = float(shape.separation(difference)) - WIDTH
         if gap > 0:
-            distance = np.linalg.norm(side[:, None] - (side[None, ::11] + difference.numpy()), axis=-1).min()
+            distance = np.linalg.norm(side[:, None] - (side[None] + difference.numpy()), axis=-1).min()
             assert gap < distance * (1 + 1e-3)
 
 
