@@ -106,7 +106,7 @@ def check_errors(errors: Tensor | np.ndarray, frames: Tensor, valid: Tensor, num
 
 
 def photon_slope(frames: Tensor, errors: Tensor, valid: Tensor) -> float:
-    """Return by how much the variance `errors`**2 (T, H, W) rises with the counts of `frames`, at least 0.
+    """Return by how much the square of `errors` (T, H, W) rises with the counts of `frames`, at least 0.
 
     It is 1 for errors in electrons that include photon noise, and 0 for those of the detector alone. Only changes from
     one frame to the next count, as a map of the detector may resemble the object by chance; the slope has the least
