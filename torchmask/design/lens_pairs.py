@@ -5,13 +5,14 @@ Two lenses with middles c apart, at baselines that differ by less than two holes
     T(u) T(u') < exp(-Q(b, c + t) / 2) >
 
 at the baseline b, u and u' from their own ones; t is the separation of two points, one of either lens, from their
-middles. It is known by its second moments, to which the exposure adds those of the drift: four points stand for it.
-The mean varies little over a patch and is a parabola in b there, after a factor that is common to far lenses is split
-off. The lenses of holes with themselves, at baseline 0, take part; there are N of them in one place.
+middles. It is known by its second moments, to which the exposure adds those of the drift: nine points stand for it.
+The logarithm of the mean is a parabola in b over a patch, after a factor that is common to far lenses is split off. The
+lenses of holes with themselves, at baseline 0, take part; there are N of them in one place.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -26,7 +27,10 @@ from torchmask.design.overlap import Geometry
 _SMALLEST = 5e-4  # products T T' exp(-Q / 2) below, as estimated, are left out
 _RICH = 0.005  # of those that are never larger the coherence is taken to be constant
 _WINDOWS = (0.65, 0.85, 1.0)  # sizes of patches, of that of a lens
-_NODE = 0.7  # of the hole's reach: where the parabolas are fixed
+_KURTOSIS = 2.5  # along one axis, of the separation of two points of two discs
+_POINTS = [(i * math.sqrt(_KURTOSIS), (1 - abs(i)) * (1 - 1 / _KURTOSIS) + abs(i) / (2 * _KURTOSIS)) for i in (-1, 0, 1)]
+_NODE = 0.4  # of the hole's reach: where the parabolas are fixed, as lenses transmit little further out
+_NOTHING, _MOST = 1e-30, 10.0  # coherence, and logarithm of it over `far`, that no pixel with light goes beyond
 
 
 class Entries(NamedTuple):
@@ -91,7 +95,7 @@ class LensPairs:
         one[entries.slot] = torch.arange(len(sign), device=sign.device)  # an entry of each slot
         pairs = Entries(*(part[one] for part in entries))
         own = pairs.first == pairs.second  # their own opposite
-        nodes = (nodes * torch.where(own, 1.0, 2.0).to(nodes)[:, None]).unflatten(1, (3, 3))
+        nodes = (nodes * torch.where(own, 1.0, 2.0).to(nodes)[:, None]).clamp(min=_NOTHING).log().unflatten(1, (3, 3))
         between = (first - second).detach()[one].norm(dim=-1)
         return [
             (pairs.mask[some], *self._patches(lenses, Entries(*(part[some] for part in pairs)), nodes[some], *places))
@@ -137,7 +141,7 @@ class LensPairs:
         first = _at_pixels(lenses, pairs.mask, pairs.first, torch.ones_like(pairs.sign), corner, size)
         second = _at_pixels(lenses, pairs.mask, pairs.second, pairs.sign, corner, size)
         start = (corner * self.pixel - middle) / step
-        return corner, (first * second).sum(1) * _parabola(nodes, start, self.pixel / step, *size)
+        return corner, (first * second).sum(1) * _parabola(nodes, start, self.pixel / step, *size).clamp(max=_MOST).exp()
 
     def _select(self, lenses: Lenses, baselines: Tensor, centers: Tensor) -> tuple[Entries, Tensor]:
         """Return the pairs that share something, and about the most that each gives anywhere."""
@@ -223,10 +227,11 @@ class LensPairs:
         along, skew, across = (xx + root) / trace, xy / trace, (yy + root) / trace
         sx, sy = separation[:, :1, None], separation[:, 1:, None]
         total = torch.zeros_like(xx)
-        for i in (-1, 1):
-            for j in (-1, 1):
-                total = total + self._kernel(bx, by, sx + i * along + j * skew, sy + i * skew + j * across, square)
-        return total / (4 * self._far(bx, by))
+        for i, share in _POINTS:
+            for j, other in _POINTS:
+                kept = self._kernel(bx, by, sx + i * along + j * skew, sy + i * skew + j * across, square)
+                total = total + share * other * kept
+        return total / self._far(bx, by)
 
     def _scale(self, middle: Tensor, bx: Tensor, by: Tensor) -> tuple[Tensor | float, Tensor | float]:
         """Return the phases of the light over those at the reference wavelength, and their squares.
@@ -251,7 +256,8 @@ class LensPairs:
         x, y = x / self.geometry.reach, y / self.geometry.reach
         r = torch.sqrt(x * x + y * y + 1e-4)
         inside = (1 - r).clamp(min=0.03)  # no lens: it has no weight either
-        narrow, base = -2 * inside / r * self.variance, inside * (1 + r) * self.variance
+        height, width = inside * (1 + 0.6 * r), inside * inside * (1 - 0.1 * r)
+        narrow, base = (width - height) / (r * r) * self.variance, height * self.variance
         return base + narrow * x * x, narrow * x * y, base + narrow * y * y
 
 
