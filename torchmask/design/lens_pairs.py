@@ -5,30 +5,26 @@ Two lenses with middles c apart, at baselines that differ by less than two holes
     T(u) T(u') < exp(-Q(b, c + t) / 2) >
 
 at the baseline b, u and u' from their own ones; t is the separation of two points, one of either lens, from their
-middles. It is known by its second moments, to which the exposure adds those of the drift: nine points stand for it.
-The logarithm of the mean is a parabola in b over a patch, after a factor that is common to far lenses is split off. The
-lenses of holes with themselves, at baseline 0, take part; there are N of them in one place.
+middles. The logarithm of the mean (`torchmask.design.pair_coherence`) is a parabola in b over a patch, after a factor
+that is common to far lenses is split off. The lenses of holes with themselves, at baseline 0, take part; there are N of
+them in one place.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchmask.atmosphere.seeing import Seeing
-from torchmask.atmosphere.structure import StructureFunction
 from torchmask.design.lens_patches import Lenses
 from torchmask.design.overlap import Geometry
+from torchmask.design.pair_coherence import PairCoherence
 
 _SMALLEST = 5e-4  # products T T' exp(-Q / 2) below, as estimated, are left out
 _RICH = 0.005  # of those that are never larger the coherence is taken to be constant
 _WINDOWS = (0.65, 0.85, 1.0)  # sizes of patches, of that of a lens
-_KURTOSIS = 2.5  # along one axis, of the separation of two points of two discs
-_POINTS = [(i * math.sqrt(_KURTOSIS), (1 - abs(i)) * (1 - 1 / _KURTOSIS) + abs(i) / (2 * _KURTOSIS)) for i in (-1, 0, 1)]
 _NODE = 0.4  # of the hole's reach: where the parabolas are fixed, as lenses transmit little further out
 _NOTHING, _MOST = 1e-30, 10.0  # coherence, and logarithm of it over `far`, that no pixel with light goes beyond
 
@@ -48,30 +44,10 @@ class Entries(NamedTuple):
 
 
 class LensPairs:
-    """Coherence that pairs of lenses of a mask share, for holes of one geometry under one turbulence.
+    """What pairs of lenses of a mask share, for holes of one geometry; `pixel` (2,) [m]."""
 
-    pixel : (2,) [m]; scales : the least and largest phases of the band's light, over those at the reference wavelength
-    """
-
-    def __init__(
-        self, geometry: Geometry, seeing: Seeing, longest: float, pixel: Tensor, scales: tuple[float, float]
-    ) -> None:
-        self.geometry, self.pixel, self.scales = geometry, pixel, scales
-        reach = geometry.reach
-        points, weights = geometry.shape.quadrature(4, geometry.diameter)
-        self.variance: float = float((weights @ points**2).mean())  # of the points of a hole, along either axis [m^2]
-        steps, shares = seeing.drift()
-        moments = (shares[:, None, None] * steps[:, :, None] * steps[:, None]).sum(0)
-        self.drift: tuple[float, float, float] = (float(moments[0, 0]), float(moments[0, 1]), float(moments[1, 1]))
-        self.structure: StructureFunction = seeing.structure(4 * longest + 4 * reach)
-
-    def far(self, baselines: Tensor) -> Tensor:
-        """Return a factor (...) that follows exp(-D), the coherence of far lenses, where that is not small."""
-        return self._far(*baselines.unbind(-1))
-
-    def _far(self, x: Tensor, y: Tensor) -> Tensor:
-        d = self.structure.of_square(x * x + y * y)
-        return torch.exp(-d / (1 + d / 3))
+    def __init__(self, geometry: Geometry, coherence: PairCoherence, pixel: Tensor) -> None:
+        self.geometry, self.coherence, self.pixel = geometry, coherence, pixel
 
     def __call__(self, lenses: Lenses, centers: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
         """Return what lenses share over `far`, in patches of some sizes: mask (S,), corner (S, 2) [pixels] and values
@@ -85,11 +61,11 @@ class LensPairs:
         first, second = baselines[entries.mask, entries.first], sign * baselines[entries.mask, entries.second]
         separation = self._middles(lenses, centers, entries, 0) - self._middles(lenses, centers, entries, 1)
         middle = (first + second) / 2
-        step = _NODE * (self.geometry.reach + (self.scales[1] - self.scales[0]) / 2 * middle.abs())
+        step = _NODE * (self.geometry.reach + self.coherence.spread / 2 * middle.abs())
         n_slots = int(entries.slot.max()) + 1
         nodes = middle.new_zeros(n_slots, 9)
         for some, n in ((largest > _RICH, 3), (largest <= _RICH, 1)):
-            found = self._coherence(first[some], second[some], separation[some], step[some], n).flatten(1)
+            found = self.coherence.around(first[some], second[some], separation[some], step[some], n).flatten(1)
             nodes = nodes.index_add(0, entries.slot[some], found.expand(-1, 9))
         one = torch.zeros(n_slots, dtype=torch.long, device=sign.device)
         one[entries.slot] = torch.arange(len(sign), device=sign.device)  # an entry of each slot
@@ -141,7 +117,9 @@ class LensPairs:
         first = _at_pixels(lenses, pairs.mask, pairs.first, torch.ones_like(pairs.sign), corner, size)
         second = _at_pixels(lenses, pairs.mask, pairs.second, pairs.sign, corner, size)
         start = (corner * self.pixel - middle) / step
-        return corner, (first * second).sum(1) * _parabola(nodes, start, self.pixel / step, *size).clamp(max=_MOST).exp()
+        return corner, (first * second).sum(1) * _parabola(nodes, start, self.pixel / step, *size).clamp(
+            max=_MOST
+        ).exp()
 
     def _select(self, lenses: Lenses, baselines: Tensor, centers: Tensor) -> tuple[Entries, Tensor]:
         """Return the pairs that share something, and about the most that each gives anywhere."""
@@ -187,78 +165,13 @@ class LensPairs:
             shrunk = (1 - reach / 2 * torch.rsqrt(x * x + y * y)).clamp(min=0)
             near += [shrunk * x, shrunk * y]
         near = [vector.nan_to_num(0.0) for vector in near]
-        return lens * self._kernel(*near)
+        return lens * self.coherence.of_points(*near)
 
     def _middles(self, lenses: Lenses, centers: Tensor, entries: Entries, which: int) -> Tensor:
         """Return the middle of the first or second lens of each entry, (E, 2) [m]."""
         lens = entries.second if which else entries.first
         hole = centers[entries.mask, entries.holes[:, which]]
         return torch.where((lens == 0)[:, None], hole, lenses.middle[entries.mask, lens])
-
-    def _kernel(self, bx: Tensor, by: Tensor, sx: Tensor, sy: Tensor, square: Tensor | float = 1.0) -> Tensor:
-        """Return exp(-Q / 2) (...) to the power `square` of the phases' scale."""
-        structure = self.structure.of_square
-        crossed = structure((sx + bx) ** 2 + (sy + by) ** 2) + structure((sx - bx) ** 2 + (sy - by) ** 2)
-        return torch.exp(square * (crossed / 2 - structure(bx * bx + by * by) - structure(sx * sx + sy * sy)))
-
-    def _coherence(self, first: Tensor, second: Tensor, separation: Tensor, step: Tensor, n: int) -> Tensor:
-        """Return the mean of exp(-Q / 2) over `far`, (E, rows, columns), at n x n baselines around that midway.
-
-        The baselines are `step` (E, 2) apart.
-        """
-        nodes = torch.arange(n, dtype=first.dtype, device=first.device) - (n - 1) / 2
-        middle = (first + second) / 2
-        zero = torch.zeros(n, n, dtype=first.dtype, device=first.device)
-        bx = middle[:, :1, None] + step[:, :1, None] * nodes + zero
-        by = middle[:, 1:, None] + step[:, 1:, None] * nodes[:, None] + zero
-        scale, square = self._scale(middle, bx, by)
-        xx, xy, yy = (
-            one + other + drift
-            for one, other, drift in zip(
-                self._moments(bx / scale - first[:, :1, None], by / scale - first[:, 1:, None]),
-                self._moments(bx / scale - second[:, :1, None], by / scale - second[:, 1:, None]),
-                self.drift,
-                strict=True,
-            )
-        )
-        # the symmetric square root: a mask that is turned by 90 degrees has the same points
-        root = torch.sqrt((xx * yy - xy**2).clamp(min=1e-6 * self.variance**2))
-        trace = torch.sqrt(xx + yy + 2 * root)
-        along, skew, across = (xx + root) / trace, xy / trace, (yy + root) / trace
-        sx, sy = separation[:, :1, None], separation[:, 1:, None]
-        total = torch.zeros_like(xx)
-        for i, share in _POINTS:
-            for j, other in _POINTS:
-                kept = self._kernel(bx, by, sx + i * along + j * skew, sy + i * skew + j * across, square)
-                total = total + share * other * kept
-        return total / self._far(bx, by)
-
-    def _scale(self, middle: Tensor, bx: Tensor, by: Tensor) -> tuple[Tensor | float, Tensor | float]:
-        """Return the phases of the light over those at the reference wavelength, and their squares.
-
-        The baselines (E, 3, 3) lie near `middle` (E, 2).
-        """
-        least, largest = self.scales
-        if largest == least:
-            return least, least**2
-        squared = (middle**2).sum(-1)[:, None, None]
-        along = (bx * middle[:, :1, None] + by * middle[:, 1:, None] - squared) / (squared + 1e-6 * self.variance)
-        # the part of it that the lenses tell apart: all of it where they lie side by side, none where they overlap
-        spread = (largest - least) ** 2 / 4 * squared
-        scale = 1 + along.clamp(least - 1, largest - 1) * spread / (spread + self.variance)
-        return scale, scale * scale
-
-    def _moments(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the moments xx, xy and yy (...) [m^2] of the lens at the place (x, y).
-
-        Its width shrinks as 1 - r, its height as that of two discs; r is the distance over the hole's diameter.
-        """
-        x, y = x / self.geometry.reach, y / self.geometry.reach
-        r = torch.sqrt(x * x + y * y + 1e-4)
-        inside = (1 - r).clamp(min=0.03)  # no lens: it has no weight either
-        height, width = inside * (1 + 0.6 * r), inside * inside * (1 - 0.1 * r)
-        narrow, base = (width - height) / (r * r) * self.variance, height * self.variance
-        return base + narrow * x * x, narrow * x * y, base + narrow * y * y
 
 
 def _parabola(nodes: Tensor, start: Tensor, step: Tensor, n_rows: int, n_columns: int) -> Tensor:

@@ -22,6 +22,7 @@ from torchmask.design.frequency_plane import FrequencyPlane, half_plane
 from torchmask.design.lens_pairs import LensPairs
 from torchmask.design.lens_patches import Lenses, LensPatches
 from torchmask.design.overlap import Geometry
+from torchmask.design.pair_coherence import PairCoherence
 from torchmask.optics.band import Band
 
 _CHUNK = 2**20  # pixels of lenses in work at a time: few enough for memory, enough to amortise launches
@@ -61,8 +62,9 @@ class MaskTransfer:
         self.central: CentralLenses = CentralLenses(
             geometry, seeing, band, reference, longest, half_plane(geometry), dtype, device
         )
-        self.pairs: LensPairs = LensPairs(geometry, seeing, longest, self.pixel, (min(scales), max(scales)))
-        self.far: Tensor = self.pairs.far(self.plane.baselines.to(device)).to(dtype)
+        coherence = PairCoherence(geometry, seeing, colours, furthest, dtype, device)
+        self.pairs: LensPairs = LensPairs(geometry, coherence, self.pixel)
+        self.far: Tensor = coherence.far(*self.plane.baselines.to(device).unbind(-1)).to(dtype)
 
     def __call__(self, centers: Tensor) -> Tensor:
         """Return N^2 E|OTF|^2 (B, H // 2 + 1, W) of masks with `centers` (B, N, 2) [m]."""

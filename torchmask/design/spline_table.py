@@ -39,5 +39,5 @@ class SplineTable:
         index = start.long()[..., None] + torch.arange(-1, 3, device=places.device)
         flat = index[..., 1, :, None] * (2 * self.half + 1) + index[..., 0, None, :]
         weights = (basis[..., 1, :, None] * basis[..., 0, None, :]).flatten(-2)
-        rows = self.coefficients.index_select(0, flat.flatten()).view(*weights.shape, -1)
+        rows = self.coefficients.index_select(0, flat.flatten()).view(*weights.shape, self.coefficients.shape[1])
         return (weights[..., None, :] @ rows)[..., 0, :]
