@@ -2,8 +2,8 @@
 
 Light whose phases are a and a' times those at the reference wavelength comes from baselines b / a and b / a', that is
 from different points of the holes, and its phases differ by (a - a') phi. Relative to the geometric mean of the |OTF|^2
-of either wavelength, their product keeps exp(-k), with k even in a - a'. This ratio is computed where both wavelengths
-have the same lens of a hole.
+of either wavelength, their product keeps exp(-k), with k even in a - a'. It is least where both wavelengths have the
+same lens of a hole, and 10 to 20 per cent larger elsewhere; so it is computed for lenses whose places stand for all.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from torchmask.optics.shape_base import Shape
 _BASELINES = (16, 16)
 _STEPS = (0.4, 0.75, 1.0)  # fractions of the largest a - a' at which k is computed
 _PER_HOLE, _PER_R0 = 12, 6
-_THINNEST = 0.9  # of a hole's reach: thinner lenses, further out, transmit almost nothing
+_THINNEST = 0.75  # of a hole's reach: thinner lenses, further out, transmit almost nothing
+_ASIDE = 0.45  # of a hole's reach, across the baseline: there k is about its mean over all places 0.3 of it away
 _LOST = 1e-2  # fraction of the light in modes that are left out
 
 
@@ -48,9 +49,10 @@ class ColourCoherence:
 
     def between(self, baselines: Tensor) -> Tensor:
         """Return exp(-k) (P, W, W) for all pairs of wavelengths at baselines (P, 2) [m]."""
-        step = (self.scales[:, None] - self.scales) ** 2
-        second, fourth = self.factors(baselines)[..., None, None]
-        return torch.exp(-((second + fourth * step).clamp(min=0) * step))
+        one, other = self.scales[:, None], self.scales
+        middle = baselines[:, None, None] / ((one + other) / 2)[..., None]  # of those of the two wavelengths
+        second, fourth = self.factors(middle.flatten(0, 2)).unflatten(1, middle.shape[:3])
+        return torch.exp(-colour_loss(second, fourth, one, other))
 
     def modes(self, baselines: Tensor) -> Tensor:
         """Return M modes (M, W, P) whose outer products in W, summed over M, approximate exp(-k)."""
@@ -63,25 +65,39 @@ class ColourCoherence:
         return modes.permute(2, 1, 0)
 
 
+def colour_loss(second: Tensor, fourth: Tensor, one: Tensor, other: Tensor) -> Tensor:
+    """Return k (...) of light whose phases are `one` and `other` times those at the reference wavelength.
+
+    second, fourth : `ColourCoherence.factors` at the mean of the baselines of both, k for a + a' = 2 over (a - a')^2
+    """
+    step = (one - other) ** 2
+    return (second + fourth * step / ((one + other) / 2) ** 2).clamp(min=0) * step
+
+
 def _lost(shape: Shape, diameter: float, seeing: Seeing, baselines: Tensor, step: Tensor) -> Tensor:
     """Return k (P,) at baselines (P, 2) [m], for phases that differ by `step` (P,) times those at the reference."""
     one, other = (1 + step / 2)[:, None], (1 - step / 2)[:, None]
     reach = shape.outer_diameter(diameter)
     first, second = baselines / one, baselines / other
-    place = (first - second) / 2
+    apart = (first - second) / 2
+    aside = baselines.flip(-1) * baselines.new_tensor([-1.0, 1.0])
+    aside = _ASIDE * reach * aside / aside.norm(dim=-1, keepdim=True).clamp(min=1e-9)
+    places = aside + apart, aside - apart
     per_hole = max(_PER_HOLE, math.ceil(_PER_R0 * diameter / seeing.r0))
-    separations, densities = lens_densities(shape, diameter, place, per_hole)
+    separations, alike = lens_densities(shape, diameter, places[0], per_hole)
+    mirrored = lens_densities(shape, diameter, places[1], per_hole)[1]
+    crossed = lens_densities(shape, diameter, places[0], per_hole, places[1])[1]
     drift, shares = lens_drift(seeing)
     furthest = float(baselines.norm(dim=-1).max()) / float(other.min()) + 4 * reach + float(drift.norm(dim=-1).max())
     structure = seeing.structure(furthest)
 
-    def kept(b: Tensor, c: Tensor, scale: Tensor, other_scale: Tensor) -> Tensor:
+    def kept(b: Tensor, c: Tensor, scale: Tensor, other_scale: Tensor, densities: Tensor) -> Tensor:
         total = torch.zeros(len(b), dtype=torch.float64)
         for lag, share in zip(drift, shares, strict=True):
             variance = difference_variance(structure, separations + lag, b[:, None], c[:, None], scale, other_scale)
             total += share * (torch.exp(-variance / 2) * densities).sum(-1)
         return total
 
-    alone = torch.sqrt(kept(first, first, one, one) * kept(second, second, other, other))
-    together = kept(first, second, one, other).clamp(min=1e-30)
+    alone = torch.sqrt(kept(first, first, one, one, alike) * kept(second, second, other, other, mirrored))
+    together = kept(first, second, one, other, crossed).clamp(min=1e-30)
     return torch.log(alone / together)

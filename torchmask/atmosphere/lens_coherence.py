@@ -7,7 +7,8 @@ lens, wherever the holes are. Turbulence and exposure leave the fraction
 
 of its |OTF|^2, the mean over pairs of points of the lens, of separation s. The length of a thin lens is proportional to
 the cube root of its transmission T(u), and its loss to about (length / r0)^(5/3), or T^(5/9). Hence c is nearly linear
-in T^(1/2), and a cubic in it with terms for the direction of u approximates c to one or two per cent.
+in T^(1/2), and a parabola in it with terms for the direction of u approximates c to one or two per cent. Phases that
+are scaled, as those of a band's other wavelengths, change both of its powers in proportion.
 """
 
 from __future__ import annotations
@@ -33,7 +34,6 @@ _SHARED_BASELINES = (9, 12)  # the same for baselines within a hole, of lenses o
 _SEPARATIONS = (28, 12)  # the same for the separations of these holes
 _TOLERANCE = 1e-3  # of the table of lenses of holes with themselves, in its norm
 _FAINT = 0.05  # errors of c are weighted by T^(1/2) plus this: thin lenses transmit little
-_STRENGTH = 9 / 5  # phases scaled by a act like a lens with a^(9/5) times the root of T
 
 
 class PolarTable:
@@ -79,17 +79,14 @@ class SharedCoherence(NamedTuple):
     by_place: PolarTable
 
 
-def lens_functions(root: Tensor, x: Tensor, y: Tensor) -> list[Tensor]:
+def lens_functions(root: Tensor, x: Tensor, y: Tensor, scale: Tensor | float | None = None) -> list[Tensor]:
     """Return the functions whose sum with the factors of `lens_coherence` is c, each of the shape of the arguments.
 
-    `root` is the square root of T times `strength_of`; x and y are u over the holes' outer diameter.
+    `root` is the square root of T; x and y are u over the holes' outer diameter. In a band, `scale` is that of the
+    phases, which c falls with, and two functions more are for it.
     """
-    return [torch.ones_like(root), root, root * root, root * (x * x - y * y), root * (2 * x * y)]
-
-
-def strength_of(scale: Tensor | float) -> Tensor:
-    """Return the factor on the root of T for light whose phases are `scale` times those of the reference."""
-    return torch.as_tensor(scale) ** _STRENGTH
+    functions = [torch.ones_like(root), root, root * root, root * (x * x - y * y), root * (2 * x * y)]
+    return functions if scale is None else [*functions, (scale - 1) * root, (scale - 1) * root * root]
 
 
 def lens_coherence(
@@ -97,13 +94,13 @@ def lens_coherence(
     diameter: float,
     seeing: Seeing,
     longest: float,
-    scales: tuple[float, ...] = (1.0,),
+    scales: tuple[float, ...] | None = None,
     steady: bool = False,
 ) -> PolarTable:
     """Tabulate the factors of c against the baseline, up to `longest` [m], for holes of one shape.
 
-    `scales` are those of the phases, relative to the seeing. With `steady` it is exp(-<Q>) instead, the square of the
-    fraction of |OTF|^2 that an amplitude keeps which does not fluctuate.
+    `scales` are those of the phases of a band, relative to the seeing. With `steady` it is exp(-<Q>) instead, the
+    square of the fraction of |OTF|^2 that an amplitude keeps which does not fluctuate.
     """
     reach = shape.outer_diameter(diameter)
     nodes = PolarTable.nodes(_PLACES, reach, 1.0)
@@ -117,7 +114,7 @@ def lens_coherence(
     root = shape.otf(places, diameter).sqrt()
     weight = root + _FAINT
     rows, tables = [], []
-    for scale in scales:
+    for scale in scales or (1.0,):
 
         def coherence(baselines: Tensor, scale: float = scale) -> Tensor:
             total = torch.zeros(len(baselines), len(separations), dtype=torch.float64)
@@ -126,7 +123,8 @@ def lens_coherence(
                 total += share * (exponent if steady else exponent.exp())
             return (2 * total @ densities.T).exp() if steady else total @ densities.T
 
-        functions = torch.stack(lens_functions(root * strength_of(scale), *(places / reach).unbind(-1)), -1)
+        x, y = (places / reach).unbind(-1)
+        functions = torch.stack(lens_functions(root, x, y, scale if scales else None), -1)
         rows.append(functions * weight[:, None])
         tables.append(_table(coherence, baselines, _PLACES, shape.is_round and seeing.is_isotropic) * weight)
     factors = torch.linalg.lstsq(torch.cat(rows), torch.cat(tables, -1).T).solution
@@ -197,19 +195,27 @@ def _factors(table: Tensor) -> tuple[Tensor, Tensor]:
     return (left[:, :rank] * root).T, root[:, None] * right[:rank]
 
 
-def lens_densities(shape: Shape, diameter: float, places: Tensor, per_hole: int) -> tuple[Tensor, Tensor]:
+def lens_densities(
+    shape: Shape, diameter: float, places: Tensor, per_hole: int, others: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """Return separations (S, 2) [m] in half the plane, and their densities (U, S) in the lenses at `places` (U, 2).
 
-    Densities have unit sum. A lens without extent has separation 0 only.
+    With `others` (U, 2), they are those between points of a lens at a place and points of one at the other place, with
+    a common middle. Densities have unit sum. A lens without extent has separation 0 only.
     """
     step = diameter * shape.fineness / per_hole
     size = math.ceil(shape.outer_diameter(diameter) / step) + 2
     axis = (torch.arange(size, dtype=torch.float64) - (size - 1) / 2) * step
     points = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), -1)
     cell = torch.tensor([step, step], dtype=torch.float64)
-    half = places[:, None, None] / 2
-    lens = shape.coverage(points + half, cell, diameter) * shape.coverage(points - half, cell, diameter)
-    power = torch.fft.rfft2(lens, s=(2 * size, 2 * size)).abs() ** 2
+
+    def transform(places: Tensor) -> Tensor:
+        half = places[:, None, None] / 2
+        lens = shape.coverage(points + half, cell, diameter) * shape.coverage(points - half, cell, diameter)
+        return torch.fft.rfft2(lens, s=(2 * size, 2 * size))
+
+    first = transform(places)
+    power = first.conj() * (first if others is None else transform(others))
     density = torch.fft.irfft2(power, s=(2 * size, 2 * size)).clamp(min=0).flatten(1)
     lag = torch.fft.fftfreq(2 * size, 1 / (2 * size), dtype=torch.float64) * step
     separations = torch.stack(torch.meshgrid(lag, lag, indexing="xy"), -1).flatten(0, 1)

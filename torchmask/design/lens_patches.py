@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from torchmask.atmosphere.colour_coherence import ColourCoherence
-from torchmask.atmosphere.lens_coherence import strength_of
 from torchmask.design.frequency_plane import FrequencyPlane
 from torchmask.design.overlap import Geometry, PatchPlan, cached_plan
 from torchmask.design.spline_patches import SplinePatches
@@ -149,7 +148,7 @@ class LensPatches:
         values, (total, roots, phases) = layers[:, :, :-3], layers[:, :, -3:].unbind(2)
         total = total + _NOTHING
         scale = (phases + _NOTHING) / total
-        return values, roots / total * strength_of(scale), scale, corner
+        return values, roots / total, scale, corner
 
 
 def _pairs(n: int, device: torch.device) -> Tensor:

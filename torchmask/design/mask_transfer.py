@@ -56,7 +56,9 @@ class MaskTransfer:
         self.pixel: Tensor = torch.tensor([geometry.period / side for side in geometry.grid[::-1]], dtype=dtype)
         self.pixel = self.pixel.to(device)
         self.reach: float = geometry.reach
-        spread = tuple(sorted({min(scales), sum(scales) / len(scales), max(scales)}))
+        spread = None
+        if scales != [1.0]:
+            spread = tuple(sorted({min(scales), sum(scales) / len(scales), max(scales)}))
         self._coherence = partial(lens_coherence, geometry.shape, geometry.diameter, seeing, furthest, spread)
         self.factors: Tensor = self._coherence()(self.plane.baselines).to(device, dtype)
         self.central: CentralLenses = CentralLenses(
@@ -104,7 +106,7 @@ class MaskTransfer:
     def _parts(self, lenses: Lenses, power: Tensor) -> Tensor:
         """Return what lenses give with themselves, in parts that have a factor each (B, parts, L, rows, columns)."""
         places = self._places(lenses, *lenses.root.shape[-2:])
-        return torch.stack([power * function for function in lens_functions(lenses.root, *places)], 1)
+        return torch.stack([power * function for function in lens_functions(lenses.root, *places, lenses.scale)], 1)
 
     def _places(self, lenses: Lenses, rows: int, columns: int) -> tuple[Tensor, Tensor]:
         """Return the distance of the pixels from the lenses' baselines, x and y, over the holes' outer diameter."""

@@ -16,7 +16,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchmask.atmosphere.colour_coherence import ColourCoherence
+from torchmask.atmosphere.colour_coherence import ColourCoherence, colour_loss
 from torchmask.atmosphere.seeing import Seeing
 from torchmask.atmosphere.structure import StructureFunction
 from torchmask.design.overlap import Geometry
@@ -145,9 +145,9 @@ class PairCoherence:
         own = (
             structure((mx + hx) ** 2 + (my + hy) ** 2) * one**2 + structure((mx - hx) ** 2 + (my - hy) ** 2) * other**2
         )
-        second, fourth = self.colours(torch.stack([bx, by], -1).flatten(1, 2)).unflatten(1, bx.shape[1:]).unbind(-1)
-        squared = (one - other) ** 2
-        known = (second + fourth * squared).clamp(min=0) * squared - own / 2
+        middle = torch.stack([bx, by], -1) / ((one + other) / 2)[..., None]
+        second, fourth = self.colours(middle.flatten(1, 2)).unflatten(1, bx.shape[1:]).unbind(-1)
+        known = colour_loss(second, fourth, one, other) - own / 2
         total = torch.zeros_like(bx)
         for weight, sx, sy in points:
             crossed = structure((sx + mx) ** 2 + (sy + my) ** 2) + structure((sx - mx) ** 2 + (sy - my) ** 2)
