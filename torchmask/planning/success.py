@@ -8,17 +8,15 @@ from __future__ import annotations
 import functools
 import json
 import math
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 
 import numpy as np
 
+from torchmask.planning.lattice import Axis, interpolate
+
 SUCCESS = 1.3  # a restoration succeeds if its score is within this factor of that for known PSFs
-_ROUNDING = 1e-9
-_SCALES = {"n_frames": np.log, "n_photons": np.log, "d_over_r0": np.asarray}  # axes, and what is even along them
-_WORDS = {"n_frames": "numbers of frames", "n_photons": "photons per frame", "d_over_r0": "d/r0"}
 
 
 @dataclass(frozen=True)
@@ -78,17 +76,21 @@ class SuccessMap:
     conditions: str = ""
 
     def __post_init__(self) -> None:
-        for name in _SCALES:
-            axis = getattr(self, name)
-            if len(axis) < 2 or not (np.diff(axis) > 0).all() or not axis[0] > 0:
-                raise ValueError(f"{name} is {list(axis)}: at least two positive values are needed, in rising order")
-        shape = tuple(len(getattr(self, name)) for name in _SCALES)
+        shape = tuple(len(axis.values) for axis in self._axes)
         for name in ("tried", "succeeded", "cost"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), float))
             if getattr(self, name).shape != shape:
                 raise ValueError(f"{name} has shape {getattr(self, name).shape}: {shape} is needed, as by the axes")
         if not ((self.succeeded >= 0) & (self.succeeded <= self.tried) & (self.tried >= 1) & (self.cost > 0)).all():
             raise ValueError("each cell needs at least one restoration, no more successes than those, a positive cost")
+
+    @property
+    def _axes(self) -> tuple[Axis, ...]:
+        return (
+            Axis("n_frames", "numbers of frames", self.n_frames, logarithmic=True),
+            Axis("n_photons", "photons per frame", self.n_photons, logarithmic=True),
+            Axis("d_over_r0", "d/r0", self.d_over_r0),
+        )
 
     def outlook(self, d_over_r0: float, n_photons: float, n_frames: float) -> BlindOutlook:
         """Return chance and cost at one point.
@@ -108,37 +110,27 @@ class SuccessMap:
         Raises
         ------
         ValueError
-            If a number is not finite and positive.
+            If a number is not finite, or not positive (d / r0: negative).
 
         Warns
         -----
         UserWarning
             If the point lies outside the map, whose nearest edge is taken.
         """
-        point = {"n_frames": n_frames, "n_photons": n_photons, "d_over_r0": d_over_r0}
-        for name, value in point.items():
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"{name} is {value}: it must be finite and positive")
-        places, outside = [], []
-        for name, scale in _SCALES.items():
-            axis = getattr(self, name)
-            if not axis[0] * (1 - _ROUNDING) <= point[name] <= axis[-1] * (1 + _ROUNDING):
-                outside.append(name)
-                warnings.warn(
-                    f"blind restorations were tried for {_WORDS[name]} from {axis[0]:g} to {axis[-1]:g}: beyond, their "
-                    "success is taken to be that of the nearest tried",
-                    stacklevel=2,
-                )
-            places.append(float(np.interp(scale(point[name]), scale(np.array(axis)), np.arange(len(axis)))))
+        point = tuple(zip(self._axes, (n_frames, n_photons, d_over_r0), strict=True))
+        for axis, value in point:
+            axis.check(value)
+        outside = tuple(axis.name for axis, value in point if not axis.holds(value))
+        places = [axis.place(value) for axis, value in point]
         chance = self.succeeded / self.tried
         middle, half = chance + 0.5 / self.tried, np.sqrt(chance * (1 - chance) / self.tried + 0.25 / self.tried**2)
         low, high = ((middle + side * half) / (1 + 1 / self.tried) for side in (-1, 1))
         return BlindOutlook(
-            cost=math.exp(_interpolate(np.log(self.cost), places)),
-            success=_interpolate(chance, places),
-            low=_interpolate(low, places),
-            high=_interpolate(high, places),
-            outside=tuple(outside),
+            cost=math.exp(interpolate(np.log(self.cost), places)),
+            success=interpolate(chance, places),
+            low=interpolate(low, places),
+            high=interpolate(high, places),
+            outside=outside,
         )
 
 
@@ -150,11 +142,3 @@ def success_map() -> SuccessMap:
     True
     """
     return SuccessMap(**json.loads(files("torchmask.planning").joinpath("success.json").read_text(encoding="utf-8")))
-
-
-def _interpolate(table: np.ndarray, places: Sequence[float]) -> float:
-    """Return the multilinear interpolation of a table at fractional indices inside it."""
-    for place in places:
-        first = min(int(place), len(table) - 2)
-        table = table[first] + (place - first) * (table[first + 1] - table[first])
-    return float(table)

@@ -1,0 +1,82 @@
+"""Axes of a table that was measured on a lattice, and its values between the points."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class Axis:
+    """Values along one axis of a lattice.
+
+    name : of the quantity, for errors
+    words : what its values are, for warnings
+    values : in rising order, at least two
+    logarithmic : whether tables are interpolated evenly in its logarithm
+
+    Raises ValueError if the values are too few, negative or out of order, or 0 on a logarithmic axis.
+
+    Examples
+    --------
+    >>> Axis("n_photons", "photons per frame", (1e5, 1e7), logarithmic=True).place(1e6)
+    0.5
+    """
+
+    name: str
+    words: str
+    values: Sequence[float]
+    logarithmic: bool = False
+
+    def __post_init__(self) -> None:
+        if len(self.values) < 2 or not (np.diff(self.values) > 0).all() or not self._can_be(self.values[0]):
+            raise ValueError(
+                f"{self.name} is {list(self.values)}: at least two values are needed, in rising order, {self._wanted}"
+            )
+
+    @property
+    def _wanted(self) -> str:
+        return "finite and positive" if self.logarithmic else "finite and at least 0"
+
+    def _can_be(self, value: float) -> bool:
+        return math.isfinite(value) and (value > 0 or (value == 0 and not self.logarithmic))
+
+    def check(self, value: float) -> None:
+        """Raise ValueError unless a value is finite and positive, or 0 on an axis that is not logarithmic."""
+        if not self._can_be(value):
+            raise ValueError(f"{self.name} is {value}: it must be {self._wanted}")
+
+    def holds(self, value: float) -> bool:
+        """Return whether a value lies on the axis; with a UserWarning if not."""
+        first, last = self.values[0], self.values[-1]
+        inside = first * (1 - _ROUNDING) <= value <= last * (1 + _ROUNDING)
+        if not inside:
+            warnings.warn(
+                f"blind restorations were tried for {self.words} from {first:g} to {last:g}: beyond, what they lose is "
+                "taken to be that of the nearest tried",
+                stacklevel=3,
+            )
+        return inside
+
+    def place(self, value: float) -> float:
+        """Return the fractional index of a value, that of the nearest end outside."""
+        scale = np.log if self.logarithmic else np.asarray
+        return float(np.interp(scale(value), scale(np.array(self.values)), np.arange(len(self.values))))
+
+
+def interpolate(table: np.ndarray, places: Sequence[float]) -> float:
+    """Return the multilinear interpolation of a table at fractional indices inside it.
+
+    >>> interpolate(np.array([[0.0, 1.0], [2.0, 3.0]]), (0.5, 0.25))
+    1.25
+    """
+    for place in places:
+        first = min(int(place), len(table) - 2)
+        table = table[first] + (place - first) * (table[first + 1] - table[first])
+    return float(table)
