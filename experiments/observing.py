@@ -191,7 +191,7 @@ def table(cells: Sequence[Mapping[str, Any]], columns: Mapping[str, str]) -> lis
     """Lines of Markdown: the given columns of each cell, the score and its interval."""
     lines = [f"| {' | '.join(columns.values())} | instrument | score | interval |", "|---" * (len(columns) + 3) + "|"]
     for cell in cells:
-        values = [f"{cell[key]:.3g}" for key in columns]
+        values = ["-" if cell[key] is None else f"{cell[key]:.3g}" for key in columns]
         values += [INSTRUMENTS[cell["instrument"]], f"{cell['score']:.3f}", f"{cell['low']:.3f} to {cell['high']:.3f}"]
         lines.append(f"| {' | '.join(values)} |")
     return lines

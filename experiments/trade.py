@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -20,9 +21,11 @@ from torchmask.design.sweep import run_tasks
 from torchmask.design.turbulent import TurbulentMSE
 from torchmask.grid import Grid
 from torchmask.optics.band import Band
+from torchmask.planning.smearing import smearing_map
+from torchmask.planning.success import success_map
 from torchmask.record import Callback
 from torchmask.spectra import NoisePSD, PowerLawPSD
-from torchmask.viz.style import FAINT, new_figure, styled
+from torchmask.viz.style import COLORS, FAINT, new_figure, styled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -48,12 +51,12 @@ class Trade:
     where: str
 
     def summarise(
-        self, rows: Sequence[Mapping[str, Any]], predicted: Mapping[tuple[str, float], float]
+        self, rows: Sequence[Mapping[str, Any]], predicted: Mapping[tuple[str, float], Mapping[str, float | None]]
     ) -> list[dict[str, Any]]:
-        """Return one cell for each instrument and amount, with the score that `predictions` give."""
+        """Return one cell for each instrument and amount, with the scores that `predictions` give."""
         keys = dict.fromkeys((row["instrument"], row[self.key]) for row in rows)
         return [
-            {"instrument": which, self.key: amount, "kept": self.kept(amount), "predicted": predicted[which, amount]}
+            {"instrument": which, self.key: amount, "kept": self.kept(amount), **predicted[which, amount]}
             | scores([row for row in rows if (row["instrument"], row[self.key]) == (which, amount)])
             for which, amount in keys
         ]
@@ -65,18 +68,22 @@ class Trade:
             own = [cell for cell in cells if cell["instrument"] == which]
             if own:
                 best = min(own, key=lambda cell: cell["score"])
+                blind = ""
+                if best["predicted_blind"] is not None:
+                    blind = f", or {between(own, self.key, 'predicted_blind'):.2g} with what blindness costs"
                 lines.append(
                     f"The {name} is best at {self.name} = {optimum(own, self.key)}, with a score of "
                     f"{best['score']:.3f}; {best['kept']:.3f} of V^2 is kept {self.where} there. "
-                    f"Between the amounts the best is {between(own, self.key, 'score'):.2g}, and that predicted "
-                    f"{between(own, self.key, 'predicted'):.2g}."
+                    f"Between the amounts the best is {between(own, self.key, 'score'):.2g}, and that predicted for "
+                    f"known PSFs {between(own, self.key, 'predicted'):.2g}{blind}."
                 )
         return lines
 
     @property
     def columns(self) -> dict[str, str]:
         """Heads of the table beside instrument and score."""
-        return {self.key: self.name, "kept": f"V^2 kept {self.where}", "predicted": "predicted score"}
+        kept = {self.key: self.name, "kept": f"V^2 kept {self.where}"}
+        return kept | {"predicted": "predicted, known PSFs", "predicted_blind": "predicted, blind"}
 
 
 def between(cells: Sequence[Mapping[str, Any]], key: str, value: str) -> float:
@@ -92,6 +99,11 @@ def between(cells: Sequence[Mapping[str, Any]], key: str, value: str) -> float:
 
 def predict(task: Mapping[str, Any]) -> dict[str, Any]:
     """Return the score of `observing.measure` that TurbulentMSE predicts for known PSFs and a power-law object."""
+    return {"predicted": math.sqrt(float(criterion(task).relative(instrument(task))))}
+
+
+def criterion(task: Mapping[str, Any]) -> TurbulentMSE:
+    """Return the criterion at the conditions of a task, for what lies within the diffraction limit."""
     aperture, mask = instrument(task), instrument({**task, "instrument": "mask"})
     side, r0 = task["n_pixels"], DIAMETER / task["d_over_r0"]
     grid = Grid.nyquist(DIAMETER, WAVELENGTH, 2 * side, task.get("oversampling", 1.0))
@@ -101,30 +113,54 @@ def predict(task: Mapping[str, Any]) -> dict[str, Any]:
     signal = PowerLawPSD(1.5, photons, 1 / (SIZE * side))(grid)
     nu_y, nu_x = grid.frequencies(signal.dtype)
     signal[torch.hypot(nu_y, nu_x) >= grid.cutoff(DIAMETER)] *= _NOTHING  # no score counts what lies beyond
-    criterion = TurbulentMSE(
+    return TurbulentMSE(
         *(grid, signal, NoisePSD(photons, task["readout_noise"], side**2)),
         *(task["n_frames"], r0, task["outer_scale"] * DIAMETER, exposure, WIND if exposure else 0.0),
         *(band.wavelengths, band.shares),
     )
-    return {"predicted": math.sqrt(float(criterion.relative(aperture)))}
 
 
 def predictions(
     options: ObservingOptions, key: str, settings: Iterable[Mapping[str, Any]], callback: Callback
-) -> dict[tuple[str, float], float]:
-    """Return the predicted score for each instrument and amount."""
+) -> dict[tuple[str, float], dict[str, float | None]]:
+    """Return the predicted scores for each instrument and amount: for known PSFs, and blind as a plan says it."""
     common, cases = shared(options, callback), list(itertools.product(options.instruments, settings))
     tasks = [common | dict(setting) | {"instrument": which} for which, setting in cases]
     found = run_tasks(predict, tasks, options.sweep / "tasks", stage="predicted", **options.keywords(callback))
-    return {(which, setting[key]): row["predicted"] for (which, setting), row in zip(cases, found, strict=True)}
+    return {
+        (task["instrument"], task[key]): row | {"predicted_blind": blind(task, row["predicted"])}
+        for task, row in zip(tasks, found, strict=True)
+    }
+
+
+def blind(task: Mapping[str, Any], known: float) -> float | None:
+    """Return what a predicted score becomes where aberrations have to be found; None for a full pupil, as in a plan.
+
+    Beyond what was tried, the nearest edge is taken.
+    """
+    if task["instrument"] != "mask":
+        return None
+    size, photons = task["subaperture_diameter"] / DIAMETER * task["d_over_r0"], task["n_photons"]
+    exposure, width = task.get("exposure", 0.0), task.get("band", 0.0)
+    with warnings.catch_warnings(action="ignore", category=UserWarning):
+        instants = success_map().outlook(size, photons, task["n_frames"])
+        outlook = smearing_map().outlook(instants, n_photons=photons, exposure=exposure, width=width)
+    return math.sqrt(outlook.mse(known**2, known**2))
 
 
 @styled
 def figure(trade: Trade, cells: Sequence[Mapping[str, Any]]) -> Figure:
-    """Score against what is varied, and what is kept of the contrast."""
-    sheet = new_figure(5.4, 3.6)
+    """Score against what is varied, restored and predicted, and what is kept of the contrast."""
+    sheet = new_figure(5.4, 3.9)
     ax = sheet.subplots()
     curves(ax, cells, trade.key)
+    for (which, name), color in zip(INSTRUMENTS.items(), COLORS, strict=False):
+        own = [cell for cell in cells if cell["instrument"] == which]
+        for key, style, told in (("predicted", ":", "known PSFs"), ("predicted_blind", "-.", "blind")):
+            drawn = [cell for cell in own if cell[key] is not None]
+            if drawn:
+                x, y = ([cell[axis] for cell in drawn] for axis in (trade.key, key))
+                ax.plot(x, y, style, color=color, linewidth=1.1, label=f"{name}, predicted, {told}")
     ax.set(xscale="log", xlabel=trade.label, ylabel="score (0 is perfect)")
     ticks = sorted({cell[trade.key] for cell in cells})
     ax.set_xticks(ticks, [f"{tick:g}" for tick in ticks])

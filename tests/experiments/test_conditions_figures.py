@@ -16,6 +16,8 @@ from torchmask.design.criterion import AsymptoticMSE
 from torchmask.grid import Grid
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.band import Band
+from torchmask.planning.smearing import smearing_map
+from torchmask.planning.success import success_map
 from torchmask.spectra import NoisePSD, PowerLawPSD
 
 SCRIPTS = {"anisoplanatism": anisoplanatism, "exposure": exposure, "band": band, "rival_modes": rival_modes}
@@ -85,6 +87,18 @@ def test_a_predicted_score_is_that_of_the_criterion_for_the_same_light(monkeypat
     assert (r0, outer_scale, wind) == (1 / 3, 20.0, observing.WIND)
     assert exposure == pytest.approx(0.5 * 0.314 * r0 / wind, rel=1e-3)  # tau0 = 0.314 r0 / wind
     assert (wavelengths, shares) == (Band.top_hat(550e-9, 55e-9, 5).wavelengths, Band.top_hat(550e-9, 55e-9, 5).shares)
+
+
+def test_a_blind_prediction_grows_by_what_was_measured():
+    """The square of a score is an error; beyond what was tried (2e4 photons) its edge counts, without a warning."""
+    task = {"instrument": "mask", "subaperture_diameter": 0.2, "d_over_r0": 4.0, "n_photons": 2e4, "n_frames": 8}
+    task |= {"exposure": 2.0, "band": 0.1}
+    instants = success_map().outlook(0.8, 1e5, 8)
+    factor = instants.cost * smearing_map().outlook(instants, n_photons=1e5, exposure=2.0, width=0.1).smearing
+    assert factor > 1
+    assert trade.blind(task, 0.3) == pytest.approx(0.3 * factor, rel=1e-12)
+    assert trade.blind(task, 0.99) == 1.0
+    assert trade.blind(task | {"instrument": "full"}, 0.3) is None
 
 
 @pytest.mark.parametrize("name", SCRIPTS)

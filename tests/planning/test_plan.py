@@ -22,6 +22,7 @@ from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.pixel import SquarePixel
 from torchmask.planning.plan import plan_observation
 from torchmask.planning.result import Choice, ObservationPlan
+from torchmask.planning.smearing import SmearingMap
 from torchmask.planning.success import BlindOutlook, SuccessMap
 from torchmask.spectra import NoisePSD, PowerLawPSD
 from torchmask.viz.planning import plan_figure
@@ -34,6 +35,18 @@ EVERYWHERE = {"n_frames": (1, 1e6), "n_photons": (1, 1e12), "d_over_r0": (0.1, 1
 def lossless():
     """A map on which blind restorations always succeed and lose nothing."""
     return SuccessMap(**EVERYWHERE, tried=np.ones((2, 2, 2)), succeeded=np.ones((2, 2, 2)), cost=np.ones((2, 2, 2)))
+
+
+def sharp():
+    """Tables in which exposure and band cost nothing."""
+    axes = {"n_photons": (1, 1e12), "exposures": (0, 100), "widths": (0, 1)}
+    return SmearingMap(**axes, exposure_cost=np.ones((2, 2)), width_cost=np.ones((2, 2)))
+
+
+def lose_nothing(patch):
+    """Take away what blind restorations lose."""
+    patch.setattr(torchmask.planning.plan, "success_map", lossless)
+    patch.setattr(torchmask.planning.plan, "smearing_map", sharp)
 
 
 def make(**changes):
@@ -55,7 +68,7 @@ def quick(monkeypatch):
     """Without the tables of turbulence, which take seconds each."""
     still = functools.partial(instrument_criterion, turbulence=False)
     monkeypatch.setattr(torchmask.planning.plan, "instrument_criterion", still)
-    monkeypatch.setattr(torchmask.planning.plan, "success_map", lossless)
+    lose_nothing(monkeypatch)
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +76,7 @@ def plan():
     with pytest.MonkeyPatch.context() as patch:
         still = functools.partial(instrument_criterion, turbulence=False)
         patch.setattr(torchmask.planning.plan, "instrument_criterion", still)
-        patch.setattr(torchmask.planning.plan, "success_map", lossless)
+        lose_nothing(patch)
         axes = {"n_subapertures": (3, 7), "hole_diameters": (0.09, 0.15, 0.35), "exposures": (2e-3, 6e-3)}
         return plan_observation(make(), **axes, **TINY)
 
@@ -92,7 +105,7 @@ def exposures():
     lengths = [factor * bright.seeing.tau0 for factor in (0.1, 1.5, 6.0)]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(torchmask.planning.plan, "instrument_criterion", keep)
-        patch.setattr(torchmask.planning.plan, "success_map", lossless)
+        lose_nothing(patch)
         return built, plan_observation(bright, aperture=MASK, exposures=lengths, n_frequencies=24)
 
 
@@ -196,6 +209,26 @@ def test_the_map_is_asked_at_the_size_light_and_frames_of_each_point(monkeypatch
     found = plan_observation(make(), aperture=MASK, exposures=(2e-3, 6e-3), n_frequencies=32)
     expected = [(MASK.subaperture_diameter / 0.15, choice.photons, choice.frames) for choice in found.choices]
     assert sorted(asked) == sorted(expected)
+
+
+def test_exposure_and_width_are_best_where_light_balances_what_their_smearing_costs(monkeypatch, quick):
+    """For pistons alone the most light is best for known PSFs; with costs of 2 % a tau0 and 3 % of width it is not."""
+    steps = 1.02 ** np.arange(5.0)
+    axes = {"n_photons": (1, 1e12), "exposures": (0, 1, 2, 3, 4), "widths": (0, 0.03, 0.06, 0.09, 0.12)}
+    tables = {"exposure_cost": np.tile(steps, (2, 1)), "width_cost": np.tile(steps, (2, 1))}
+    monkeypatch.setattr(torchmask.planning.plan, "smearing_map", lambda: SmearingMap(**axes, **tables))
+    known = make(source=Source(photon_rate=3e9), n_wavelengths=2, n_frames=20, observing_time=None)
+    tau0 = 0.314 * 0.15 / 10  # r0 / wind
+    times, widths = [factor * tau0 for factor in (0.05, 0.2, 0.8, 3.2)], [5e-9, 20e-9, 60e-9]
+    found = plan_observation(known, aperture=MASK, exposures=times, widths=widths, n_frequencies=32)
+    assert (found.best_known.exposure, found.best_known.width) == (times[-1], widths[-1])
+    assert (found.at_edge("exposure"), found.at_edge("width")) == (False, False)
+    assert times[0] < found.best_exposure < times[-1]
+    assert widths[0] < found.best_width < widths[-1]
+    assert f"ms; best width: {1e9 * found.best_width:.4g} nm." in str(found)
+    for choice in found.choices:
+        steps_there = choice.exposure / tau0 + choice.width / 550e-9 / 0.03
+        assert np.log(choice.blind.smearing) == pytest.approx(steps_there * np.log(1.02), rel=2e-3)
 
 
 @pytest.mark.slow

@@ -121,6 +121,19 @@ class Band:
         """Shortest wavelength [m], whose image is sampled most coarsely."""
         return min(self.wavelengths)
 
+    @property
+    def relative_width(self) -> float:
+        """Width over the mean wavelength of the top hat with the same scatter of wavelengths; 0 for a single one.
+
+        >>> round(Band.top_hat(550e-9, 55e-9).relative_width, 6)
+        0.1
+        """
+        mean = math.fsum(share * wavelength for wavelength, share in zip(self.wavelengths, self.shares, strict=True))
+        variance = math.fsum(
+            share * (wavelength - mean) ** 2 for wavelength, share in zip(self.wavelengths, self.shares, strict=True)
+        )
+        return math.sqrt(12 * variance) / mean
+
 
 def _fine_samples(wavelengths: np.ndarray, transmission: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return nodes and weights that integrate the piecewise linear curve times a polynomial exactly."""

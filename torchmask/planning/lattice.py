@@ -47,27 +47,40 @@ class Axis:
     def _can_be(self, value: float) -> bool:
         return math.isfinite(value) and (value > 0 or (value == 0 and not self.logarithmic))
 
-    def check(self, value: float) -> None:
-        """Raise ValueError unless a value is finite and positive, or 0 on an axis that is not logarithmic."""
+    def place(self, value: float) -> float:
+        """Return the fractional index of a value, that of the nearest end outside.
+
+        Raises ValueError unless the value is finite and positive, or 0 on an axis that is not logarithmic.
+        """
         if not self._can_be(value):
             raise ValueError(f"{self.name} is {value}: it must be {self._wanted}")
-
-    def holds(self, value: float) -> bool:
-        """Return whether a value lies on the axis; with a UserWarning if not."""
-        first, last = self.values[0], self.values[-1]
-        inside = first * (1 - _ROUNDING) <= value <= last * (1 + _ROUNDING)
-        if not inside:
-            warnings.warn(
-                f"blind restorations were tried for {self.words} from {first:g} to {last:g}: beyond, what they lose is "
-                "taken to be that of the nearest tried",
-                stacklevel=3,
-            )
-        return inside
-
-    def place(self, value: float) -> float:
-        """Return the fractional index of a value, that of the nearest end outside."""
         scale = np.log if self.logarithmic else np.asarray
         return float(np.interp(scale(value), scale(np.array(self.values)), np.arange(len(self.values))))
+
+    def holds(self, value: float) -> bool:
+        """Return whether a value lies between the ends."""
+        return self.values[0] * (1 - _ROUNDING) <= value <= self.values[-1] * (1 + _ROUNDING)
+
+
+def locate(axes: Sequence[Axis], point: Sequence[float]) -> tuple[list[float], tuple[str, ...]]:
+    """Return the fractional indices of a point, and the names of the axes that do not hold it.
+
+    Raises ValueError for a value that cannot be.
+
+    Warns
+    -----
+    UserWarning
+        For each of those axes, whose nearest end is taken.
+    """
+    places = [axis.place(value) for axis, value in zip(axes, point, strict=True)]
+    outside = [axis for axis, value in zip(axes, point, strict=True) if not axis.holds(value)]
+    for axis in outside:
+        warnings.warn(
+            f"blind restorations were tried for {axis.words} from {axis.values[0]:g} to {axis.values[-1]:g}: beyond, "
+            "what they lose is taken to be that of the nearest tried",
+            stacklevel=3,
+        )
+    return places, tuple(axis.name for axis in outside)
 
 
 def interpolate(table: np.ndarray, places: Sequence[float]) -> float:

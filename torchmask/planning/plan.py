@@ -17,7 +17,8 @@ from torchmask.instrument.instrument import Instrument
 from torchmask.optics.packing import largest_fill_factor
 from torchmask.optics.pupil import Aperture
 from torchmask.planning.result import AXES, Choice, ObservationPlan
-from torchmask.planning.success import success_map
+from torchmask.planning.smearing import smearing_map
+from torchmask.planning.success import BlindOutlook, success_map
 from torchmask.record import Callback, Record
 
 _HOLES = (0.5, 0.8, 1.2)  # in r0: wider holes hold aberrations that a blind restoration has to find
@@ -204,7 +205,7 @@ def _measure(
     callback: Callback | None,
 ) -> list[Choice]:
     """Return the predicted error at every point; masks with holes of one size share what is known of the turbulence."""
-    choices, n_steps, measured = [], len(exposed) * len(masks), success_map()
+    choices, n_steps = [], len(exposed) * len(masks)
     for instrument in exposed:
         criterion = None
         for (n, hole), mask in sorted(masks.items(), key=lambda item: item[0][1]):
@@ -215,10 +216,17 @@ def _measure(
             floor = criterion.relative_floor(instrument.telescope.diameter)
             photons, sky = instrument.photons(area), instrument.sky(area)
             light = instrument.exposure, instrument.width, instrument.frames, photons, sky
-            blind = None if mask.is_full else measured.outlook(hole / instrument.site.r0, photons, instrument.frames)
+            blind = None if mask.is_full else _blind_outlook(instrument, hole, photons)
             choices.append(Choice(n, hole, *light, error, error - floor, blind))
             _tell(callback, "plan/map", len(choices), n_steps, error)
     return sorted(choices, key=lambda choice: tuple(getattr(choice, name) for name in AXES))
+
+
+def _blind_outlook(instrument: Instrument, hole: float, photons: float) -> BlindOutlook:
+    """Return what was measured of restorations that have to find the aberrations behind holes of this diameter [m]."""
+    instants = success_map().outlook(hole / instrument.site.r0, photons, instrument.frames)
+    exposure, width = instrument.exposure / instrument.seeing.tau0, instrument.band.relative_width
+    return smearing_map().outlook(instants, n_photons=photons, exposure=exposure, width=width)
 
 
 def _tell(callback: Callback | None, stage: str, step: int, n_steps: int, relative_mse: float) -> None:

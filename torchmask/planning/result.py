@@ -114,17 +114,27 @@ class ObservationPlan:
 
         At an edge of the axis, the edge.
         """
-        line = self.axis("exposure")
+        return self._between("exposure")
+
+    @property
+    def best_width(self) -> float | None:
+        """The width of the band [m] of the least error, found as `best_exposure` is; None for a filter."""
+        return None if self.best.width is None else self._between("width")
+
+    def _between(self, name: str) -> float:
+        line, best = self.axis(name), getattr(self.best, name)
         place = line.index(self.best)
         if place in (0, len(line) - 1):
-            return self.best.exposure
-        x, y = np.log([[c.exposure, c.blind_mse] for c in line[place - 1 : place + 2]]).T
+            return best
+        x, y = np.log([[getattr(c, name), c.blind_mse] for c in line[place - 1 : place + 2]]).T
         curvature, slope, _ = np.polyfit(x - x[1], y, 2)
-        return self.best.exposure * math.exp(-slope / (2 * curvature))
+        return best * math.exp(-slope / (2 * curvature))
 
     def __str__(self) -> str:
         best, told = self.best, self.best_instrument
         band = "" if best.width is None else f", a band of {1e9 * best.width:.4g} nm"
+        between = self.best_width if len(self.axis("width")) > 1 else None
+        width = "" if between is None else f"; best width: {1e9 * between:.4g} nm"
         lines = [
             f"Least predicted error of a blind restoration: {best.blind_mse:.4g}, of which no mask of this diameter "
             f"can avoid {best.relative_mse - best.above_floor:.4g}, with {_point(best)} "
@@ -133,7 +143,7 @@ class ObservationPlan:
             _blind_line(best.blind),
             f"With known PSFs: {best.relative_mse:.4g}; the least would be {self.best_known.relative_mse:.4g}, with "
             f"{_point(self.best_known)}.",
-            f"Best exposure between those of the map: {1e3 * self.best_exposure:.4g} ms.",
+            f"Best exposure between those of the map: {1e3 * self.best_exposure:.4g} ms{width}.",
             *(
                 f"The best {_WORDS[name]} is at the edge of the map: beyond may be better."
                 for name in AXES
@@ -158,9 +168,9 @@ def _blind_line(blind: BlindOutlook | None) -> str:
     if blind is None:
         return "What the unknown aberrations of a full pupil cost has not been measured: it is left out."
     return (
-        f"There blind restorations score {blind.cost:.3g} times as high as with known PSFs (median), and "
-        f"{100 * blind.success:.0f} % of them ({100 * blind.low:.0f} to {100 * blind.high:.0f} %) stay within "
-        f"{SUCCESS:g} times."
+        f"There blind restorations of instants in narrow light score {blind.cost:.3g} times as high as with known PSFs "
+        f"(median), and {100 * blind.success:.0f} % of them ({100 * blind.low:.0f} to {100 * blind.high:.0f} %) stay "
+        f"within {SUCCESS:g} times; exposure and band raise their score by another factor of {blind.smearing:.3g}."
     )
 
 

@@ -14,7 +14,7 @@ from importlib.resources import files
 
 import numpy as np
 
-from torchmask.planning.lattice import Axis, interpolate
+from torchmask.planning.lattice import Axis, interpolate, locate
 
 SUCCESS = 1.3  # a restoration succeeds if its score is within this factor of that for known PSFs
 
@@ -26,7 +26,8 @@ class BlindOutlook:
     cost : its score over that for known PSFs, median; below 1 where both are drowned in noise
     success : chance that this ratio is within 1.3
     low, high : Wilson's interval of that chance at one standard error, from the number of restorations
-    outside : names of what lies outside the map, for which its nearest edge was taken
+    outside : names of what lies outside what was tried, for which its nearest edge was taken
+    smearing : factor by which a long exposure and a wide band raise the score further, beyond what is predicted
 
     Examples
     --------
@@ -39,14 +40,15 @@ class BlindOutlook:
     low: float
     high: float
     outside: tuple[str, ...] = ()
+    smearing: float = 1.0
 
     def mse(self, relative_mse: float, above_floor: float) -> float:
         """Return what a relative error predicted for known PSFs becomes, of which a mask can avoid `above_floor`.
 
-        That part grows by the square of the cost, where it is above 1: a score is an amplitude. No more than 1 is
-        returned, the error of knowing nothing.
+        That part grows by the square of cost times smearing, where it is above 1: a score is an amplitude. No more than
+        1 is returned, the error of knowing nothing.
         """
-        return min(1.0, relative_mse + (max(1.0, self.cost) ** 2 - 1) * above_floor)
+        return min(1.0, relative_mse + (max(1.0, self.cost * self.smearing) ** 2 - 1) * above_floor)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,11 +119,7 @@ class SuccessMap:
         UserWarning
             If the point lies outside the map, whose nearest edge is taken.
         """
-        point = tuple(zip(self._axes, (n_frames, n_photons, d_over_r0), strict=True))
-        for axis, value in point:
-            axis.check(value)
-        outside = tuple(axis.name for axis, value in point if not axis.holds(value))
-        places = [axis.place(value) for axis, value in point]
+        places, outside = locate(self._axes, (n_frames, n_photons, d_over_r0))
         chance = self.succeeded / self.tried
         middle, half = chance + 0.5 / self.tried, np.sqrt(chance * (1 - chance) / self.tried + 0.25 / self.tried**2)
         low, high = ((middle + side * half) / (1 + 1 / self.tried) for side in (-1, 1))
