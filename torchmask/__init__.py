@@ -36,6 +36,7 @@ from torchmask.optics.zernike import ZernikePhase
 from torchmask.planning.bounds import MyopicBound, myopic_bound
 from torchmask.planning.plan import plan_observation
 from torchmask.planning.result import ObservationPlan
+from torchmask.planning.smearing import SmearingMap, smearing_map
 from torchmask.planning.success import BlindOutlook, SuccessMap, success_map
 from torchmask.restoration.baselines import average_psf, shift_and_add
 from torchmask.restoration.many import restore_many
@@ -81,6 +82,7 @@ __all__ = [
     "SceneOptions",
     "SearchResult",
     "Site",
+    "SmearingMap",
     "SmoothVariation",
     "Source",
     "SparseAperture",
@@ -115,6 +117,7 @@ __all__ = [
     "search_mask",
     "shift_and_add",
     "simulate_observation",
+    "smearing_map",
     "success_map",
     "wiener_mse",
 ]
