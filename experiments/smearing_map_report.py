@@ -113,7 +113,7 @@ def figure(cells: Sequence[Mapping[str, Any]]) -> Figure:
             ax.set(yscale="log", title=f"{photons:.0e} photons".replace("e+0", "e"))
             ax.set_yticks([0.25, 0.5, 1, 2, 4], ["0.25", "0.5", "1", "2", "4"])
             ax.minorticks_off()
-            if row is axes[-1]:
+            if photons == fluxes[-1]:
                 ax.set_xlabel(label)
     sheet.supylabel("score over that of instants, of narrow light", fontsize=9)
     sheet.legend(*axes[0][0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
