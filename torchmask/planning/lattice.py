@@ -25,7 +25,7 @@ class Axis:
 
     Examples
     --------
-    >>> Axis("n_photons", "photons per frame", (1e5, 1e7), logarithmic=True).place(1e6)
+    >>> round(Axis("n_photons", "photons per frame", (1e5, 1e7), logarithmic=True).place(1e6), 6)
     0.5
     """
 
