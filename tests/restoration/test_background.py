@@ -11,9 +11,11 @@ from torchmask.restoration.background import Background, check_known_level, dark
 from torchmask.restoration.calibration import fit_of_frames
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.frames import FrameStack
+from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.priors import TotalVariation
 from torchmask.restoration.state import Calibration, State
+from torchmask.restoration.verdict import Finding
 
 GRID = Grid((12, 15), 2.3e-7, 550e-9)
 FREE, COMMON = Background.PER_FRAME, Background.COMMON
@@ -224,3 +226,13 @@ def test_the_sky_of_bright_frames_does_not_stay_in_the_object(seed, observe, res
     noise = torch.poisson(torch.full_like(seen.frames, sky), generator=torch.Generator().manual_seed(5))
     result = restoring(6, r0=0.2, max_iterations=500, refine_geometry=False).restore(seen.frames + noise)
     assert result.sky == pytest.approx(sky, rel=0.06 / 0.5)
+
+
+@pytest.mark.filterwarnings("ignore:the frames are bright at the border")  # and everywhere else
+def test_noise_is_all_sky_and_no_object(five_holes):
+    grid = Grid.nyquist(1.0, 550e-9, 32)
+    frames = torch.poisson(torch.full((4, *grid.shape), 200.0), generator=torch.Generator().manual_seed(0)).double()
+    result = MyopicDeconvolution(five_holes, grid, 3, r0=0.25).restore(frames)
+    assert result.verdict.finding is Finding.ONLY_NOISE
+    assert result.sky == pytest.approx(200.0, rel=0.05)
+    assert bool(torch.isfinite(result.object).all())

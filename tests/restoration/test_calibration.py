@@ -1,11 +1,14 @@
 """What frames tell of themselves between two descents, in closed form."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from torchmask.grid import Grid
 from torchmask.optics.band import Band
 from torchmask.restoration.aberrations import turbulent_basis
+from torchmask.restoration.background import Background
 from torchmask.restoration.calibration import (
     calibrate,
     fit_of_frames,
@@ -92,6 +95,17 @@ def test_a_frame_without_light_has_the_least_transmission(problem):
     objective, state = problem()
     objective.frames[0] *= -1
     assert float(fit_of_frames(objective, state)[0][0]) == 1e-3
+
+
+@pytest.mark.parametrize("background", [Background.NONE, Background.PER_FRAME, Background.COMMON])
+def test_an_object_without_light_leaves_the_frames_alike(background, problem):
+    """A sky takes the light of frames that show no object."""
+    objective, state = problem(random_precision())
+    objective = objective.with_changes(model=objective.model.beside(background))
+    now = calibrate(objective, replace(state, image=torch.zeros_like(state.image)))
+    assert float(now.image.abs().max()) == 0
+    torch.testing.assert_close(now.calibration.transmission, torch.ones_like(TRANSMISSION), rtol=1e-12, atol=0)
+    assert bool(torch.isfinite(now.calibration.noise_inflation).all())
 
 
 def test_calibrated_transmissions_are_one_on_average_and_noise_is_not_deflated(problem):

@@ -65,8 +65,9 @@ def _fit_transmission(background: Background, model: Tensor, frames: Tensor, pre
 
 
 def _slope(precision: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """Return the least-squares factor (t, 1, 1) of `x` to `y`."""
-    return (precision * x * y).sum((1, 2), keepdim=True) / (precision * x**2).sum((1, 2), keepdim=True)
+    """Return the least-squares factor (t, 1, 1) of `x` to `y`; 0 where `x` is 0, as for an object without light."""
+    square = (precision * x**2).sum((1, 2), keepdim=True)
+    return (precision * x * y).sum((1, 2), keepdim=True) / square.clamp(min=torch.finfo(square.dtype).tiny)
 
 
 def recalibrate(objective: MyopicObjective, state: State, power: int | None, *, follow_r0: bool) -> State:
