@@ -70,7 +70,7 @@ class Trade:
                 best = min(own, key=lambda cell: cell["score"])
                 blind = ""
                 if best["predicted_blind"] is not None:
-                    blind = f", or {between(own, self.key, 'predicted_blind'):.2g} with what blindness costs"
+                    blind = f", or {between(own, self.key, 'predicted_blind'):.2g} with what restorations lose"
                 lines.append(
                     f"The {name} is best at {self.name} = {optimum(own, self.key)}, with a score of "
                     f"{best['score']:.3f}; {best['kept']:.3f} of V^2 is kept {self.where} there. "

@@ -43,9 +43,9 @@ def plan_observation(
 
     The error is `TurbulentMSE` with the photons, the sky, the frames and the read-out noise that follow from the
     instrument at each point. It supposes that every transfer function is known; what restorations that had to find the
-    aberrations were measured to lose, `success_map`, raises what of it a mask can avoid. Each mask is searched for its
-    number and size of holes by `AsymptoticMSE` (hybrid, `budget` evaluations) at the light of the instrument's own
-    exposure, and kept for all exposures.
+    aberrations were measured to lose, `success_map`, and by long exposures and wide bands, `smearing_map`, raises what
+    of it a mask can avoid. Each mask is searched for its number and size of holes by `AsymptoticMSE` (hybrid, `budget`
+    evaluations) at the light of the instrument's own exposure, and kept for all exposures.
 
     Parameters
     ----------
