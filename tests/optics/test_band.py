@@ -88,3 +88,10 @@ def test_bands_are_in_metres():
         assert instrument == "NIRISS"
         assert band.wavelength == pytest.approx(int(name[1:4]) * 1e-8, rel=0.01)  # the name is the wavelength
         assert 0 < band.width < band.wavelength
+
+
+def test_the_relative_width_is_that_of_the_top_hat_of_equal_scatter():
+    """A top hat of width w scatters by w / sqrt(12), two equal lines a distance d apart by d / 2."""
+    assert Band.top_hat(2e-6, 0.5e-6, 3).relative_width == pytest.approx(0.25, rel=1e-12)
+    assert Band.of([0.9e-6, 1.1e-6]).relative_width == pytest.approx(math.sqrt(3) * 0.2, rel=1e-12)
+    assert Band.of([1e-6]).relative_width == 0
