@@ -157,13 +157,13 @@ def test_objects_are_neither_written_nor_read(tmp_path):
         save_npz(path, {"good": 1, "x": [object()]})
     assert names(tmp_path) == []
     np.savez(path, x=np.array([{}], dtype=object))
-    with pytest.raises(ValueError, match=r"a\.npz cannot be read.*pickle.*needed: an \.npz file with frames"):
+    with pytest.raises(ValueError, match=r"a\.npz cannot be read.*pickle.*needed: an \.npz file with 'frames'"):
         load_npz(path, ["frames"])
 
 
 def test_missing_array_is_named(tmp_path):
     save_npz(tmp_path / "a.npz", {"x": 1, "y": 2})
-    with pytest.raises(ValueError, match=r"a\.npz has no frames, centers; it contains x, y"):
+    with pytest.raises(ValueError, match=r"a\.npz has no 'frames', 'centers'; it contains x, y"):
         load_npz(tmp_path / "a.npz", ["x", "frames", "centers"])
 
 
@@ -192,7 +192,7 @@ def test_damaged_files_are_refused(tmp_path):
         with pytest.raises(ValueError, match=message) as caught:
             load_npz(path, ["frames"])
         assert str(path) in str(caught.value)
-        assert "needed: an .npz file with frames" in str(caught.value)
+        assert "needed: an .npz file with 'frames'" in str(caught.value)
 
 
 @dataclass(frozen=True)

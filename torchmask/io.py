@@ -129,7 +129,9 @@ def load_npz(path: str | Path, required: Sequence[str] = ()) -> dict[str, np.nda
     Raises ValueError if the file is missing, damaged or not an .npz file, contains pickled objects, or lacks an array
     named in `required`.
     """
-    need = f" (needed: an .npz file with {', '.join(required)})" if required else " (needed: an .npz file)"
+    # quoted, as these are names in a file: `torchmask.cli.wording` would take them for names of options
+    names = ", ".join(map(repr, required))
+    need = f" (needed: an .npz file with {names})" if required else " (needed: an .npz file)"
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"there is no file {path}{need}")
@@ -144,7 +146,9 @@ def load_npz(path: str | Path, required: Sequence[str] = ()) -> dict[str, np.nda
         raise ValueError(f"{path} is an archive of something other than arrays{need}")
     missing = [name for name in required if name not in arrays]
     if missing:
-        raise ValueError(f"{path} has no {', '.join(missing)}; it contains {', '.join(arrays) or 'nothing'}{need}")
+        raise ValueError(
+            f"{path} has no {', '.join(map(repr, missing))}; it contains {', '.join(arrays) or 'nothing'}{need}"
+        )
     return arrays
 
 

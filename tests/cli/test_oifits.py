@@ -7,13 +7,15 @@ import pytest
 import torch
 
 from torchmask.cli.main import main
-from torchmask.cli.oifits import OIFITSOptions, measure_frames
+from torchmask.cli.oifits import FILE, OIFITSOptions, measure_frames, write_frames
 from torchmask.cli.program import NOT_EXPLAINED
 from torchmask.grid import Grid
 from torchmask.interferometry.fringes import frame_observables
 from torchmask.observation import Observation
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.pixel import SquarePixel
+from torchmask.restoration.myopic import MyopicDeconvolution
+from torchmask.restoration.verdict import Finding
 
 fits = pytest.importorskip("astropy.io.fits")
 
@@ -71,3 +73,23 @@ def test_a_sky_that_is_known_is_taken_off_with_its_noise_counted(seen):
     torch.testing.assert_close(found.vis2, expected.vis2)
     torch.testing.assert_close(found.vis2_covariance, expected.vis2_covariance)
     assert measure_frames(bright, OIFITSOptions()) is None
+
+
+def test_a_sky_that_explains_the_frames_is_taken_off(seen, tmp_path):
+    bright, options = dataclasses.replace(seen, frames=seen.frames + 50), OIFITSOptions(oifits=True, bandwidth=1e-8)
+    ended = MyopicDeconvolution(MASK, GRID, 3, readout_noise=1.0, max_iterations=1).restore(bright.frames)
+    assert ended.verdict is not None
+    assert not ended.verdict.explained
+    lost = dataclasses.replace(ended, background=torch.full((3,), 50.0, dtype=torch.float64))
+    good = dataclasses.replace(lost, verdict=dataclasses.replace(ended.verdict, finding=Finding.EXPLAINED))
+    raw = measure_frames(bright, options)
+    for name, result, known, expected, told in (
+        ("good", good, 0.0, measure_frames(bright, options, 50.0), ", without a sky of 50 electrons"),
+        ("lost", lost, 0.0, raw, "; a sky in the frames lowers |V|^2: take it off by --sky"),
+        ("known", good, 50.0, raw, ""),  # what is handed in is without it already
+    ):
+        (tmp_path / name).mkdir()
+        (line,) = write_frames(tmp_path / name, raw, bright, options, result, known)
+        assert line.endswith(f"{FILE}{told}")
+        with fits.open(tmp_path / name / FILE) as hdus:
+            np.testing.assert_allclose(hdus["OI_VIS2"].data["VIS2DATA"].ravel(), expected.vis2, rtol=1e-12)

@@ -65,7 +65,7 @@ def test_options_are_the_turbulence_that_they_name():
     [
         (["--conditions.sky", "-1"], r"sky is -1\.0: it must be finite and at least 0"),
         (["--turbulence.exposure-time", "-0.1"], r"--turbulence.exposure-time is -0\.1: .* in s"),
-        (["--turbulence.exposure-time", "0.1"], "no wind"),
+        (["--turbulence.exposure-time", "0.1"], "--turbulence.exposure-time needs --turbulence.wind"),
         (["--turbulence.profile", "hv58"], "profile 'hv58' is unknown: known ones are hv57, las_campanas, mauna_kea"),
         (["--turbulence.frame-interval", "0.1"], "--turbulence.frame-interval needs --turbulence.wind"),
         (

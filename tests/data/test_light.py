@@ -106,7 +106,7 @@ def test_a_cloud_is_told_and_its_frame_stays(share):
     kept, said = usable(frames)
     assert kept == list(range(12))
     assert said == [
-        "frames [4] have less than half the light of the others, as through a cloud: `skip` leaves them out"
+        "frames [4] have less than half the light of the others, as through a cloud: they stay unless you skip them"
     ]
 
 

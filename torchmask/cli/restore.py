@@ -144,7 +144,6 @@ def restore_one(files: Sequence[Path], options: Options, star: MaskCalibration |
     method = deconvolution(observation, options)
     observables = measure_frames(observation, options, known_sky(options))
     with new_run("restore", options) as output:
-        output.summary.extend(write_frames(output.directory, observables, observation, options))
         state = output.directory / CHECKPOINT
         if checkpoint is not None:
             shutil.copyfile(checkpoint, state)
@@ -158,6 +157,9 @@ def restore_one(files: Sequence[Path], options: Options, star: MaskCalibration |
         ).with_frame_numbers(observation.frame_numbers)
         if star is not None and options.star is not None:
             write_calibration(output, star, [options.star], observation.grid.wavelength)
+        output.summary.extend(
+            write_frames(output.directory, observables, observation, options, result, known_sky(options))
+        )
         table = write_outcome(output.directory, observation, result, history(files, observation, result, options))
         log_outcome(observation, result, table, output.logger)
         output.logger.conclude(verdict=table["verdict"], clouded_frames=table["clouded_frames"])
@@ -200,7 +202,9 @@ def restore_several(stacks: Mapping[str, Sequence[Path]], options: Options, star
             tables[name] = write_outcome(
                 folder, seen[number], result, history(stacks[name], seen[number], result, options)
             )
-            output.summary.extend(write_frames(folder, observables[name], seen[number], options))
+            output.summary.extend(
+                write_frames(folder, observables[name], seen[number], options, result, known_sky(options))
+            )
             log_outcome(seen[number], result, tables[name], output.logger, f"{name}/")
             output.summary.append(f"{name}: {summarise_outcome(result, tables[name])}")
         verdicts = {name: table["verdict"] for name, table in tables.items()}

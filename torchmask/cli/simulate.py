@@ -67,6 +67,8 @@ class TurbulenceOptions:
         elif self.wind is None:
             if self.frame_interval is not None:
                 raise ValueError("--turbulence.frame-interval needs --turbulence.wind or --turbulence.profile")
+            if self.exposure_time > 0:
+                raise ValueError("--turbulence.exposure-time needs --turbulence.wind or --turbulence.profile")
             return TurbulencePhase(r0, outer_scale)
         else:
             layers = Layers.from_fractions(r0, wavelength, [0.0], [1.0], [self.wind])

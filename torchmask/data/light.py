@@ -55,7 +55,7 @@ def usable_frames(
     if clouded.size:
         warnings.warn(
             f"frames {named[clouded].tolist()} have less than half the light of the others, as through a cloud: "
-            "`skip` leaves them out",
+            "they stay unless you skip them",
             stacklevel=3,
         )
     return kept
