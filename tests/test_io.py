@@ -163,7 +163,7 @@ def test_objects_are_neither_written_nor_read(tmp_path):
 
 def test_missing_array_is_named(tmp_path):
     save_npz(tmp_path / "a.npz", {"x": 1, "y": 2})
-    with pytest.raises(ValueError, match=r"a\.npz has no 'frames', 'centers'; it contains x, y"):
+    with pytest.raises(ValueError, match=r"a\.npz has no 'frames', 'centers'; it contains 'x', 'y'"):
         load_npz(tmp_path / "a.npz", ["x", "frames", "centers"])
 
 

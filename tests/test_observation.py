@@ -148,7 +148,7 @@ def test_files_of_version_0_1_are_read(tmp_path):
     assert least.readout_noise is None
     for name in needed:
         np.savez(tmp_path / f"no_{name}.npz", **{key: old[key] for key in needed if key != name})
-        with pytest.raises(ValueError, match=f"has no {name}"):
+        with pytest.raises(ValueError, match=f"has no {name!r}"):
             Observation.load(tmp_path / f"no_{name}.npz")
 
 

@@ -146,9 +146,8 @@ def load_npz(path: str | Path, required: Sequence[str] = ()) -> dict[str, np.nda
         raise ValueError(f"{path} is an archive of something other than arrays{need}")
     missing = [name for name in required if name not in arrays]
     if missing:
-        raise ValueError(
-            f"{path} has no {', '.join(map(repr, missing))}; it contains {', '.join(arrays) or 'nothing'}{need}"
-        )
+        lacking, held = (", ".join(map(repr, names)) for names in (missing, arrays))
+        raise ValueError(f"{path} has no {lacking}; it contains {held or 'nothing'}{need}")
     return arrays
 
 

@@ -275,7 +275,7 @@ def test_bad_stacks_are_refused(runs, cube, tmp_path, capsys):
     refused(["restore", tmp_path / "cut.npz"], tmp_path, capsys, "cut.npz")
     refused(["restore", tmp_path / "cut.fits", *full], tmp_path, capsys, "cut.fits")
     refused(["restore", tmp_path / "four.fits", *full], tmp_path, capsys, r"shape \(2, 2, 8, 8\)")
-    refused(["restore", tmp_path / "frames.npz"], tmp_path, capsys, "has no centers")
+    refused(["restore", tmp_path / "frames.npz"], tmp_path, capsys, "has no 'centers'")
     refused(["restore", runs / "simulate/stack.npz", "--crop", "8"], tmp_path, capsys, "--crop is for FITS")
     refused(["restore", *[runs / "simulate/stack.npz"] * 2, "--join"], tmp_path, capsys, "--join is for FITS")
     two = [tmp_path / "none.npz", tmp_path / "cut.npz"]

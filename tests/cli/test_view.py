@@ -178,7 +178,7 @@ def test_mistakes_about_files(tmp_path, capsys):
     refused(capsys, "cannot be read as a mask", "view", tmp_path / "other.json")
     refused(capsys, "is not a run folder", "view", tmp_path / "empty")
     save_npz(tmp_path / "half.npz", {"frames": np.zeros((2, 8, 8))})
-    refused(capsys, "has no centers", "view", tmp_path / "half.npz")
+    refused(capsys, "has no 'centers'", "view", tmp_path / "half.npz")
 
 
 def test_a_cube_in_adu_is_shown_in_adu_with_its_sky(write_fits, fits_cube, sky_cards):
