@@ -1,11 +1,13 @@
 """E|OTF|^2 by Monte Carlo, with the exact von Karman covariance between all samples of a pupil.
 
 Screens made by FFT lack low frequencies. Here the phases of all samples, at all instants of an exposure and all
-wavelengths of a band, are drawn together from their covariance, by its Cholesky factor.
+wavelengths of a band, are drawn together from their covariance, by its Cholesky factor. What the mean of such draws
+tends to is known without any: a sum over pairs of samples, which tells their sampling from their statistics.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple
@@ -14,6 +16,7 @@ import torch
 from torch import Tensor
 
 from torchmask.atmosphere.seeing import Seeing
+from torchmask.atmosphere.transfer import difference_variance
 from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.band import Band
@@ -80,7 +83,7 @@ def drawn_powers(
     """
     band, samples = _sampled(aperture, grid, band, oversampling)
     open_ = [own.weights > 0 for own in samples]
-    wind = torch.tensor(seeing.wind if isinstance(seeing.wind, tuple) else (seeing.speed, 0.0), dtype=torch.float64)
+    wind = torch.tensor(_velocity(seeing), dtype=torch.float64)
     times = (torch.arange(n_instants, dtype=torch.float64) + 0.5) / n_instants * seeing.exposure
     places = [(own.offsets + aperture.centers[:, None])[inside] for own, inside in zip(samples, open_, strict=True)]
     covariance = _covariance(torch.cat([place - time * wind for time in times for place in places]), seeing)
@@ -96,6 +99,61 @@ def drawn_powers(
                 phase[:, inside] = next(pieces) * grid.wavelength / wavelength
                 otf += share / n_instants * _otf(own, grid, phase)
         yield otf.abs() ** 2
+
+
+def sampled_mean_square(
+    aperture: Aperture,
+    grid: Grid,
+    pixels: Tensor,
+    seeing: Seeing,
+    band: Band | None = None,
+    *,
+    n_instants: int = 1,
+    oversampling: int = 1,
+) -> Tensor:
+    """Return E|OTF|^2 (F,) of the exposures of `drawn_powers` by its definition, at `pixels` (F, 2), rows and columns.
+
+    It is the mean of exp(-E[(a (phi_1 - phi_2) - a' (phi_3 - phi_4))^2] / 2) over all pairs of such pairs of samples as
+    the baseline joins, of all instants and wavelengths.
+    """
+    band, samples = _sampled(aperture, grid, band, oversampling)
+    pupils = [_pupil(own).roll((own.raster[0] // 2, own.raster[1] // 2), (0, 1)) for own in samples]
+    steps = [torch.tensor(own.step[::-1], dtype=torch.float64) for own in samples]
+    scales = [grid.wavelength / wavelength for wavelength in band.wavelengths]
+    shifts = torch.stack([torch.fft.fftfreq(n, 1 / n)[at] for n, at in zip(grid.shape, pixels.T, strict=True)], -1)
+    shifts = oversampling * shifts.round().long()
+    reach = 4 * aperture.reach + grid.period * max(1.0, *(1 / scale for scale in scales))
+    structure = seeing.structure(reach + seeing.exposure * seeing.speed)
+    found = torch.zeros(len(pixels), dtype=torch.float64)
+    for row, shift in enumerate(shifts):
+        overlaps = []
+        for pupil, step in zip(pupils, steps, strict=True):
+            both = pupil * pupil.roll((-shift).tolist(), (0, 1))
+            inside = both.nonzero()
+            baseline = shift.flip(0) * step
+            places = (inside - torch.tensor(pupil.shape) // 2).flip(1) * step + baseline / 2
+            overlaps.append((places, both[inside.unbind(1)] / pupil.sum(), baseline))
+        for i, j in itertools.product(range(len(overlaps)), repeat=2):
+            (points, weights, one), (others, other_weights, other) = overlaps[i], overlaps[j]
+            for lag in range(n_instants):
+                drift = torch.tensor(_velocity(seeing), dtype=torch.float64) * seeing.exposure * lag / n_instants
+                share = band.shares[i] * band.shares[j] * (2 if lag else 1) * (n_instants - lag) / n_instants**2
+                for some, own in zip(points.split(_ROWS), weights.split(_ROWS), strict=True):
+                    apart = others - some[:, None] + drift
+                    variance = difference_variance(structure, apart, one, other, scales[i], scales[j])
+                    found[row] += share * (own @ torch.exp(-variance / 2) @ other_weights)
+    return found
+
+
+def _velocity(seeing: Seeing) -> tuple[float, float]:
+    """Return the wind [m/s], along x if its direction is not known."""
+    return seeing.wind if isinstance(seeing.wind, tuple) else (seeing.speed, 0.0)
+
+
+def _pupil(samples: PupilSamples) -> Tensor:
+    """Return the amplitude of the pupil on its raster, with the origin at the first pixel."""
+    pupil = torch.zeros(math.prod(samples.raster), dtype=torch.float64)
+    return pupil.scatter_add(0, samples.index.flatten(), samples.weights.flatten()).unflatten(0, samples.raster)
 
 
 def _sampled(aperture: Aperture, grid: Grid, band: Band | None, oversampling: int) -> tuple[Band, list[PupilSamples]]:

@@ -5,8 +5,10 @@
     python experiments/turbulent_transfer.py --smoke                           # everything, tiny, in seconds
 
 Masks of several numbers and sizes of holes and a full pupil, E|OTF|^2 of the criterion beside its mean over draws of
-the phases of all samples of the pupil. Frequencies count above 0.1 of the median baseline, where E|OTF|^2 is above
-2 % of what one pair of holes gives at most. The picture shows all of them for the first mask and the pupil.
+the phases of all samples of the pupil. Samples and instants of the draws are few: what their mean tends to is a sum
+over pairs of samples, and the ratio of Korff's integral to it is taken into the draws. Frequencies count above 0.1 of
+the median baseline, where E|OTF|^2 is above 2 % of what one pair of holes gives at most. The picture shows those of the
+first mask and the pupil.
 """
 
 from __future__ import annotations
@@ -19,10 +21,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
-from exact_turbulence import Drawn, drawn_mean_square
+from exact_turbulence import Drawn, drawn_mean_square, sampled_mean_square
 from torch import Tensor
 
 from torchmask.atmosphere.seeing import Seeing
+from torchmask.atmosphere.transfer import mean_square_otf
 from torchmask.cli.options import ExperimentOptions
 from torchmask.cli.program import run_script
 from torchmask.cli.run import new_run
@@ -40,7 +43,6 @@ DIAMETER, WAVELENGTH = 1.0, 550e-9
 _PER_R0 = 6  # samples
 _MOST = 20_000  # of all instants and wavelengths: their covariance takes 3 GB
 _WIND = (10.0, 0.0)  # [m/s]; only T / tau0 counts
-_STILL = 1e6  # r0 [m] without turbulence
 _LEAST = 0.02  # of what one pair of holes gives at most, or of the pupil's largest
 
 
@@ -70,6 +72,8 @@ class Options(ExperimentOptions):
     """Least number of samples across a hole of a mask."""
     n_pixels: int = 48
     """Frequency grid, per side."""
+    n_frequencies: int | None = None
+    """Number of frequencies compared of each pupil, at random among those that count; None: all of them."""
     n_draws: int = 2000
     """Exposures drawn of each pupil."""
     seed: int = 0
@@ -88,20 +92,24 @@ class Case(NamedTuple):
 
 
 class Compared(NamedTuple):
-    """E|OTF|^2 at the frequencies that count, in [F]: baseline [D], closed, drawn and its standard error."""
+    """E|OTF|^2 at the frequencies that count, in [F]: baseline [D], closed, Korff's integral, drawn and its error."""
 
     baseline: Tensor
     closed: Tensor
+    integral: Tensor
     drawn: Tensor
     error: Tensor
 
     def row(self, name: str) -> dict[str, Any]:
-        """Return the differences of closed form and draws, in per cent."""
+        """Return the differences of the closed form from the integral and the draws, in per cent."""
+        exact = 100 * (self.closed / self.integral - 1)
         ratio = 100 * (self.closed / self.drawn - 1)
         beyond = 100 * ((self.closed - self.drawn).abs() - 3 * self.error).clamp(min=0) / self.drawn
         return {
             "pupil": name,
             "n_frequencies": len(ratio),
+            "mean_of_integral": float(exact.mean()),
+            "largest_of_integral": float(exact.abs().max()),
             "mean": float(ratio.mean()),
             "largest": float(ratio.abs().max()),
             "standard_error": float(100 * (self.error / self.drawn).median()),
@@ -113,6 +121,8 @@ def check(options: Options) -> None:
     """Raise ValueError for what could not be drawn."""
     if not 0 <= options.width < 1:
         raise ValueError(f"width is {options.width}: it must be at least 0 and less than 1, over the wavelength")
+    if options.n_frequencies is not None and options.n_frequencies < 1:
+        raise ValueError(f"n_frequencies is {options.n_frequencies}: it must be at least 1, or left out for all")
     if options.n_draws < 2:
         raise ValueError(f"n_draws is {options.n_draws}: a standard error needs at least 2")
     for ratio in (*options.hole_over_r0, *options.pupil_over_r0):
@@ -165,51 +175,55 @@ def conditions(options: Options, case: Case) -> tuple[Seeing, Band | None]:
 
 def draw(options: Options, case: Case, grid: Grid) -> Drawn:
     """Exposures of one case."""
+    generator = torch.Generator().manual_seed(options.seed)
+    light, sampling = conditions(options, case), sampling_of(options, case)
+    return drawn_mean_square(case.aperture, grid, *light, n_draws=options.n_draws, generator=generator, **sampling)
+
+
+def sampling_of(options: Options, case: Case) -> dict[str, int]:
+    """Return how many instants make an exposure, and how much finer than the grid the pupil's samples are."""
+    n_instants = options.n_instants if options.exposure_tau0 > 0 else 1
+    return {"n_instants": n_instants, "oversampling": case.oversampling}
+
+
+def compare(options: Options, case: Case, grid: Grid, drawn: Drawn) -> Compared:
+    """Return the closed form of one turbulence beside Korff's integral and exposures that were drawn."""
     seeing, band = conditions(options, case)
-    return drawn_mean_square(
-        case.aperture,
-        grid,
-        seeing,
-        band,
-        n_draws=options.n_draws,
-        n_instants=options.n_instants if seeing.exposure > 0 else 1,
-        oversampling=case.oversampling,
-        generator=torch.Generator().manual_seed(options.seed),
-    )
-
-
-def compare(case: Case, grid: Grid, drawn: Drawn, seeing: Seeing, band: Band | None) -> Compared:
-    """Return the closed form for one turbulence beside exposures that were drawn."""
     wavelengths, shares = (None, None) if band is None else (band.wavelengths, band.shares)
     psds = PowerLawPSD(1.5, 1e5), NoisePSD(1e5)  # of any object: only E|OTF|^2 is asked for
-    power, still = (
-        TurbulentMSE(
-            grid, *psds, 1, air.r0, air.outer_scale, air.exposure, air.wind, wavelengths, shares
-        ).expected_power(case.aperture)
-        for air in (seeing, Seeing(_STILL))
-    )
-    closed = power * drawn.perfect / still  # of the samples that were drawn
-    nu_y, nu_x = grid.frequencies(torch.float64)
+    closed = TurbulentMSE(
+        grid, *psds, 1, seeing.r0, seeing.outer_scale, seeing.exposure, seeing.wind, wavelengths, shares
+    ).expected_power(case.aperture)
+    nu_y, nu_x = (nu.expand(grid.shape) for nu in grid.frequencies(torch.float64))
     baseline = torch.hypot(nu_y, nu_x) * grid.period
     counts = (baseline > case.lowest) & (drawn.mean > _LEAST * case.per_pair)
     counts &= (nu_y > 0) | ((nu_y == 0) & (nu_x > 0))  # the others are their opposites
-    return Compared(baseline[counts] / DIAMETER, closed[counts], drawn.mean[counts], drawn.error[counts])
+    pixels = counts.nonzero()
+    generator = torch.Generator().manual_seed(options.seed)
+    pixels = pixels[torch.randperm(len(pixels), generator=generator)[: options.n_frequencies]]
+    at = pixels.unbind(1)
+    integral = mean_square_otf(case.aperture, grid, torch.stack([nu_x[at], nu_y[at]], -1), seeing, band)
+    # the draws' samples and instants are few, by a ratio that is known
+    finer = integral / sampled_mean_square(case.aperture, grid, pixels, seeing, band, **sampling_of(options, case))
+    return Compared(baseline[at] / DIAMETER, closed[at], integral, finer * drawn.mean[at], finer * drawn.error[at])
 
 
 def markdown(options: Options, rows: Sequence[dict[str, Any]]) -> str:
     """Return the report as Markdown."""
     lines = [
-        "# E|OTF|^2 in closed form and drawn",
+        "# E|OTF|^2 in closed form, by Korff's integral and drawn",
         "",
         f"{options.n_draws} draws, outer scale {options.outer_scale or math.inf:g} D, "
         f"T / tau0 = {options.exposure_tau0:g}, band {100 * options.width:g} % wide, "
-        f"{options.n_pixels} frequencies a side. In per cent of what is drawn.",
+        f"{options.n_pixels} frequencies a side. In per cent.",
         "",
-        "| pupil | frequencies | mean | largest | standard error (median) | largest beyond three standard errors |",
-        "|---|---|---|---|---|---|",
+        "| pupil | frequencies | over the integral: mean | largest | over the draws: mean | largest | "
+        "standard error (median) | largest beyond three standard errors |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     lines += [
-        f"| {row['pupil']} | {row['n_frequencies']} | {row['mean']:+.2f} | {row['largest']:.1f} | "
+        f"| {row['pupil']} | {row['n_frequencies']} | {row['mean_of_integral']:+.2f} | "
+        f"{row['largest_of_integral']:.1f} | {row['mean']:+.2f} | {row['largest']:.1f} | "
         f"{row['standard_error']:.1f} | {row['beyond_three_errors']:.1f} |"
         for row in rows
     ]
@@ -254,14 +268,14 @@ def figure(shown: Sequence[tuple[str, Compared]]) -> Figure:
 def run(options: Options) -> None:
     """Draw and compare in a new folder."""
     if options.smoke:
-        tiny = {"n_subapertures": (4,), "hole_over_r0": (0.8,), "n_pixels": 24, "n_draws": 100}
+        tiny = {"n_subapertures": (4,), "hole_over_r0": (0.8,), "n_pixels": 24, "n_draws": 100, "n_frequencies": 20}
         options = dataclasses.replace(options, **tiny)
     check(options)
     grid = grid_of(options)
     with new_run("turbulent_transfer", options) as output:
         found = []
         for case in cases(options, grid):
-            found.append((case.name, compare(case, grid, draw(options, case, grid), *conditions(options, case))))
+            found.append((case.name, compare(options, case, grid, draw(options, case, grid))))
         rows = [compared.row(name) for name, compared in found]
         shown = [found[0], *found[len(found) - len(options.pupil_over_r0) :][:1]]
         text = markdown(options, rows)

@@ -5,13 +5,14 @@ import json
 
 import pytest
 import turbulent_transfer
-from turbulent_transfer import DIAMETER, WAVELENGTH, Options, cases, check, compare, conditions, draw, grid_of
+from turbulent_transfer import DIAMETER, WAVELENGTH, Options, cases, check, compare, draw, grid_of
 
-from torchmask.atmosphere.seeing import Seeing
 from torchmask.grid import Grid
 
 GRID = Grid.nyquist(DIAMETER, WAVELENGTH, 24)
-OPTIONS = Options(n_subapertures=(4,), hole_over_r0=(0.8,), pupil_over_r0=(3.0,), n_pixels=24, n_draws=400)
+OPTIONS = Options(
+    n_subapertures=(4,), hole_over_r0=(0.8,), pupil_over_r0=(3.0,), n_pixels=24, n_draws=400, n_frequencies=50
+)
 MASK, PUPIL = cases(OPTIONS, GRID)
 
 
@@ -19,13 +20,14 @@ MASK, PUPIL = cases(OPTIONS, GRID)
 def test_closed_form_and_draws_agree(case):
     """3 % is the claim, on top of three standard errors of the draws; on the mean of frequencies that share their
     exposures, of one."""
-    drawn, (seeing, band) = draw(OPTIONS, case, GRID), conditions(OPTIONS, case)
-    found = compare(case, GRID, drawn, seeing, band)
+    drawn = draw(OPTIONS, case, GRID)
+    found = compare(OPTIONS, case, GRID, drawn)
     row = found.row(case.name)
     assert row["n_frequencies"] > 40
     assert row["beyond_three_errors"] < 3
+    assert row["largest_of_integral"] < 3
     assert abs(row["mean"]) < 3 + row["standard_error"]
-    stronger = compare(case, GRID, drawn, Seeing(0.8 * seeing.r0), band)
+    stronger = compare(OPTIONS, case._replace(r0=0.8 * case.r0), GRID, drawn)
     assert stronger.row(case.name)["beyond_three_errors"] > 10  # the closed form of other turbulence would be seen
 
 
