@@ -79,7 +79,7 @@ def test_masks_agree_with_the_general_integral(n, ratio, outer_scale, tau, wind,
 def test_bands_agree_with_the_general_integral(n, ratio, width, most):
     mask, band = mask_of(n), Band.top_hat(550e-9, width * 550e-9, 3)
     r0 = mask.subaperture_diameter / ratio
-    row, column, nu = some_frequencies(mask, GRID, 15, 0.1)
+    row, column, nu = some_frequencies(mask, GRID, 24, 0.1)
     criterion = criterion_of(r0=r0, wavelengths=band.wavelengths, weights=band.shares)
     found = criterion.expected_power(mask)[row, column]
     exact = mean_square_otf(mask, GRID, nu, Seeing(r0), band)
