@@ -145,6 +145,7 @@ def test_a_background_that_is_known_is_taken_off_and_its_noise_is_left(five_hole
 @pytest.mark.parametrize(
     ("background", "message"),
     [
+        ("common", "such as Background.COMMON"),
         (math.nan, "not finite"),
         (-3.0, "negative .-3 electrons"),
         (torch.zeros(5), "broadcasts"),

@@ -82,8 +82,7 @@ def _contradiction(power: FringePower, aperture: SparseAperture, others: dict[st
     if best.share > max(told.share + best.error, _NAMED * best.error) and _may_be(best):
         return (
             f"the fringes of the frames fit the mask better {name} than as given (they show {best.share:.2f} of its "
-            f"pattern instead of {told.share:.2f}): check its orientation, or measure it with calibrate_mask on frames "
-            "of a star"
+            f"pattern instead of {told.share:.2f}): check its orientation, or calibrate it on frames of a star"
         )
     if _may_be(told):
         return ""

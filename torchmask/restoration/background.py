@@ -108,8 +108,12 @@ def darkest_level(frames: Tensor) -> Tensor:
 def check_known_level(level: float | Tensor, frames: Tensor) -> Tensor:
     """Expand a known background [electrons] to the shape of the frames (T, H, W).
 
-    Raises ValueError if it is not finite, is negative, or does not broadcast to the frames.
+    Raises ValueError if it is text, is not finite, is negative, or does not broadcast to the frames.
     """
+    if isinstance(level, str):
+        raise ValueError(
+            f"background is {level!r}: electrons per pixel are needed, or an assumption such as Background.COMMON"
+        )
     given = torch.as_tensor(level, dtype=frames.dtype, device=frames.device)
     if not bool(torch.isfinite(given).all()):
         raise ValueError("background holds values that are not finite: electrons per pixel are needed")

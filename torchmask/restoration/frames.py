@@ -79,7 +79,7 @@ class FrameStack:
         if border_brightness(light) > _BRIGHT_BORDER or float(guess.mean()) > _EVEN_LIGHT * float(frames.mean()):
             warnings.warn(
                 "the frames are bright at the border: does the object extend beyond the field? If it is sky, give its "
-                "level as background [electrons per pixel]",
+                "level [electrons per pixel]",
                 stacklevel=3,
             )
         return cls(frames / unit, valid, unit, variance, known, free, errors, slope)
