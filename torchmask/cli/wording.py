@@ -14,6 +14,7 @@ _START = r"(?:^|(?<=: ))"  # of a message, or of its part after the name of a fi
 _VALUE = re.compile(_START + r"(?P<name>[\w.]+) (?:is|are) (?P<value>[-+]?(?:\d[-+\w.]*|nan|inf)|[(\[][^)\]]*)")
 _SUBJECT = re.compile(_START + r"(?P<name>[a-z]\w*) (?=(?:is|are|has|have|holds|names|leaves) )")
 _ADVICE = re.compile(r"(?<=give )(?P<name>[a-z]\w*)\b|(?<![-\w./'\"`])(?P<word>[a-z]\w*_\w+)\b(?![./(=])")
+_ANGLE = re.compile(r"[\d.e+-]+ rad \((?P<arcsec>[\d.e+-]+ arcsec)\)")  # options are in arcsec
 _NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*(?:e[-+]?\d+)?|nan|inf)\b")
 
 
@@ -59,8 +60,10 @@ def in_options(message: str, options: Any) -> str:
     '--pixel-fill is 2.0: it must be a fraction'
     >>> in_options("these holes overlap: lower fill_factor", Options())
     'these holes overlap: lower --fill-factor'
+    >>> in_options("pixel_scale 4.848e-06 rad (1 arcsec) undersamples an aperture", Options())
+    'pixel_scale 1 arcsec undersamples an aperture'
     """
-    known = list(_flatten(options))
+    known, message = list(_flatten(options)), _ANGLE.sub(r"\g<arcsec>", message)
     told = _VALUE.search(message)
     head = told or _SUBJECT.search(message)
     if head is None:
@@ -83,7 +86,7 @@ def _by_value(name: str, numbers: list[float], known: list[Option]) -> str | Non
 
 
 def _by_name(name: str, known: list[Option]) -> str | None:
-    flags = [option.flag for option in known if option.name == name]
+    flags = [option.flag for option in known if option.name in (name, f"{name}_arcsec")]
     return flags[0] if len(flags) == 1 else None
 
 
