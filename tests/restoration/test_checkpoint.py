@@ -121,7 +121,7 @@ def test_a_damaged_checkpoint_is_refused(tmp_path):
     optional = {"decrease", "rival_decrease", "explained1_decrease"}  # where a start is not at its end
     for name in parts.keys() - optional:
         np.savez(file.path, **{key: value for key, value in parts.items() if key != name})
-        with pytest.raises(ValueError, match=rf"state\.npz has no {name}\b"):
+        with pytest.raises(ValueError, match=rf"state\.npz has no '?{name}\b"):
             file.load(CPU)
 
 
