@@ -74,7 +74,7 @@ class TurbulentMSE(AsymptoticMSE):
     integral for holes of 0.4 to 1.5 r0 (4 % for 1.5 r0 in a band 20 % wide), where it is above 2 % of what one pair of
     holes gives at most; that of full pupils, which is interpolated, within 2 % where it is above 1e-4 (4 % with vanes
     of D/25, or with an outer scale of 5 D). Baselines beyond the frequency torus alias as in MSE_a. A value takes 13 to
-    25 times as long as that of MSE_a, 80 to 170 times for 7 wavelengths over 20 %, and its gradient one to three times
+    22 times as long as that of MSE_a, 50 to 130 times for 7 wavelengths over 20 %, and its gradient two to five times
     the value.
 
     Examples
