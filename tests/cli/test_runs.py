@@ -229,7 +229,7 @@ def test_every_assumption_about_the_sky_has_its_word():
         (["--mask", "MASK", "--wavelength", "1e-6"], "give --pixel-scale-arcsec"),
         (
             ["--mask", "MASK", "--wavelength", "1e-6", "--pixel-scale-arcsec", "9"],
-            r"\(9 arcsec\) undersamples .* at most .* \(0\.1\d+ arcsec\)",
+            r"--pixel-scale-arcsec 9 arcsec undersamples .* at most 0\.1\d+ arcsec",
         ),
         (["--mask", "MASK", "--wavelength", "550"], r"--wavelength is 550: .* 550 nm are 550e-9"),
         (["--mask", "MASK", "--pixel-scale-arcsec", "-0.1"], "--pixel-scale-arcsec is -0.1: .* in arcsec"),
@@ -322,7 +322,7 @@ def test_a_band_that_the_pixels_undersample_is_refused_before_any_work(runs, tmp
         ["simulate", "--mask", runs / "design/mask.json", "--wavelength", "8e-7", "--pixel-scale-arcsec", "0.1"],
         tmp_path,
         capsys,
-        r"\(0\.1 arcsec\) undersamples",
+        r"0\.1 arcsec undersamples",
     )
 
 

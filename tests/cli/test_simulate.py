@@ -75,7 +75,7 @@ def test_options_are_the_turbulence_that_they_name():
         (["--conditions.band-width", "-1e-9"], r"--conditions.band-width is -1e-09: it must be at least 0 m"),
         (["--conditions.band-width", "8e-8", "--pixel-scale-arcsec", f"{FINE_ENOUGH:.6f}"], r"undersamples .* 5\.1\d"),
         (["--pixel-scale-arcsec", "0"], "--pixel-scale-arcsec is 0: it must be finite and positive, in arcsec"),
-        (["--pixel-scale-arcsec", "0.5"], r"\(0\.5 arcsec\) undersamples .* at most .* \(0\.06\d+ arcsec\)"),
+        (["--pixel-scale-arcsec", "0.5"], r"--pixel-scale-arcsec 0\.5 arcsec undersamples .* at most 0\.06\d+ arcsec"),
         (["--scene.path", "none.png"], "none.png"),
         (["--pixel-fill", "1.5"], r"--pixel-fill is 1\.5"),
         (["--jitter", "-1"], r"--jitter is -1\.0"),
