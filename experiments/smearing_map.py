@@ -25,7 +25,16 @@ from typing import Any
 import torch
 from mask_vs_full_options import DIAMETER, WAVELENGTH
 from smearing_map_report import figure, markdown, summarise, table_of
-from success_map import HOLES, of_mask, restore_known, scene_of, score
+from success_map import (
+    FILL_FACTOR,
+    HOLES,
+    READOUT_NOISE,
+    choose_masks,
+    of_mask,
+    restore_known,
+    scene_of,
+    score,
+)
 from trade import criterion
 
 import torchmask
@@ -34,9 +43,7 @@ from torchmask.atmosphere.phase import LayeredPhase
 from torchmask.cli.options import SweepOptions
 from torchmask.cli.program import run_script
 from torchmask.cli.run import new_run
-from torchmask.design.space import DesignSpace
 from torchmask.design.sweep import run_tasks
-from torchmask.design.table import design_table
 from torchmask.grid import Grid
 from torchmask.io import write_json
 from torchmask.observation import Observation
@@ -48,7 +55,7 @@ from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.simulation.conditions import Conditions
 from torchmask.simulation.exposures import simulate_observation
 
-WIND, OUTER_SCALE, READOUT_NOISE, FILL_FACTOR = 10.0, 20.0, 1.5, 0.15
+WIND, OUTER_SCALE = 10.0, 20.0  # in m/s, of which only T / tau0 counts, and in D
 FIRST = 100  # draw: scenes and turbulence are others than those of `success_map`, `exposure` and `band`
 OVERSAMPLING = 1.25  # of all bands
 
@@ -135,22 +142,6 @@ def predict(task: Mapping[str, Any]) -> dict[str, Any]:
     return {"scores": scores}
 
 
-def choose_masks(options: Options, callback: Callback) -> list[SparseAperture]:
-    """Return a searched mask for each draw."""
-    holes = list(itertools.islice(itertools.cycle(HOLES), options.draws))
-    space = DesignSpace(
-        n_subapertures=tuple(sorted(set(holes))),
-        fill_factor=(FILL_FACTOR,),
-        reference_fill_factor=FILL_FACTOR,
-        diameter_over_r0=(),
-        n_frequencies=64 if options.smoke else 128,
-        budget=100 if options.smoke else 2000,
-    )
-    table = design_table(space, options.sweep, **options.keywords(callback))
-    masks = {row.n_subapertures: table.aperture(row) for row in table.rows}
-    return [masks[n] for n in holes]
-
-
 def restore(options: Options, masks: Sequence[SparseAperture], callback: Callback) -> list[dict[str, Any]]:
     """Return a row for each draw, flux and amount, with its score where aberrations were searched for."""
     cases = [("exposure", length, 0.0) for length in options.exposures]
@@ -201,7 +192,7 @@ def run(options: Options) -> None:
         options = replace(options, exposures=(0.0, 2.0), widths=(0.02, 0.2), photons=(1e5, 1e6), draws=1)
         options = replace(options, n_pixels=36, n_frames=2, iterations=4)
     with new_run("smearing_map", options) as output:
-        rows = restore(options, choose_masks(options, output.callback), output.callback)
+        rows = restore(options, choose_masks(options.draws, options, output.callback), output.callback)
         cells, told = summarise(rows), setting(options)
         output.report(
             "smearing_map", {"setting": told, "cells": cells, "rows": rows}, markdown(told, cells), figure(cells)

@@ -185,9 +185,9 @@ def restore_known(observation: Observation) -> Tensor:
     return torch.from_numpy(found.x).reshape(shape)
 
 
-def choose_masks(options: Options, callback: Callback) -> list[SparseAperture]:
+def choose_masks(n_draws: int, options: SweepOptions, callback: Callback) -> list[SparseAperture]:
     """Return a searched mask for each draw."""
-    holes = [HOLES[draw % len(HOLES)] for draw in range(max(options.draws))]
+    holes = [HOLES[draw % len(HOLES)] for draw in range(n_draws)]
     space = DesignSpace(
         n_subapertures=tuple(sorted(set(holes))),
         fill_factor=(FILL_FACTOR,),
@@ -282,7 +282,7 @@ def run(options: Options) -> None:
         options = replace(options, d_over_r0=(0.5, 1.0), photons=(1e6, 1e7), frames=(1, 2), draws=(1, 1), n_pixels=36)
         options = replace(options, iterations=4)
     with new_run("success_map", options) as output:
-        masks = choose_masks(options, output.callback)
+        masks = choose_masks(max(options.draws), options, output.callback)
         rows = restore(options, masks, output.callback)
         cells = summarise(rows, bounds(options, masks[0], output.callback))
         numbers = {"setting": setting(options, cells), "cells": cells, "rows": rows}

@@ -40,7 +40,7 @@ def test_the_map_of_smearing_is_what_the_plan_can_read(tmp_path, monkeypatch):
         return (1 + task["exposure"] + 10 * task["width"]) ** power
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(smearing_map, "choose_masks", lambda options, callback: [THREE])
+    monkeypatch.setattr(smearing_map, "choose_masks", lambda n_draws, options, callback: [THREE])
     monkeypatch.setattr(smearing_map, "predict", lambda task: {"scores": [0.1 * grown(task, -0.1)] * 2})
     monkeypatch.setattr(smearing_map, "measure_known", lambda task: {"known": 0.1 * grown(task, 0.2)})
     monkeypatch.setattr(smearing_map, "measure", lambda task: {"score": 0.2 * grown(task, 0.5)})

@@ -108,3 +108,5 @@ def test_a_map_that_cannot_be_is_refused(changes, said):
 def test_points_that_cannot_be_are_refused(value):
     with pytest.raises(ValueError, match=r"n_photons is .*: it must be finite and positive"):
         MAP.outlook(0.5, value, 1)
+    with pytest.raises(ValueError, match=r"d_over_r0 is 0.*: it must be finite and positive"):
+        success_map().outlook(0.0, 1e6, 5)

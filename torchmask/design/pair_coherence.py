@@ -26,9 +26,7 @@ _KURTOSIS = 2.5  # along one axis, of the separation of two points of two discs
 _POINTS = [
     (i * math.sqrt(_KURTOSIS), (1 - abs(i)) * (1 - 1 / _KURTOSIS) + abs(i) / (2 * _KURTOSIS)) for i in (-1, 0, 1)
 ]
-_LIGHT = (
-    0.13  # mean square of a place in a lens's T, taken for a Gaussian, along either axis over the hole's diameter^2
-)
+_LIGHT = 0.13  # mean square of a place in a lens's T, a Gaussian here, along either axis, over the hole's diameter^2
 _STEPS = 4  # of the spline to a hole
 
 

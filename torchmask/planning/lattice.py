@@ -20,8 +20,9 @@ class Axis:
     words : what its values are, for warnings
     values : in rising order, at least two
     logarithmic : whether tables are interpolated evenly in its logarithm
+    may_be_zero : whether 0 is a value of the quantity
 
-    Raises ValueError if the values are too few, negative or out of order, or 0 on a logarithmic axis.
+    Raises ValueError if the values are too few, negative or out of order, or 0 where that is none.
 
     Examples
     --------
@@ -33,6 +34,7 @@ class Axis:
     words: str
     values: Sequence[float]
     logarithmic: bool = False
+    may_be_zero: bool = False
 
     def __post_init__(self) -> None:
         if len(self.values) < 2 or not (np.diff(self.values) > 0).all() or not self._can_be(self.values[0]):
@@ -42,15 +44,15 @@ class Axis:
 
     @property
     def _wanted(self) -> str:
-        return "finite and positive" if self.logarithmic else "finite and at least 0"
+        return "finite and at least 0" if self.may_be_zero else "finite and positive"
 
     def _can_be(self, value: float) -> bool:
-        return math.isfinite(value) and (value > 0 or (value == 0 and not self.logarithmic))
+        return math.isfinite(value) and (value > 0 or (value == 0 and self.may_be_zero))
 
     def place(self, value: float) -> float:
         """Return the fractional index of a value, that of the nearest end outside.
 
-        Raises ValueError unless the value is finite and positive, or 0 on an axis that is not logarithmic.
+        Raises ValueError unless the value is finite and positive, or 0 where it may be.
         """
         if not self._can_be(value):
             raise ValueError(f"{self.name} is {value}: it must be {self._wanted}")

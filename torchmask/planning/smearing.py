@@ -57,8 +57,8 @@ class SmearingMap:
     def _axes(self) -> tuple[Axis, Axis, Axis]:
         return (
             Axis("n_photons", "photons per frame", self.n_photons, logarithmic=True),
-            Axis("exposure", "exposures over tau0", self.exposures),
-            Axis("width", "widths of the band over the wavelength", self.widths),
+            Axis("exposure", "exposures over tau0", self.exposures, may_be_zero=True),
+            Axis("width", "widths of the band over the wavelength", self.widths, may_be_zero=True),
         )
 
     def outlook(self, instants: BlindOutlook, *, n_photons: float, exposure: float, width: float) -> BlindOutlook:

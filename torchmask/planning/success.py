@@ -112,7 +112,7 @@ class SuccessMap:
         Raises
         ------
         ValueError
-            If a number is not finite, or not positive (d / r0: negative).
+            If a number is not finite and positive.
 
         Warns
         -----

@@ -1,0 +1,94 @@
+"""What two lenses share, against sums over pairs of their points."""
+
+import math
+
+import pytest
+import torch
+
+from torchmask.atmosphere.colour_coherence import ColourCoherence, colour_loss
+from torchmask.atmosphere.seeing import Seeing
+from torchmask.atmosphere.transfer import difference_variance
+from torchmask.design.overlap import Geometry
+from torchmask.design.pair_coherence import _POINTS, PairCoherence
+from torchmask.optics.band import Band
+from torchmask.optics.shapes import Disc
+
+DIAMETER, LONGEST, REFERENCE = 0.05, 0.8, 550e-9
+GEOMETRY = Geometry((48, 48), 2.0, Disc(), DIAMETER, DIAMETER)
+STRETCH = (1.1, 0.9)  # wavelengths over REFERENCE
+BASELINE = torch.tensor([[0.4, 0.3]], dtype=torch.float64)  # so long that a lens transmits one wavelength only
+
+each_separation = pytest.mark.parametrize("distance", [1.2, 4.0])
+each_ratio = pytest.mark.parametrize("ratio", [0.1, 0.2, 0.4])
+
+
+def coherence_of(seeing, colours=None):
+    return PairCoherence(GEOMETRY, seeing, colours, LONGEST, torch.float64, torch.device("cpu"))
+
+
+def lens_points(place, side):
+    """Points of the overlap of two discs whose centres are `place` (2,) apart, about its middle, (P, 2) [m]."""
+    axis = ((torch.arange(side, dtype=torch.float64) + 0.5) / side - 0.5) * DIAMETER
+    points = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), -1).flatten(0, 1)
+    inside = ((points + place / 2).norm(dim=-1) < DIAMETER / 2) & ((points - place / 2).norm(dim=-1) < DIAMETER / 2)
+    return points[inside]
+
+
+def mean_over_points(seeing, baselines, phases, separation):
+    """The mean of exp(-variance / 2) over pairs of points of two holes."""
+    points = lens_points(torch.zeros(2), 24)
+    separations = separation + (points[:, None] - points).flatten(0, 1)
+    first, second = (baseline.expand_as(separations) for baseline in baselines)
+    variance = difference_variance(seeing.structure(4 * LONGEST), separations, first, second, *phases)
+    return float(torch.exp(-variance / 2).mean())
+
+
+def tolerance(ratio):
+    """Of the logarithm at d / r0: nine points have all moments up to the fifth, so that what they miss goes with the
+    cube of (d / r0)^(5/3); 24 samples across a hole are off by 24^-2 of a variance of about 0.1."""
+    return 0.01 * (ratio / 0.4) ** 5 + 2e-4
+
+
+@pytest.mark.parametrize("distance", [0.1, 0.3, 0.5, 0.7])
+def test_moments_are_those_of_the_lens_of_two_discs(distance):
+    """To a per cent of those of a hole, as the fit of the lens's width and height is meant."""
+    coherence = coherence_of(Seeing(DIAMETER))
+    place = distance * DIAMETER * torch.tensor([0.8, 0.6], dtype=torch.float64)
+    points = lens_points(place, 400)
+    expected = points.T @ points / len(points)
+    found = coherence._moments(*place)
+    for value, (row, column) in zip(found, ((0, 0), (0, 1), (1, 1)), strict=True):
+        assert float(value) == pytest.approx(float(expected[row, column]), abs=0.01 * coherence.variance)
+
+
+def test_points_have_the_moments_of_the_separations_between_two_discs():
+    """Along one axis x a disc of radius R has <x^2> = R^2 / 4 and <x^4> = R^4 / 8, so that its kurtosis is 2; that of
+    the difference of two points is (2 + 3) / 2."""
+    for power, expected in ((0, 1), (1, 0), (2, 1), (3, 0), (4, 5 / 2)):
+        assert sum(share * place**power for place, share in _POINTS) == pytest.approx(expected, abs=1e-12)
+
+
+@each_separation
+@each_ratio
+def test_one_colour_is_the_mean_over_pairs_of_points(distance, ratio):
+    seeing = Seeing(DIAMETER / ratio)
+    coherence, separation = coherence_of(seeing), torch.tensor([[0.6, -0.8]]).double() * distance * DIAMETER
+    found = coherence.around(BASELINE, BASELINE, separation, torch.ones_like(BASELINE), 1)
+    expected = math.log(mean_over_points(seeing, (BASELINE, BASELINE), (1.0, 1.0), separation))
+    assert float((found * coherence.far(*BASELINE[0])).log()) == pytest.approx(expected, abs=tolerance(ratio))
+
+
+@each_separation
+@each_ratio
+def test_two_colours_are_the_mean_over_pairs_of_points_beside_what_they_keep_in_one_lens(distance, ratio):
+    seeing = Seeing(DIAMETER / ratio)
+    band = Band.of([stretch * REFERENCE for stretch in STRETCH])
+    colours = ColourCoherence(Disc(), DIAMETER, seeing, band, REFERENCE, LONGEST)
+    coherence, separation = coherence_of(seeing, colours), torch.tensor([[0.6, -0.8]]).double() * distance * DIAMETER
+    first, second = (stretch * BASELINE for stretch in STRETCH)  # of which BASELINE is the mean
+    found = coherence.around(first, second, separation, torch.ones_like(BASELINE), 1)
+    one, other = (torch.tensor(1 / stretch) for stretch in STRETCH)
+    factors = (factor.flatten()[0] for factor in colours.factors(BASELINE / ((one + other) / 2)))
+    kept = math.log(mean_over_points(seeing, (first, second), (float(one), float(other)), separation))
+    expected = kept + float(colour_loss(*factors, one, other))
+    assert float((found * coherence.far(*BASELINE[0])).log()) == pytest.approx(expected, abs=tolerance(ratio))
