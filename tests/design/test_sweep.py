@@ -62,7 +62,7 @@ def finished(tmp_path: Path) -> list[Path]:
 
 def test_a_killed_sweep_loses_at_most_the_running_tasks(tmp_path):
     process = start(tmp_path, "loky")
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 300  # of a busy machine
     while len(finished(tmp_path)) < 3:
         assert process.poll() is None, process.communicate()[1]
         assert time.monotonic() < deadline
@@ -76,25 +76,30 @@ def test_a_killed_sweep_loses_at_most_the_running_tasks(tmp_path):
         stored = json.loads(path.read_text())
         assert stored["result"]["square"] == stored["task"]["x"] ** 2
 
-    resumed = start(tmp_path, "loky")
-    _, errors = resumed.communicate(timeout=60)
-    assert resumed.returncode == 0, errors.decode()
-    assert len(finished(tmp_path)) == 10
+    computed = []
+
+    def count(task: dict) -> dict:
+        computed.append(task["x"])
+        return square(task)
+
+    tasks = [{"x": float(x)} for x in range(10)]
+    resumed = run_tasks(count, tasks, tmp_path / "sweep", stage="square", n_workers=1)
+    assert [result["square"] for result in resumed] == [task["x"] ** 2 for task in tasks]
     assert {path: path.stat().st_mtime_ns for path in done} == before  # what was there is read, not computed
-    started = len(list((tmp_path / "marks").glob("*.started")))
+    assert len(computed) == 10 - len(done)
     # Computed twice: at most the two running tasks, and two whose results were on the way to a process that waits.
-    assert started <= 10 + 2 + 2
+    assert len(list((tmp_path / "marks").glob("*.started"))) <= len(done) + 2 + 2
 
 
 def test_an_interrupted_sweep_ends_and_keeps_what_is_done(tmp_path):
     process = start(tmp_path, "loky")
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 300  # of a busy machine
     while len(finished(tmp_path)) < 2:
         assert process.poll() is None, process.communicate()[1]
         assert time.monotonic() < deadline
         time.sleep(0.01)
     os.killpg(process.pid, signal.SIGINT)  # Ctrl-C reaches the whole group
-    _, errors = process.communicate(timeout=60)
+    _, errors = process.communicate(timeout=300)
     assert b"KeyboardInterrupt" in errors
     assert 2 <= len(finished(tmp_path)) < 10
 

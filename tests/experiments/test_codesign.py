@@ -85,11 +85,11 @@ def test_the_full_pupil_gets_photons_by_its_area_and_reaches_as_far(finished):
 
 def test_same_seed_same_numbers_and_another_seed_others(finished, tmp_path):
     assert tiny(tmp_path / "again") == 0
-    assert tiny(tmp_path / "other", "--seed", "1") == 0
+    assert tiny(tmp_path / "other", "--seed", "1", "--restoration.max-iterations", "1") == 0
     first, again, other = (load_npz(path / "result.npz") for path in (finished, tmp_path / "again", tmp_path / "other"))
     for name in first:
         np.testing.assert_array_equal(first[name], again[name])
-    for name in ("centers", "mask_frames", "mask_object"):
+    for name in ("centers", "mask_frames", "full_frames"):
         assert np.abs(first[name] - other[name]).max() > 0
 
 
