@@ -129,7 +129,7 @@ def test_simulate_takes_its_units_as_they_are_called(runs, tmp_path):
     assert (observation.r0, observation.outer_scale, observation.readout_noise) == (0.3, 20.0, 1.5)
     telescope = ["--mask", "full", "--mask-diameter", "2.0", "--central-obstruction", "0.5"]
     telescope += ["--vane-width", "0.02", "--vane-angles", "45", "225"]
-    sky = ["--pixel-scale-arcsec", "0.02", "--n-pixels", "16", "--n-frames", "1", "--r0", "None"]
+    sky = ["--pixel-scale-arcsec", "0.02", "--n-pixels", "16", "--n-frames", "1", "--r0", "inf"]
     run("simulate", *telescope, "--wavelength", "550e-9", *sky, "--out", tmp_path / "full")
     observation = Observation.load(tmp_path / "full/stack.npz")
     assert isinstance(observation.aperture, FullAperture)

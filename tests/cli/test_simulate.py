@@ -1,5 +1,6 @@
 """`torchmask simulate` with all that a telescope adds, in the units of its options, and what it refuses."""
 
+import math
 import re
 
 import pytest
@@ -7,7 +8,7 @@ import torch
 
 from torchmask.atmosphere.profiles import named_layers
 from torchmask.cli.main import main
-from torchmask.cli.simulate import TurbulenceOptions
+from torchmask.cli.simulate import Options, TurbulenceOptions
 from torchmask.design.manufacture import save_json
 from torchmask.grid import ARCSEC
 from torchmask.observation import Observation
@@ -49,13 +50,15 @@ def test_all_effects_at_once_leave_their_truths_in_the_stack(tmp_path, capsys):
 
 def test_options_are_the_turbulence_that_they_name():
     hv57 = named_layers("hv57", 3)
-    as_it_is = TurbulenceOptions("hv57", 3).make(None, 550e-9, 20.0)
+    as_it_is = TurbulenceOptions("hv57", 3).make(Options.r0, 550e-9, 20.0)
     assert as_it_is.layers == hv57
     stronger = TurbulenceOptions("hv57", 3, (3.0, 4.0)).make(0.05, 550e-9, 20.0)
     assert stronger.r0 == pytest.approx(0.05)
     assert stronger.layers.heights == hv57.heights
     assert stronger.layers.winds == ((3.0, 4.0),) * 3
-    assert TurbulenceOptions().make(None, 550e-9, 20.0) is None
+    assert TurbulenceOptions().make(Options.r0, 550e-9, 20.0).r0 == 0.15
+    assert TurbulenceOptions().make(math.inf, 550e-9, 20.0) is None
+    assert TurbulenceOptions("hv57", 3).make(math.inf, 550e-9, 20.0) is None
     wind = TurbulenceOptions(wind=(3.0, 4.0), frame_interval=0.02).make(0.1, 550e-9, 20.0)
     assert (wind.layers.heights, wind.frame_interval) == ((0.0,), 0.02)
 

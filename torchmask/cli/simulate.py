@@ -37,6 +37,8 @@ from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
 from torchmask.simulation.wavefronts import Turbulence
 
+_DEFAULT_R0 = 0.15  # [m]
+
 
 @dataclass(frozen=True)
 class TurbulenceOptions:
@@ -54,7 +56,9 @@ class TurbulenceOptions:
     """Exposure time of a frame [s]; needs a wind."""
 
     def make(self, r0: float | None, wavelength: float, outer_scale: float) -> Turbulence:
-        """Return the turbulence with Fried parameter `r0` [m]; None means that of the profile, or no turbulence."""
+        """Return the turbulence with Fried parameter `r0` [m], of which the option tells what None and inf mean."""
+        if r0 == math.inf:
+            return None
         if self.profile is not None:
             layers = named_layers(self.profile, self.layers)
             if r0 is not None or self.wind is not None:
@@ -62,16 +66,15 @@ class TurbulenceOptions:
                 layers = Layers.from_fractions(
                     layers.r0(wavelength) if r0 is None else r0, wavelength, layers.heights, layers.strengths, winds
                 )
-        elif r0 is None:
-            return None
-        elif self.wind is None:
+            return LayeredPhase(layers, wavelength, outer_scale, self.frame_interval)
+        r0 = _DEFAULT_R0 if r0 is None else r0
+        if self.wind is None:
             if self.frame_interval is not None:
                 raise ValueError("--turbulence.frame-interval needs --turbulence.wind or --turbulence.profile")
             if self.exposure_time > 0:
                 raise ValueError("--turbulence.exposure-time needs --turbulence.wind or --turbulence.profile")
             return TurbulencePhase(r0, outer_scale)
-        else:
-            layers = Layers.from_fractions(r0, wavelength, [0.0], [1.0], [self.wind])
+        layers = Layers.from_fractions(r0, wavelength, [0.0], [1.0], [self.wind])
         return LayeredPhase(layers, wavelength, outer_scale, self.frame_interval)
 
 
@@ -153,8 +156,9 @@ class Options(InstrumentOptions, MaskOptions, RunOptions):
     """Pixels per side of the image."""
     pixel_scale_arcsec: float | None = None
     """Angle on the sky of one pixel [arcsec]; None: the largest without aliasing at the shortest wavelength."""
-    r0: float | None = 0.15
-    """Fried parameter of the turbulence at the wavelength [m]; None: that of the profile, or no turbulence."""
+    r0: float | None = None
+    """Fried parameter of the turbulence at the wavelength [m]; None: that of the profile, or 0.15 without one; inf: no
+    turbulence."""
     outer_scale: float = 20.0
     """Outer scale of the turbulence [m]."""
     turbulence: TurbulenceOptions = field(default_factory=TurbulenceOptions)
