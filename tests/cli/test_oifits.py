@@ -66,6 +66,24 @@ def test_an_unknown_band_is_refused_before_any_work(options, message, seen, tmp_
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize(
+    ("told", "width"),
+    [
+        (["--wavelengths", "545e-9", "555e-9"], 10e-9 * 3**0.5),  # the top hat of their variance, 5 nm squared
+        (["--filter", "{curve}"], 20e-9),
+        (["--filter", "{curve}", "--bandwidth", "1e-8"], 1e-8),
+    ],
+)
+def test_the_width_of_the_band_is_that_of_its_filter_or_wavelengths(told, width, seen, tmp_path):
+    seen.save(tmp_path / "stack.npz")
+    curve = tmp_path / "curve.txt"
+    curve.write_text("540e-9 1\n560e-9 1\n")
+    told = [word.format(curve=curve) for word in told]
+    assert restore(tmp_path / "stack.npz", "--oifits", *told, "--out", tmp_path / "run") == NOT_EXPLAINED
+    with fits.open(tmp_path / "run/frames.oifits") as hdus:
+        assert float(hdus["OI_WAVELENGTH"].data["EFF_BAND"][0]) == pytest.approx(width, rel=1e-3)
+
+
 def test_a_sky_that_is_known_is_taken_off_with_its_noise_counted(seen):
     bright = dataclasses.replace(seen, frames=seen.frames + 50)
     found = measure_frames(bright, OIFITSOptions(oifits=True, bandwidth=1e-8), sky=50.0)

@@ -45,6 +45,12 @@ class BandOptions(FilterOptions):
     weights: tuple[float, ...] = ()
     """Relative amount of light at each of --wavelengths, any positive numbers; none: equal amounts."""
 
+    def told_width(self) -> float | None:
+        """Return the width of the band [m]; None if there is none. Raises ValueError for an unknown filter."""
+        if self.filter is not None:
+            return Band.from_filter(self.filter, self.n_wavelengths, self.temperature).width or None
+        return Band.of(self.wavelengths, self.weights or None).width or None if self.wavelengths else None
+
     def band(self, wavelength: float) -> dict[str, Any]:
         """Return the band as `MyopicDeconvolution` takes it. Raises ValueError for two bands or another filter."""
         if self.weights and not self.wavelengths:

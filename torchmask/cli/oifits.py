@@ -28,7 +28,8 @@ class OIFITSOptions:
     oifits: tyro.conf.FlagCreatePairsOff[bool] = False
     """Write the frames' squared visibilities and closure phases, not calibrated by a star, to frames.oifits."""
     bandwidth: float | None = None
-    """Width of the band for the OIFITS file [m]; None: that of the FILTER in the header."""
+    """Width of the band for the OIFITS file [m]; None: that of --filter, --wavelengths or --instrument, or else that of
+    the FILTER in the header."""
 
 
 def measure_frames(observation: Observation, options: OIFITSOptions, sky: Tensor | float = 0.0) -> Observables | None:
@@ -42,7 +43,7 @@ def measure_frames(observation: Observation, options: OIFITSOptions, sky: Tensor
     width = options.bandwidth
     if width is None and filter_of_header(observation.header) is None:
         raise ValueError(
-            "--oifits needs the width of the band, but the header has no known FILTER: give --bandwidth [m]"
+            "--oifits needs the width of the band, but the header has no known FILTER: give --bandwidth [m] or --filter"
         )
     if width is not None and not (math.isfinite(width) and width > 0):
         raise ValueError(f"--bandwidth is {width:g}: it must be finite and positive, in m")

@@ -6,7 +6,7 @@ import dataclasses
 import math
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -116,6 +116,8 @@ def run(options: Options) -> int:
         raise ValueError("there is no stack to restore: give .npz or FITS files")
     if options.resume is not None and len(stacks) > 1:
         raise ValueError(f"--resume continues one stack, but {len(stacks)} are given")
+    if options.oifits and options.bandwidth is None:
+        options = replace(options, bandwidth=options.told_width())
     require_one_pixel(options, options.estimate_pixel)
     if options.estimate_pixel and options.star is None:
         raise ValueError("--estimate-pixel needs a star, whose size is known: give --star, or --pixel-fill")

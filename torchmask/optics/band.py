@@ -122,17 +122,27 @@ class Band:
         return min(self.wavelengths)
 
     @property
+    def width(self) -> float:
+        """Width [m] of the top hat with the same scatter of wavelengths; 0 for a single one.
+
+        >>> round(1e9 * Band.top_hat(550e-9, 55e-9).width, 6)
+        55.0
+        """
+        mean, pairs = self._mean, zip(self.wavelengths, self.shares, strict=True)
+        return math.sqrt(12 * math.fsum(share * (wavelength - mean) ** 2 for wavelength, share in pairs))
+
+    @property
     def relative_width(self) -> float:
-        """Width over the mean wavelength of the top hat with the same scatter of wavelengths; 0 for a single one.
+        """The width over the mean wavelength.
 
         >>> round(Band.top_hat(550e-9, 55e-9).relative_width, 6)
         0.1
         """
-        mean = math.fsum(share * wavelength for wavelength, share in zip(self.wavelengths, self.shares, strict=True))
-        variance = math.fsum(
-            share * (wavelength - mean) ** 2 for wavelength, share in zip(self.wavelengths, self.shares, strict=True)
-        )
-        return math.sqrt(12 * variance) / mean
+        return self.width / self._mean
+
+    @property
+    def _mean(self) -> float:
+        return math.fsum(share * wavelength for wavelength, share in zip(self.wavelengths, self.shares, strict=True))
 
 
 def _fine_samples(wavelengths: np.ndarray, transmission: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
