@@ -1,12 +1,13 @@
-"""What long exposures and wide bands cost a restoration that has to find the aberrations, beyond what is predicted.
+"""What restorations that have to find the aberrations attain in long exposures and wide bands, over what is predicted.
 
-    python experiments/smearing_map.py                    # 180 restorations: an hour of one core
+    python experiments/smearing_map.py                    # 240 restorations: an hour of one core
     python experiments/smearing_map.py --draws 2          # fewer of each
     python experiments/smearing_map.py --smoke            # everything, tiny, in seconds
 
 Each draw is another mask, scene, turbulence and noise, and is restored from instants in narrow light, from ever longer
 exposures and from ever wider bands, with the same photons in each frame. The library's defaults with one start are told
-the read-out noise and the band, not how long a frame lasts. What is predicted is `TurbulentMSE` for the first mask.
+the read-out noise and the band, not how long a frame lasts. What is predicted is `TurbulentMSE` for instants in narrow light
+and known PSFs, times what `success_map` says that unknown ones cost: measure that map first.
 
 The table, the figure and the numbers go to a new folder, and with them smearing.json, which `torchmask plan`
 interpolates (torchmask/planning/smearing.json). Every restoration is kept in --sweep, from which a run that was stopped
@@ -18,6 +19,7 @@ from __future__ import annotations
 import itertools
 import math
 import sys
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -31,7 +33,6 @@ from success_map import (
     READOUT_NOISE,
     choose_masks,
     of_mask,
-    restore_known,
     scene_of,
     score,
 )
@@ -50,6 +51,7 @@ from torchmask.observation import Observation
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.band import Band
 from torchmask.optics.detector import Detector
+from torchmask.planning.success import success_map
 from torchmask.record import Callback
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.simulation.conditions import Conditions
@@ -65,14 +67,12 @@ class Options(SweepOptions):
     """What is restored."""
 
     exposures: tuple[float, ...] = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)
-    """Exposure times of a frame, T / tau0, of which the first is the reference."""
+    """Exposure times of a frame, T / tau0, of which the first is an instant."""
     widths: tuple[float, ...] = (0.02, 0.1, 0.2, 0.4)
-    """Widths of the band over the wavelength, of which the first is the reference."""
+    """Widths of the band over the wavelength, of which the first is narrow."""
     photons: tuple[float, ...] = (1e5, 1e6, 1e7)
     """Electrons per frame through the mask, the same at all exposures and widths."""
-    searched: tuple[float, ...] = (1e5, 1e6)
-    """Those of them at which the aberrations are searched for; at the others PSFs are known."""
-    draws: int = 5
+    draws: int = 8
     """Draws of mask, scene, turbulence and noise."""
     d_over_r0: float = 4.0
     """Strength of the turbulence, D / r0."""
@@ -102,7 +102,7 @@ def observe(task: Mapping[str, Any]) -> Observation:
 
 
 def measure(task: Mapping[str, Any]) -> dict[str, Any]:
-    """Restore with unknown aberrations, and score."""
+    """Restore, and score."""
     observation = observe(task)
     width = task["width"] * WAVELENGTH
     told = Band.top_hat(WAVELENGTH, width, 3) if width else Band.of([WAVELENGTH])
@@ -123,17 +123,10 @@ def measure(task: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def measure_known(task: Mapping[str, Any]) -> dict[str, Any]:
-    """Restore with the true PSFs of the whole exposure and band, and score."""
-    observation = observe(task)
-    return {"known": score(observation, restore_known(observation))}
-
-
 def predict(task: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the score that the criterion predicts for known PSFs, at each flux of a task."""
+    """Return the score that the criterion predicts for instants in narrow light and known PSFs, at each flux."""
     mask, kept, scores = SparseAperture(task["centers"], task["subaperture_diameter"], DIAMETER), None, []
     told = {"instrument": "mask", "readout_noise": READOUT_NOISE, "outer_scale": OUTER_SCALE}
-    told |= {"band": task["width"], "oversampling": OVERSAMPLING} if task["width"] else {}
     for photons in task["photons"]:
         lit = criterion({**task, **told, "n_photons": photons})
         kept = kept or lit  # whose tables of turbulence hold at any flux
@@ -142,38 +135,45 @@ def predict(task: Mapping[str, Any]) -> dict[str, Any]:
     return {"scores": scores}
 
 
+def expect(options: Options, masks: Sequence[SparseAperture], callback: Callback) -> list[dict[float, float]]:
+    """Return what a plan expects of instants in narrow light but for the tables measured here, at each flux.
+
+    For each mask it is that of exposures, whose pixels are coarser, and then that of bands.
+    """
+    common = {name: getattr(options, name) for name in ("d_over_r0", "n_frames", "n_pixels", "photons")}
+    tasks = [common | {"oversampling": finer} | of_mask(mask) for mask in masks for finer in (1.0, OVERSAMPLING)]
+    found = run_tasks(
+        predict, tasks, options.sweep / "tasks", stage="smearing_predicted", **options.keywords(callback)
+    )
+    expected = []
+    for task, row in zip(tasks, found, strict=True):
+        size = task["subaperture_diameter"] / DIAMETER * options.d_over_r0
+        with warnings.catch_warnings(action="ignore", category=UserWarning):  # beyond it, the nearest edge is taken
+            outlooks = [success_map().outlook(size, photons, options.n_frames) for photons in options.photons]
+        scores = [math.sqrt(one.mse(s**2, s**2)) for one, s in zip(outlooks, row["scores"], strict=True)]
+        expected.append(dict(zip(options.photons, scores, strict=True)))
+    return expected
+
+
 def restore(options: Options, masks: Sequence[SparseAperture], callback: Callback) -> list[dict[str, Any]]:
-    """Return a row for each draw, flux and amount, with its score where aberrations were searched for."""
+    """Return a row for each draw, flux and amount, with its score and the one expected of instants in narrow light."""
     cases = [("exposure", length, 0.0) for length in options.exposures]
     cases += [("width", 0.0, width) for width in options.widths]
     names = ("d_over_r0", "n_frames", "n_pixels", "iterations")
     common = {name: getattr(options, name) for name in names} | {"torchmask": torchmask.__version__}
-    folder, settings = options.sweep / "tasks", options.keywords(callback)
-    told = [
-        common | {"photons": options.photons, "exposure": exposure, "width": width} | of_mask(masks[0])
-        for _, exposure, width in cases
-    ]
-    predicted = run_tasks(predict, told, folder, stage="smearing_predicted", **settings)
-    rows, tasks = [], []
-    for (i, mask), photons, k in itertools.product(enumerate(masks), options.photons, range(len(cases))):
-        axis, exposure, width = cases[k]
+    expected, rows, tasks = expect(options, masks, callback), [], []
+    for (i, mask), photons, (axis, exposure, width) in itertools.product(enumerate(masks), options.photons, cases):
         draw = {"draw": FIRST + i, "n_photons": photons, "exposure": exposure, "width": width}
-        expected = predicted[k]["scores"][options.photons.index(photons)]
-        rows.append({"axis": axis, "predicted": expected} | draw)
+        rows.append(draw | {"axis": axis, "expected": expected[2 * i + (axis == "width")][photons]})
         tasks.append(common | draw | of_mask(mask))
-    known = run_tasks(measure_known, tasks, folder, stage="smearing_known", **settings)
-    rows = [row | dict(result) for row, result in zip(rows, known, strict=True)]
-    searched = [k for k, row in enumerate(rows) if row["n_photons"] in options.searched]
-    blind = run_tasks(measure, [tasks[k] for k in searched], folder, stage="smearing", **settings)
-    for k, result in zip(searched, blind, strict=True):
-        rows[k] |= dict(result)
-    return rows
+    found = run_tasks(measure, tasks, options.sweep / "tasks", stage="smearing", **options.keywords(callback))
+    return [row | dict(result) for row, result in zip(rows, found, strict=True)]
 
 
 def setting(options: Options) -> str:
     """Return what all restorations share."""
     holes = sorted(set(itertools.islice(itertools.cycle(HOLES), options.draws)))
-    number = options.draws * len(options.searched) * (len(options.exposures) + len(options.widths))
+    number = options.draws * len(options.photons) * (len(options.exposures) + len(options.widths))
     return (
         f"{number} restorations of {options.n_frames} frames of {options.n_pixels} x {options.n_pixels} pixels, "
         f"{options.draws} draws of mask, scene, turbulence and noise at each point: searched masks of "
@@ -197,7 +197,8 @@ def run(options: Options) -> None:
         output.report(
             "smearing_map", {"setting": told, "cells": cells, "rows": rows}, markdown(told, cells), figure(cells)
         )
-        write_json(output.directory / "smearing.json", table_of(cells) | {"conditions": told})
+        table = table_of(cells, options.d_over_r0) | {"conditions": told}
+        write_json(output.directory / "smearing.json", table)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

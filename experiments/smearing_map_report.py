@@ -1,4 +1,4 @@
-"""Code of `smearing_map` that turns restorations into costs, a table and the figure."""
+"""Code of `smearing_map` that turns restorations into ratios, a table and the figure."""
 
 from __future__ import annotations
 
@@ -10,111 +10,93 @@ import numpy as np
 from mask_vs_full_report import interval
 from scipy.optimize import isotonic_regression
 
-from torchmask.viz.style import COLORS, INK, new_figure, styled
+from torchmask.planning.smearing import phase_spread
+from torchmask.viz.style import COLORS, new_figure, styled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 AXES = {"exposure": "exposure T / tau$_0$", "width": "width / wavelength"}
 _MEAN = 0.683  # confidence of the intervals: one standard error
-_FIRST = 1e9  # weight of the first point, which is 1 by definition
 
 
 def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return a cell for each axis, flux and amount: by how much scores grow from the first amount, and the cost.
+    """Return a cell for each axis, flux and amount: what was expected and restored, and the ratio that a plan takes.
 
-    `predicted`, `known` and `blind` are geometric means over the draws of the growth that the criterion says, and of
-    what was measured for known and for unknown PSFs. `blindness` is blind over known, for which all fluxes count alike,
-    with its interval. `cost` is known over predicted, times blindness, neither of which may fall from one amount to the
-    next (isotonic regression): with the same photons more blur does not help.
+    Means over the draws are geometric. `growth` is that of the scores since the first amount, with its interval.
+    `ratio` is score over expected, as it is nearest without falling from one amount to the next (isotonic regression):
+    with the same photons more blur does not help.
     """
     cells = []
     for axis in AXES:
-        line = [row for row in rows if row["axis"] == axis]
-        amounts = sorted({row[axis] for row in line})
-        searched = [row for row in line if "score" in row]
-        lost = [_growths(searched, axis, x, "score") - _growths(searched, axis, x, "known") for x in amounts]
-        blindness = _rising(lost)
-        for photons in sorted({row["n_photons"] for row in line}):
-            own = [row for row in line if row["n_photons"] == photons]
-            known, predicted = ([_growths(own, axis, x, name) for x in amounts] for name in ("known", "predicted"))
-            excess = _rising([one - other for one, other in zip(known, predicted, strict=True)])
+        for photons in sorted({row["n_photons"] for row in rows}):
+            own = [row for row in rows if (row["axis"], row["n_photons"]) == (axis, photons)]
+            amounts = sorted({row[axis] for row in own})
+            scores, expected = (
+                np.log([[row[name] for row in own if row[axis] == amount] for amount in amounts])
+                for name in ("score", "expected")
+            )
+            ratios = isotonic_regression((scores - expected).mean(1)).x
             for k, amount in enumerate(amounts):
-                low, high = interval(lost[k], _MEAN)
-                found = [row for row in own if "score" in row]
-                blind = _growths(found, axis, amount, "score") if found else None
+                growth = scores[k] - scores[0]
+                low, high = interval(growth, _MEAN)
                 cells.append(
-                    {"axis": axis, "n_photons": photons, "amount": amount, "draws": len(known[k])}
-                    | {"predicted": _mean(predicted[k]), "known": _mean(known[k])}
-                    | {"blind": None if blind is None else _mean(blind)}
-                    | {"blindness": _mean(lost[k]), "low": low, "high": high}
-                    | {"cost": math.exp(excess[k] + blindness[k])}
+                    {"axis": axis, "n_photons": photons, "amount": amount, "draws": len(growth)}
+                    | {"expected": math.exp(expected[k].mean()), "restored": math.exp(scores[k].mean())}
+                    | {"growth": math.exp(growth.mean()), "low": low, "high": high, "ratio": math.exp(ratios[k])}
                 )
     return cells
 
 
-def _growths(rows: Sequence[Mapping[str, Any]], axis: str, amount: float, name: str) -> np.ndarray:
-    """Return the logarithms of what a score grows by from the first amount, draw by draw."""
-    first = {(row["n_photons"], row["draw"]): row for row in rows if row[axis] == min(row[axis] for row in rows)}
-    here = [row for row in rows if row[axis] == amount]
-    return np.log([row[name] / first[row["n_photons"], row["draw"]][name] for row in here])
-
-
-def _mean(logs: np.ndarray) -> float:
-    return math.exp(logs.mean())
-
-
-def _rising(logs: Sequence[np.ndarray]) -> np.ndarray:
-    """Return means, the first of which is 0, as they are nearest without falling."""
-    weights = [_FIRST, *[1.0] * (len(logs) - 1)]
-    return np.maximum(isotonic_regression([one.mean() for one in logs], weights=weights).x, 0.0)
-
-
-def table_of(cells: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def table_of(cells: Sequence[Mapping[str, Any]], d_over_r0: float) -> dict[str, Any]:
     """Return what `torchmask.planning.smearing` reads, without the conditions."""
     photons = sorted({cell["n_photons"] for cell in cells})
-    table: dict[str, Any] = {"n_photons": photons}
-    for axis in AXES:
-        own = [cell for cell in cells if cell["axis"] == axis]
-        table[f"{axis}s"] = sorted({cell["amount"] for cell in own})
-        table[f"{axis}_cost"] = [[cell["cost"] for cell in own if cell["n_photons"] == light] for light in photons]
-    return table
+    amounts = {axis: sorted({cell["amount"] for cell in cells if cell["axis"] == axis}) for axis in AXES}
+    ratios = {
+        axis: [
+            [cell["ratio"] for cell in cells if (cell["axis"], cell["n_photons"]) == (axis, light)] for light in photons
+        ]
+        for axis in AXES
+    }
+    return {
+        "n_photons": photons,
+        "exposures": amounts["exposure"],
+        "spreads": [phase_spread(width, d_over_r0) for width in amounts["width"]],
+        "exposure_ratio": ratios["exposure"],
+        "band_ratio": ratios["width"],
+    }
 
 
 def markdown(setting: str, cells: Sequence[Mapping[str, Any]]) -> str:
     """Return the report as Markdown."""
-    lines = ["# What long exposures and wide bands cost", "", setting, ""]
-    lines += ["| axis | photons | amount | predicted | known PSFs | blind | blind over known, all photons | cost |"]
-    lines += ["|---" * 8 + "|"]
+    lines = ["# What restorations attain in long exposures and wide bands", "", setting, ""]
+    lines += ["| axis | photons | amount | expected of instants | restored | growth | ratio |", "|---" * 7 + "|"]
     for cell in cells:
         texts = [cell["axis"], f"{cell['n_photons']:.0e}".replace("e+0", "e"), f"{cell['amount']:g}"]
-        texts += ["-" if cell[name] is None else f"{cell[name]:.2f}" for name in ("predicted", "known", "blind")]
-        texts += [f"{cell['blindness']:.2f} ({cell['low']:.2f} to {cell['high']:.2f})", f"{cell['cost']:.2f}"]
+        texts += [f"{cell['expected']:.3f}", f"{cell['restored']:.3f}"]
+        texts += [f"{cell['growth']:.2f} ({cell['low']:.2f} to {cell['high']:.2f})", f"{cell['ratio']:.2f}"]
         lines.append(f"| {' | '.join(texts)} |")
     return "\n".join(lines) + "\n"
 
 
 @styled
 def figure(cells: Sequence[Mapping[str, Any]]) -> Figure:
-    """Draw what scores grow by with the amount of blur, predicted and measured, at one flux a row."""
-    fluxes = sorted({cell["n_photons"] for cell in cells})
-    sheet = new_figure(6.0, 0.9 + 1.6 * len(fluxes))
-    axes = sheet.subplots(len(fluxes), 2, sharex="col", sharey=True, squeeze=False)
-    for row, photons in zip(axes, fluxes, strict=True):
-        for ax, (axis, label) in zip(row, AXES.items(), strict=True):
+    """Draw what is expected of instants in narrow light, what was restored, and what a plan makes of the first."""
+    sheet = new_figure(6.4, 4.0)
+    axes = sheet.subplots(1, 2, sharey=True)
+    for ax, (axis, label) in zip(axes, AXES.items(), strict=True):
+        for color, photons in zip(COLORS, sorted({cell["n_photons"] for cell in cells}), strict=False):
             own = [cell for cell in cells if (cell["axis"], cell["n_photons"]) == (axis, photons)]
-            amounts = [cell["amount"] for cell in own]
-            ax.plot(amounts, [cell["predicted"] for cell in own], "--", color=INK, lw=1.1, label="predicted")
-            ax.plot(amounts, [cell["known"] for cell in own], "o-", color=COLORS[0], ms=4, label="known PSFs")
-            if own[0]["blind"] is not None:
-                ax.plot(amounts, [cell["blind"] for cell in own], "s", color=COLORS[1], ms=4, label="blind")
-            planned = [cell["cost"] * cell["predicted"] for cell in own]
-            ax.plot(amounts, planned, "-", color=COLORS[1], lw=1.2, label="predicted times cost")
-            ax.set(yscale="log", title=f"{photons:.0e} photons".replace("e+0", "e"))
-            ax.set_yticks([0.25, 0.5, 1, 2, 4], ["0.25", "0.5", "1", "2", "4"])
-            ax.minorticks_off()
-            if photons == fluxes[-1]:
-                ax.set_xlabel(label)
-    sheet.supylabel("score over that of instants, of narrow light", fontsize=9)
-    sheet.legend(*axes[0][0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
+            amounts, restored, expected = ([cell[name] for cell in own] for name in ("amount", "restored", "expected"))
+            bars = [[cell["restored"] * (1 - cell["low"] / cell["growth"]) for cell in own]]
+            bars += [[cell["restored"] * (cell["high"] / cell["growth"] - 1) for cell in own]]
+            name = f"{photons:.0e} photons".replace("e+0", "e")
+            ax.errorbar(amounts, restored, np.nan_to_num(bars, posinf=0), fmt="o", color=color, ms=4, label=name)
+            ax.plot(amounts, expected, ":", color=color, lw=1.1)
+            ax.plot(amounts, [cell["ratio"] * cell["expected"] for cell in own], "-", color=color, lw=1.2)
+        ax.set(yscale="log", xlabel=label)
+        ax.set_yticks([0.1, 0.2, 0.5, 1], ["0.1", "0.2", "0.5", "1"])
+        ax.minorticks_off()
+    axes[0].set_ylabel("score (0 is perfect)")
+    sheet.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
     return sheet

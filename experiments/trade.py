@@ -21,7 +21,7 @@ from torchmask.design.sweep import run_tasks
 from torchmask.design.turbulent import TurbulentMSE
 from torchmask.grid import Grid
 from torchmask.optics.band import Band
-from torchmask.planning.smearing import smearing_map
+from torchmask.planning.smearing import phase_spread, smearing_map
 from torchmask.planning.success import success_map
 from torchmask.record import Callback
 from torchmask.spectra import NoisePSD, PowerLawPSD
@@ -98,8 +98,13 @@ def between(cells: Sequence[Mapping[str, Any]], key: str, value: str) -> float:
 
 
 def predict(task: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the score of `observing.measure` that TurbulentMSE predicts for known PSFs and a power-law object."""
-    return {"predicted": math.sqrt(float(criterion(task).relative(instrument(task))))}
+    """Return the score of `observing.measure` that TurbulentMSE predicts for known PSFs and a power-law object.
+
+    `instants` is that of instants in narrow light with the same photons.
+    """
+    still = {name: value for name, value in task.items() if name not in ("exposure", "band")}
+    aperture, tasks = instrument(task), {"predicted": task, "instants": still}
+    return {name: math.sqrt(float(criterion(one).relative(aperture))) for name, one in tasks.items()}
 
 
 def criterion(task: Mapping[str, Any]) -> TurbulentMSE:
@@ -128,24 +133,24 @@ def predictions(
     tasks: list[dict[str, Any]] = [common | dict(setting) | {"instrument": which} for which, setting in cases]
     found = run_tasks(predict, tasks, options.sweep / "tasks", stage="predicted", **options.keywords(callback))
     return {
-        (task["instrument"], task[key]): {**row, "predicted_blind": blind(task, row["predicted"])}
+        (task["instrument"], task[key]): {**row, "predicted_blind": blind(task, row["instants"])}
         for task, row in zip(tasks, found, strict=True)
     }
 
 
-def blind(task: Mapping[str, Any], known: float) -> float | None:
-    """Return what a predicted score becomes where aberrations have to be found; None for a full pupil, as in a plan.
+def blind(task: Mapping[str, Any], instants: float) -> float | None:
+    """Return what a plan makes of the score predicted for instants in narrow light; None for a full pupil.
 
     Beyond what was tried, the nearest edge is taken.
     """
     if task["instrument"] != "mask":
         return None
     size, photons = task["subaperture_diameter"] / DIAMETER * task["d_over_r0"], task["n_photons"]
-    exposure, width = task.get("exposure", 0.0), task.get("band", 0.0)
+    exposure, spread = task.get("exposure", 0.0), phase_spread(task.get("band", 0.0), task["d_over_r0"])
     with warnings.catch_warnings(action="ignore", category=UserWarning):
-        instants = success_map().outlook(size, photons, task["n_frames"])
-        outlook = smearing_map().outlook(instants, n_photons=photons, exposure=exposure, width=width)
-    return math.sqrt(outlook.mse(known**2, known**2))
+        found = success_map().outlook(size, photons, task["n_frames"])
+        outlook = smearing_map().outlook(found, n_photons=photons, exposure=exposure, spread=spread)
+    return math.sqrt(outlook.mse(instants**2, instants**2))
 
 
 @styled

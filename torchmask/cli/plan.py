@@ -17,7 +17,7 @@ from torchmask.instrument.instrument import Instrument
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.pupil import Aperture
 from torchmask.planning.plan import plan_observation
-from torchmask.planning.result import AXES, Choice, ObservationPlan
+from torchmask.planning.result import AXES, ObservationPlan
 from torchmask.viz.figures import mask_figure
 from torchmask.viz.planning import plan_figure
 
@@ -110,17 +110,13 @@ def _design_command(mask: Aperture, folder: Path) -> str:
     return f"torchmask design --instrument {file} {size}"
 
 
-def _with_blind_mse(choice: Choice) -> dict[str, Any]:
-    return dataclasses.asdict(choice) | {"blind_mse": choice.blind_mse}
-
-
 def numbers(plan: ObservationPlan) -> dict[str, object]:
     """Return the contents of plan.json: the best point, the whole map, and what is missing from it."""
     return {
-        "best": _with_blind_mse(plan.best),
-        "best_known": _with_blind_mse(plan.best_known),
+        "best": dataclasses.asdict(plan.best),
+        "best_known": dataclasses.asdict(plan.best_known),
         "best_exposure": plan.best_exposure,
         "at_edge": {name: plan.at_edge(name) for name in AXES},
-        "map": [_with_blind_mse(choice) for choice in plan.choices],
+        "map": [dataclasses.asdict(choice) for choice in plan.choices],
         "left_out": plan.left_out,
     }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from torchmask.design.conditions import ExposureConditions
 from torchmask.design.turbulent import TurbulentMSE
 from torchmask.instrument.instrument import Instrument
@@ -53,10 +55,29 @@ def instrument_criterion(
     )
 
 
-def change_light(criterion: TurbulentMSE, instrument: Instrument, area: float) -> None:
-    """Change a criterion in place to another open area [m^2] of the same instrument.
+def instant_criterion(instrument: Instrument, area: float, n_pixels: int = 256) -> TurbulentMSE:
+    """Return `instrument_criterion` with all the light of a frame in one instant and at one wavelength.
 
-    The effect of turbulence, which takes seconds to compute, does not depend on the light and is kept.
+    >>> from torchmask.instrument.parts import Site, Source, Telescope
+    >>> parts = {"telescope": Telescope(1.0), "source": Source(photon_rate=1e9), "site": Site(r0=0.15, wind=10.0)}
+    >>> instrument = Instrument(**parts, wavelength=550e-9, width=10e-9, exposure=2e-3, n_frames=20)
+    >>> criterion = instant_criterion(instrument, area=0.05, n_pixels=64)
+    >>> criterion.seeing.exposure, criterion.band, float(criterion.noise_psd[0, 0])
+    (0.0, None, 100000.0)
     """
+    conditions = ExposureConditions.of_instrument(instrument, area)
+    still = replace(conditions, exposure=0.0, wind=0.0, wavelengths=None, weights=None)
+    return TurbulentMSE(
+        *(instrument.grid(n_pixels), instrument.object_psd(area), instrument.noise_psd(area), instrument.frames),
+        **still.keywords(instrument.site.r0, instrument.site.outer_scale),
+    )
+
+
+def change_light(criterion: TurbulentMSE, instrument: Instrument, area: float) -> None:
+    """Change a criterion in place to the light and the number of frames of an instrument and open area [m^2].
+
+    The effect of turbulence, which takes seconds to compute, does not depend on them and is kept.
+    """
+    criterion.n_frames = instrument.frames
     other = instrument_criterion(instrument, area, criterion.grid.shape[0])
     criterion.load_state_dict(other.state_dict())

@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 from torchmask.design.constraint_base import Constraint, Infeasible
-from torchmask.design.observed import change_light, instrument_criterion
+from torchmask.design.observed import change_light, instant_criterion, instrument_criterion
 from torchmask.design.rules import MaskRules
 from torchmask.design.search import search_mask
 from torchmask.grid import ARCSEC
@@ -17,7 +17,7 @@ from torchmask.instrument.instrument import Instrument
 from torchmask.optics.packing import largest_fill_factor
 from torchmask.optics.pupil import Aperture
 from torchmask.planning.result import AXES, Choice, ObservationPlan
-from torchmask.planning.smearing import smearing_map
+from torchmask.planning.smearing import phase_spread, smearing_map
 from torchmask.planning.success import BlindOutlook, success_map
 from torchmask.record import Callback, Record
 
@@ -42,9 +42,9 @@ def plan_observation(
     """Return the predicted error over the number of holes, their size and the exposure, and where it is least.
 
     The error is `TurbulentMSE` with the photons, the sky, the frames and the read-out noise that follow from the
-    instrument at each point. It supposes that every transfer function is known; what restorations that had to find the
-    aberrations were measured to lose, `success_map`, and by long exposures and wide bands, `smearing_map`, raises what
-    of it a mask can avoid. Each mask is searched for its number and size of holes by `AsymptoticMSE` (hybrid, `budget`
+    instrument at each point, for a linear estimate that knows every transfer function. What to expect of a restoration
+    that has to find the aberrations is that error for instants in narrow light, times what such restorations were
+    measured to lose, `success_map`, and what the light, the exposure and the band do to them, `smearing_map`. Each mask is searched for its number and size of holes by `AsymptoticMSE` (hybrid, `budget`
     evaluations) at the light of the instrument's own exposure, and kept for all exposures.
 
     Parameters
@@ -206,7 +206,8 @@ def _measure(
 ) -> list[Choice]:
     """Return the predicted error at every point; masks with holes of one size share what is known of the turbulence."""
     choices, n_steps = [], len(exposed) * len(masks)
-    for instrument in exposed:
+    instants = _predict_instants(exposed, masks, n_frequencies)
+    for place, instrument in enumerate(exposed):
         criterion = None
         for (n, hole), mask in sorted(masks.items(), key=lambda item: item[0][1]):
             area = float(mask.area)
@@ -216,17 +217,39 @@ def _measure(
             floor = criterion.relative_floor(instrument.telescope.diameter)
             photons, sky = instrument.photons(area), instrument.sky(area)
             light = instrument.exposure, instrument.width, instrument.frames, photons, sky
-            blind = None if mask.is_full else _blind_outlook(instrument, hole, photons)
-            choices.append(Choice(n, hole, *light, error, error - floor, blind))
+            blind, expected = None, error
+            if not mask.is_full:
+                blind, still = _blind_outlook(instrument, hole, photons), instants[n, hole, place]
+                expected = blind.mse(still, still - floor)
+            choices.append(Choice(n, hole, *light, error, error - floor, expected, blind))
             _tell(callback, "plan/map", len(choices), n_steps, error)
     return sorted(choices, key=lambda choice: tuple(getattr(choice, name) for name in AXES))
 
 
+def _predict_instants(
+    exposed: Sequence[Instrument], masks: dict[tuple[int, float], Aperture], n_frequencies: int
+) -> dict[tuple[int, float, int], float]:
+    """Return the error predicted for instants in narrow light with the photons of each exposure, for each mask.
+
+    What is known of the turbulence then depends on the holes alone.
+    """
+    errors, criterion = {}, None
+    for (n, hole), mask in sorted(masks.items(), key=lambda item: item[0][1]):
+        for place, instrument in enumerate(() if mask.is_full else exposed):
+            area = float(mask.area)
+            criterion = criterion or instant_criterion(instrument, area, n_frequencies)
+            change_light(criterion, instrument, area)
+            errors[n, hole, place] = float(criterion.relative(mask))
+    return errors
+
+
 def _blind_outlook(instrument: Instrument, hole: float, photons: float) -> BlindOutlook:
     """Return what was measured of restorations that have to find the aberrations behind holes of this diameter [m]."""
-    instants = success_map().outlook(hole / instrument.site.r0, photons, instrument.frames)
-    exposure, width = instrument.exposure / instrument.seeing.tau0, instrument.band.relative_width
-    return smearing_map().outlook(instants, n_photons=photons, exposure=exposure, width=width)
+    r0, diameter = instrument.site.r0, instrument.telescope.diameter
+    instants = success_map().outlook(hole / r0, photons, instrument.frames)
+    spread = phase_spread(instrument.band.relative_width, diameter / r0)
+    exposure = instrument.exposure / instrument.seeing.tau0
+    return smearing_map().outlook(instants, n_photons=photons, exposure=exposure, spread=spread)
 
 
 def _tell(callback: Callback | None, stage: str, step: int, n_steps: int, relative_mse: float) -> None:

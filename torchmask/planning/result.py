@@ -20,8 +20,10 @@ class Choice:
 
     hole diameter in metres, exposure in seconds, width of the band in metres (None for a filter), photons and sky in
     electrons per frame (of the sky, per pixel)
-    relative_mse, above_floor : predicted for known PSFs, and that less what no mask of this diameter can avoid
-    blind : what to expect where the aberrations have to be found; None for a full pupil, of which no map is known
+    relative_mse, above_floor : predicted for a linear estimate that knows the PSFs, and that less what no mask of this
+        diameter can avoid
+    blind_mse : expected where the aberrations have to be found; `relative_mse` for a full pupil
+    blind : what was measured of such restorations; None for a full pupil, of which no map is known
     """
 
     n_subapertures: int
@@ -33,12 +35,8 @@ class Choice:
     sky: float
     relative_mse: float
     above_floor: float
+    blind_mse: float
     blind: BlindOutlook | None = None
-
-    @property
-    def blind_mse(self) -> float:
-        """The predicted error with what a blind restoration loses, or without where that is not known."""
-        return self.relative_mse if self.blind is None else self.blind.mse(self.relative_mse, self.above_floor)
 
 
 @dataclass(frozen=True)
@@ -141,7 +139,7 @@ class ObservationPlan:
             f"({best.hole_diameter / told.site.r0:.2g} r0, {best.exposure / told.seeing.tau0:.2g} tau0){band} and "
             f"{best.photons:.4g} photons in each.",
             _blind_line(best.blind),
-            f"With known PSFs: {best.relative_mse:.4g}; the least would be {self.best_known.relative_mse:.4g}, with "
+            f"A linear estimate that knows the PSFs: {best.relative_mse:.4g}; the least would be {self.best_known.relative_mse:.4g}, with "
             f"{_point(self.best_known)}.",
             f"Best exposure between those of the map: {1e3 * self.best_exposure:.4g} ms{width}.",
             *(
@@ -170,7 +168,8 @@ def _blind_line(blind: BlindOutlook | None) -> str:
     return (
         f"There blind restorations of instants in narrow light score {blind.cost:.3g} times as high as with known PSFs "
         f"(median), and {100 * blind.success:.0f} % of them ({100 * blind.low:.0f} to {100 * blind.high:.0f} %) stay "
-        f"within {SUCCESS:g} times; exposure and band raise their score by another factor of {blind.smearing:.3g}."
+        f"within {SUCCESS:g} times. With this light, exposure and band restored scores are another {blind.restored:.3g} "
+        "times those that are predicted for a linear estimate of such instants."
     )
 
 

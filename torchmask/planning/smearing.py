@@ -1,4 +1,4 @@
-"""What long exposures and wide bands cost a blind restoration beyond what is predicted: measured tables, interpolated.
+"""What restorations attain in long exposures and wide bands, over what is predicted: measured tables, interpolated.
 
 The tables are `smearing.json` beside this file, written by `experiments/smearing_map.py`; it holds its own conditions.
 Smearing by time and by bandwidth is what interferometry calls the loss of fringe contrast by either.
@@ -19,35 +19,48 @@ from torchmask.planning.lattice import Axis, interpolate, locate
 from torchmask.planning.success import BlindOutlook
 
 
+def phase_spread(width: float, d_over_r0: float) -> float:
+    """Return how far the phase difference of turbulence over the baseline D spreads across a band [rad rms].
+
+    That is width / wavelength times the root of Kolmogorov's structure function, 6.88 (D / r0)^(5/3).
+
+    >>> round(phase_spread(width=0.1, d_over_r0=4.0), 2)
+    0.83
+    """
+    return width * math.sqrt(6.88) * d_over_r0 ** (5 / 6)
+
+
 @dataclass(frozen=True, eq=False)
 class SmearingMap:
     """Restorations over photons per frame and exposure, and over photons per frame and width of the band.
 
-    n_photons, exposures, widths : the values measured, in rising order, at least two each; exposures over tau0, widths
-        over the wavelength
-    exposure_cost, width_cost : factor by which the score grows beyond that predicted for known PSFs, against the first
-        exposure or width at the same photons, indexed [photons, exposures] and [photons, widths]
+    n_photons, exposures, spreads : the values measured, in rising order, at least two each; exposures over tau0,
+        `phase_spread` of the bands [rad]
+    exposure_ratio, band_ratio : blind score over what `BlindOutlook.cost` makes of the score that `TurbulentMSE` predicts
+        for instants in narrow light, indexed [photons, exposures] and [photons, spreads]; exposures are those in narrow
+        light, bands those of instants
     conditions : what all restorations share, in a sentence
 
-    Raises ValueError if a shape or an order is wrong, or a cost is not positive.
+    Raises ValueError if a shape or an order is wrong, or a ratio is not positive.
 
     Examples
     --------
     >>> instants = BlindOutlook(cost=1.2, success=0.75, low=0.5, high=0.9)
-    >>> smearing_map().outlook(instants, n_photons=1e6, exposure=4.0, width=0.0).smearing > 1
+    >>> short, long = (smearing_map().outlook(instants, n_photons=1e6, exposure=t, spread=0.2) for t in (0.5, 8.0))
+    >>> short.restored < long.restored
     True
     """
 
     n_photons: Sequence[float]
     exposures: Sequence[float]
-    widths: Sequence[float]
-    exposure_cost: np.ndarray
-    width_cost: np.ndarray
+    spreads: Sequence[float]
+    exposure_ratio: np.ndarray
+    band_ratio: np.ndarray
     conditions: str = ""
 
     def __post_init__(self) -> None:
-        photons, exposures, widths = self._axes
-        for name, axis in (("exposure_cost", exposures), ("width_cost", widths)):
+        photons, exposures, spreads = self._axes
+        for name, axis in (("exposure_ratio", exposures), ("band_ratio", spreads)):
             table, shape = np.asarray(getattr(self, name), float), (len(photons.values), len(axis.values))
             if table.shape != shape or not (table > 0).all():
                 raise ValueError(f"{name} is {table.tolist()}: positive numbers of shape {shape} are needed")
@@ -58,14 +71,15 @@ class SmearingMap:
         return (
             Axis("n_photons", "photons per frame", self.n_photons, logarithmic=True),
             Axis("exposure", "exposures over tau0", self.exposures, may_be_zero=True),
-            Axis("width", "widths of the band over the wavelength", self.widths, may_be_zero=True),
+            Axis("spread", "spreads of the phase across the band in rad", self.spreads, may_be_zero=True),
         )
 
-    def outlook(self, instants: BlindOutlook, *, n_photons: float, exposure: float, width: float) -> BlindOutlook:
+    def outlook(self, instants: BlindOutlook, *, n_photons: float, exposure: float, spread: float) -> BlindOutlook:
         """Return what to expect of long exposures in a wide band, from what to expect of instants in narrow light.
 
-        The two factors are multiplied. Each is geometric between the points of its table, in the logarithm of the
-        photons and in the exposure or the width, and that of the first point below it.
+        The ratio of the exposure is multiplied by that of the band, over the mean of their first points, which both are
+        instants in narrow light. All means are geometric. Tables are interpolated in their logarithm, over the
+        logarithm of the photons and over exposure or spread; below its first point each is what it is there.
 
         Parameters
         ----------
@@ -75,8 +89,8 @@ class SmearingMap:
             Electrons per frame through the mask.
         exposure : float
             Exposure time of a frame, T / tau0.
-        width : float
-            Width of the band over the wavelength, `Band.relative_width`.
+        spread : float
+            `phase_spread` of the band, `Band.relative_width`, and the telescope's D / r0 [rad].
 
         Raises
         ------
@@ -90,13 +104,14 @@ class SmearingMap:
         """
         if exposure >= 0:
             exposure = max(exposure, self.exposures[0])
-        if width >= 0:
-            width = max(width, self.widths[0])
-        (light, long, wide), outside = locate(self._axes, (n_photons, exposure, width))
-        logarithm = interpolate(np.log(self.exposure_cost), (light, long))
-        logarithm += interpolate(np.log(self.width_cost), (light, wide))
+        if spread >= 0:
+            spread = max(spread, self.spreads[0])
+        (light, long, wide), outside = locate(self._axes, (n_photons, exposure, spread))
+        logarithm = 0.0
+        for ratio, place in ((self.exposure_ratio, long), (self.band_ratio, wide)):
+            logarithm += interpolate(np.log(ratio), (light, place)) - interpolate(np.log(ratio), (light, 0)) / 2
         return replace(
-            instants, smearing=math.exp(logarithm), outside=tuple(dict.fromkeys((*instants.outside, *outside)))
+            instants, restored=math.exp(logarithm), outside=tuple(dict.fromkeys((*instants.outside, *outside)))
         )
 
 

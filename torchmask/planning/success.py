@@ -27,7 +27,8 @@ class BlindOutlook:
     success : chance that this ratio is within 1.3
     low, high : Wilson's interval of that chance at one standard error, from the number of restorations
     outside : names of what lies outside what was tried, for which its nearest edge was taken
-    smearing : factor by which a long exposure and a wide band raise the score further, beyond what is predicted
+    restored : its score over what is predicted for instants in narrow light, times cost: by how much restorations differ
+        from the linear estimate that is predicted, and what exposure and band do to them
 
     Examples
     --------
@@ -40,15 +41,15 @@ class BlindOutlook:
     low: float
     high: float
     outside: tuple[str, ...] = ()
-    smearing: float = 1.0
+    restored: float = 1.0
 
     def mse(self, relative_mse: float, above_floor: float) -> float:
-        """Return what a relative error predicted for known PSFs becomes, of which a mask can avoid `above_floor`.
+        """Return what a relative error predicted for known PSFs of instants in narrow light becomes.
 
-        That part grows by the square of cost times smearing, where it is above 1: a score is an amplitude. No more than
-        1 is returned, the error of knowing nothing.
+        What of it a mask can avoid, `above_floor`, is multiplied by the square of cost, where that is above 1, times
+        restored: a score is an amplitude. No more than 1 is returned, the error of knowing nothing.
         """
-        return min(1.0, relative_mse + (max(1.0, self.cost * self.smearing) ** 2 - 1) * above_floor)
+        return min(1.0, relative_mse + ((max(1.0, self.cost) * self.restored) ** 2 - 1) * above_floor)
 
 
 @dataclass(frozen=True, eq=False)
