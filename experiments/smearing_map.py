@@ -6,8 +6,8 @@
 
 Each draw is another mask, scene, turbulence and noise, and is restored from instants in narrow light, from ever longer
 exposures and from ever wider bands, with the same photons in each frame. The library's defaults with one start are told
-the read-out noise and the band, not how long a frame lasts. What is predicted is `TurbulentMSE` for instants in narrow light
-and known PSFs, times what `success_map` says that unknown ones cost: measure that map first.
+the read-out noise and the band, not how long a frame lasts. What is predicted is `TurbulentMSE` for instants in narrow
+light and known PSFs, times what `success_map` says that unknown ones cost: measure that map first.
 
 The table, the figure and the numbers go to a new folder, and with them smearing.json, which `torchmask plan`
 interpolates (torchmask/planning/smearing.json). Every restoration is kept in --sweep, from which a run that was stopped
@@ -142,9 +142,7 @@ def expect(options: Options, masks: Sequence[SparseAperture], callback: Callback
     """
     common = {name: getattr(options, name) for name in ("d_over_r0", "n_frames", "n_pixels", "photons")}
     tasks = [common | {"oversampling": finer} | of_mask(mask) for mask in masks for finer in (1.0, OVERSAMPLING)]
-    found = run_tasks(
-        predict, tasks, options.sweep / "tasks", stage="smearing_predicted", **options.keywords(callback)
-    )
+    found = run_tasks(predict, tasks, options.sweep / "tasks", stage="smearing_predicted", **options.keywords(callback))
     expected = []
     for task, row in zip(tasks, found, strict=True):
         size = task["subaperture_diameter"] / DIAMETER * options.d_over_r0

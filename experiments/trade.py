@@ -131,7 +131,7 @@ def predictions(
     """Return the predicted scores for each instrument and amount: for known PSFs, and blind as a plan says it."""
     common, cases = shared(options, callback), list(itertools.product(options.instruments, settings))
     tasks: list[dict[str, Any]] = [common | dict(setting) | {"instrument": which} for which, setting in cases]
-    found = run_tasks(predict, tasks, options.sweep / "tasks", stage="predicted", **options.keywords(callback))
+    found = run_tasks(predict, tasks, options.sweep / "tasks", stage="predicted_scores", **options.keywords(callback))
     return {
         (task["instrument"], task[key]): {**row, "predicted_blind": blind(task, row["instants"])}
         for task, row in zip(tasks, found, strict=True)

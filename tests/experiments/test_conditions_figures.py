@@ -16,7 +16,7 @@ from torchmask.design.criterion import AsymptoticMSE
 from torchmask.grid import Grid
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.band import Band
-from torchmask.planning.smearing import smearing_map
+from torchmask.planning.smearing import phase_spread, smearing_map
 from torchmask.planning.success import success_map
 from torchmask.spectra import NoisePSD, PowerLawPSD
 
@@ -82,29 +82,31 @@ def test_a_predicted_score_is_that_of_the_criterion_for_the_same_light(monkeypat
     criterion = AsymptoticMSE(Grid.nyquist(1.0, 550e-9, 32), *psds, 4)
     floor = criterion.relative_floor(1.0)
     seen = (float(criterion.relative(SparseAperture(centers, 0.2, 1.0))) - floor) / (1 - floor)
-    assert trade.predict(task)["predicted"] == pytest.approx(math.sqrt(seen), rel=1e-6)
-    ((r0, outer_scale, exposure, wind, wavelengths, shares),) = told
+    predicted = trade.predict(task)
+    assert predicted["predicted"] == pytest.approx(math.sqrt(seen), rel=1e-6)
+    assert predicted["instants"] == predicted["predicted"]  # by pistons alone
+    (r0, outer_scale, exposure, wind, wavelengths, shares), instants = told
+    assert instants == (r0, outer_scale, 0.0, 0.0, (550e-9,), (1.0,))
     assert (r0, outer_scale, wind) == (1 / 3, 20.0, observing.WIND)
     assert exposure == pytest.approx(0.5 * 0.314 * r0 / wind, rel=1e-3)  # tau0 = 0.314 r0 / wind
     assert (wavelengths, shares) == (Band.top_hat(550e-9, 55e-9, 5).wavelengths, Band.top_hat(550e-9, 55e-9, 5).shares)
 
 
-def test_a_blind_prediction_grows_by_what_was_measured():
+def test_a_blind_prediction_is_what_a_plan_makes_of_instants():
     """The square of a score is an error; beyond what was tried (2e4 photons) its edge counts, without a warning."""
     task = {"instrument": "mask", "subaperture_diameter": 0.2, "d_over_r0": 4.0, "n_photons": 2e4, "n_frames": 8}
     task |= {"exposure": 2.0, "band": 0.1}
-    instants = success_map().outlook(0.8, 1e5, 8)
-    factor = instants.cost * smearing_map().outlook(instants, n_photons=1e5, exposure=2.0, width=0.1).smearing
-    assert factor > 1
-    assert trade.blind(task, 0.3) == pytest.approx(0.3 * factor, rel=1e-12)
-    assert trade.blind(task, 0.99) == 1.0
+    found = success_map().outlook(0.8, 1e5, 8)
+    outlook = smearing_map().outlook(found, n_photons=1e5, exposure=2.0, spread=phase_spread(0.1, 4.0))
+    assert trade.blind(task, 0.3) == pytest.approx(0.3 * found.cost * outlook.restored, rel=1e-12)
     assert trade.blind(task | {"instrument": "full"}, 0.3) is None
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_a_tiny_run_writes_numbers_table_picture_and_log(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(trade, "predict", lambda task: {"predicted": 0.5})  # takes seconds, and has a test of its own
+    # takes seconds, and has a test of its own
+    monkeypatch.setattr(trade, "predict", lambda task: {"predicted": 0.5, "instants": 0.5})
     assert SCRIPTS[name].main(["--smoke", "--workers", "1", "--out", "run"]) == 0
     result = json.loads((tmp_path / f"run/{name}.json").read_text())
     assert all(0 < row["score"] < 10 for row in result["rows"])

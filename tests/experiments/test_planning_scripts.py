@@ -11,10 +11,11 @@ import success_map
 import torch
 
 from torchmask.optics.aperture import SparseAperture
-from torchmask.planning.smearing import SmearingMap
+from torchmask.planning.smearing import SmearingMap, phase_spread
 from torchmask.planning.success import SuccessMap
 
 THREE = SparseAperture([[0.0, 0.35], [0.3, -0.2], [-0.3, -0.2]], 0.25, 1.0)
+ATLAS = SuccessMap((1, 9), (1e4, 1e7), (0.1, 2.0), *(number * np.ones((2, 2, 2)) for number in (2, 1, 1.5)))
 
 
 def test_a_tiny_map_is_what_the_plan_can_read(tmp_path, monkeypatch):
@@ -34,48 +35,51 @@ def test_a_tiny_map_is_what_the_plan_can_read(tmp_path, monkeypatch):
 
 
 def test_the_map_of_smearing_is_what_the_plan_can_read(tmp_path, monkeypatch):
-    """With scores in closed form: cost is blind over predicted, where both rise."""
+    """With scores in closed form: the ratio is restored over predicted and over what unknown aberrations cost."""
 
-    def grown(task, power):
-        return (1 + task["exposure"] + 10 * task["width"]) ** power
+    def restored(task):
+        return {"score": 0.2 * (1 + task["exposure"] + 10 * task["width"]) ** 0.5 * (task["n_photons"] / 1e5) ** -0.4}
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(smearing_map, "choose_masks", lambda n_draws, options, callback: [THREE])
-    monkeypatch.setattr(smearing_map, "predict", lambda task: {"scores": [0.1 * grown(task, -0.1)] * 2})
-    monkeypatch.setattr(smearing_map, "measure_known", lambda task: {"known": 0.1 * grown(task, 0.2)})
-    monkeypatch.setattr(smearing_map, "measure", lambda task: {"score": 0.2 * grown(task, 0.5)})
+    monkeypatch.setattr(smearing_map, "success_map", lambda: ATLAS)
+    monkeypatch.setattr(smearing_map, "predict", lambda task: {"scores": [0.1 * task["oversampling"]] * 2})
+    monkeypatch.setattr(smearing_map, "measure", restored)
     assert smearing_map.main(["--smoke", "--workers", "1", "--out", "run"]) == 0
     measured = SmearingMap(**json.loads((tmp_path / "run/smearing.json").read_text()))
-    assert (measured.exposures, measured.widths, measured.n_photons) == ([0.0, 2.0], [0.02, 0.2], [1e5, 1e6])
-    np.testing.assert_allclose(measured.exposure_cost, [[1, 3**0.6]] * 2, rtol=1e-9)
-    np.testing.assert_allclose(measured.width_cost, [[1, (3 / 1.2) ** 0.6]] * 2, rtol=1e-9)
+    assert (measured.exposures, measured.n_photons) == ([0.0, 2.0], [1e5, 1e6])
+    assert measured.spreads == [phase_spread(width, 4.0) for width in (0.02, 0.2)]
+    levels = np.array([[2 / 1.5], [2 * 0.1**0.4 / 1.5]])
+    np.testing.assert_allclose(measured.exposure_ratio, levels * [1, 3**0.5], rtol=1e-9)
+    np.testing.assert_allclose(measured.band_ratio, levels / 1.25 * np.sqrt([1.2, 3]), rtol=1e-9)
     assert (tmp_path / "run/smearing_map.png").read_bytes().startswith(b"\x89PNG")
     lines = (tmp_path / "run/smearing_map.md").read_text().splitlines()
     assert sum(line.startswith("| ") for line in lines) == 1 + 8
 
 
-def test_a_point_of_smearing_is_restored_blind_and_by_its_true_psfs():
+def test_a_point_of_smearing_is_restored_in_its_band():
     task = {"draw": 1, "n_photons": 1e6, "exposure": 0.0, "width": 0.1, "d_over_r0": 2.0, "n_frames": 2}
     task |= {"n_pixels": 24, "iterations": 4} | success_map.of_mask(THREE)
-    blind, known = smearing_map.measure(task)["score"], smearing_map.measure_known(task)["known"]
-    assert 0 < known < blind < 1
+    assert 0 < smearing_map.measure(task)["score"] < 1
 
 
-def test_costs_of_smearing_do_not_fall_and_blindness_counts_for_all_photons():
-    """Two fluxes of two draws; the second amount's known score shrinks, so its excess is that of the first and none."""
-    known, blind = {0.0: 0.1, 1.0: 0.08, 2.0: 0.2}, {0.0: 0.1, 1.0: 0.1, 2.0: 0.3}
+def test_ratios_of_smearing_are_means_of_draws_that_do_not_fall():
+    """Two draws at each flux; the second amount scores lower than the first, so both count as their mean."""
+    scores = {0.0: 0.1, 1.0: 0.08, 2.0: 0.2}
     rows = [
-        {"axis": axis, "draw": draw, "n_photons": photons, "exposure": x, "width": x, "predicted": 0.5}
-        | {"known": scale * known[x]}
-        | ({"score": scale * blind[x]} if photons < 1e6 else {})
+        {"axis": axis, "draw": draw, "n_photons": photons, "exposure": x, "width": x}
+        | {"expected": 0.5, "score": scale * score}
         for axis in ("exposure", "width")
-        for draw, scale in ((0, 1.0), (1, 3.0))
+        for draw, scale in ((0, 1.0), (1, 4.0))
         for photons in (1e5, 1e6)
-        for x in known
+        for x, score in scores.items()
     ]
-    table = smearing_map_report.table_of(smearing_map_report.summarise(rows))
-    np.testing.assert_allclose(table["exposure_cost"], [[1.0, 1.25, 2 * 1.5]] * 2, rtol=1e-6)
-    assert table["width_cost"] == table["exposure_cost"]
+    cells = smearing_map_report.summarise(rows)
+    table = smearing_map_report.table_of(cells, 4.0)
+    first = 4 * 0.1 * 0.8**0.5  # 0.5 is expected, 4 is twice the mean of 1 and 4
+    np.testing.assert_allclose(table["exposure_ratio"], [[first, first, 0.8]] * 2, rtol=1e-9)
+    assert table["band_ratio"] == table["exposure_ratio"]
+    assert [cell["growth"] for cell in cells[:3]] == pytest.approx([1.0, 0.8, 2.0])
 
 
 def test_scenes_differ_and_hold_the_light():

@@ -263,7 +263,7 @@ def test_the_best_exposure_is_the_vertex_of_a_parabola_of_logarithms():
         return 0.3 * 10 ** (0.2 * (torch.tensor(exposure / 5e-3).log10()) ** 2)
 
     choices = tuple(
-        Choice(3, 0.1, exposure, 20e-9, 10, 1e3, 0.0, 0.2, 0.1, float(error(exposure))) for exposure in (2e-3, 4e-3, 9e-3)
+        Choice(3, 0.1, time, 20e-9, 10, 1e3, 0.0, 0.2, 0.1, float(error(time))) for time in (2e-3, 4e-3, 9e-3)
     )
     plan = ObservationPlan(make(), choices, {(3, 0.1): MASK})
     assert plan.best_exposure == pytest.approx(5e-3, rel=1e-5)

@@ -82,7 +82,7 @@ def test_the_spread_of_the_phase_is_the_root_of_its_structure_function_times_the
 
 
 def test_ratios_of_the_library_never_fall_with_blur_and_fall_with_light():
-    """The criterion's trend with light is that of a linear estimate, which a positive object of least variation beats."""
+    """The prediction is that of a linear estimate, which a positive object of least variation beats in bright light."""
     measured = smearing_map()
     for table in (measured.exposure_ratio, measured.band_ratio):
         assert (np.diff(table, axis=1) >= 0).all()

@@ -44,8 +44,9 @@ def plan_observation(
     The error is `TurbulentMSE` with the photons, the sky, the frames and the read-out noise that follow from the
     instrument at each point, for a linear estimate that knows every transfer function. What to expect of a restoration
     that has to find the aberrations is that error for instants in narrow light, times what such restorations were
-    measured to lose, `success_map`, and what the light, the exposure and the band do to them, `smearing_map`. Each mask is searched for its number and size of holes by `AsymptoticMSE` (hybrid, `budget`
-    evaluations) at the light of the instrument's own exposure, and kept for all exposures.
+    measured to lose, `success_map`, and what light, exposure and band do to them, `smearing_map`. Each mask is searched
+    for its number and size of holes by `AsymptoticMSE` (hybrid, `budget` evaluations) at the light of the instrument's
+    own exposure, and kept for all exposures.
 
     Parameters
     ----------

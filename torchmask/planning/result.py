@@ -139,8 +139,8 @@ class ObservationPlan:
             f"({best.hole_diameter / told.site.r0:.2g} r0, {best.exposure / told.seeing.tau0:.2g} tau0){band} and "
             f"{best.photons:.4g} photons in each.",
             _blind_line(best.blind),
-            f"A linear estimate that knows the PSFs: {best.relative_mse:.4g}; the least would be {self.best_known.relative_mse:.4g}, with "
-            f"{_point(self.best_known)}.",
+            f"Predicted for a linear estimate that knows the PSFs: {best.relative_mse:.4g}; the least would be "
+            f"{self.best_known.relative_mse:.4g}, with {_point(self.best_known)}.",
             f"Best exposure between those of the map: {1e3 * self.best_exposure:.4g} ms{width}.",
             *(
                 f"The best {_WORDS[name]} is at the edge of the map: beyond may be better."
@@ -168,8 +168,8 @@ def _blind_line(blind: BlindOutlook | None) -> str:
     return (
         f"There blind restorations of instants in narrow light score {blind.cost:.3g} times as high as with known PSFs "
         f"(median), and {100 * blind.success:.0f} % of them ({100 * blind.low:.0f} to {100 * blind.high:.0f} %) stay "
-        f"within {SUCCESS:g} times. With this light, exposure and band restored scores are another {blind.restored:.3g} "
-        "times those that are predicted for a linear estimate of such instants."
+        f"within {SUCCESS:g} times. With this light, exposure and band restored scores are another "
+        f"{blind.restored:.3g} times those that are predicted for a linear estimate of such instants."
     )
 
 

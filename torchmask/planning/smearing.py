@@ -36,9 +36,9 @@ class SmearingMap:
 
     n_photons, exposures, spreads : the values measured, in rising order, at least two each; exposures over tau0,
         `phase_spread` of the bands [rad]
-    exposure_ratio, band_ratio : blind score over what `BlindOutlook.cost` makes of the score that `TurbulentMSE` predicts
-        for instants in narrow light, indexed [photons, exposures] and [photons, spreads]; exposures are those in narrow
-        light, bands those of instants
+    exposure_ratio, band_ratio : restored score over the one that `TurbulentMSE` predicts for instants in narrow light
+        times `BlindOutlook.cost`, indexed [photons, exposures] and [photons, spreads]; the exposures were in narrow
+        light, the bands those of instants
     conditions : what all restorations share, in a sentence
 
     Raises ValueError if a shape or an order is wrong, or a ratio is not positive.

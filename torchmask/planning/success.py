@@ -27,7 +27,7 @@ class BlindOutlook:
     success : chance that this ratio is within 1.3
     low, high : Wilson's interval of that chance at one standard error, from the number of restorations
     outside : names of what lies outside what was tried, for which its nearest edge was taken
-    restored : its score over what is predicted for instants in narrow light, times cost: by how much restorations differ
+    restored : its score over cost times the one predicted for instants in narrow light: by how much restorations differ
         from the linear estimate that is predicted, and what exposure and band do to them
 
     Examples
