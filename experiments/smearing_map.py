@@ -140,7 +140,8 @@ def expect(options: Options, masks: Sequence[SparseAperture], callback: Callback
 
     For each mask it is that of exposures, whose pixels are coarser, and then that of bands.
     """
-    common = {name: getattr(options, name) for name in ("d_over_r0", "n_frames", "n_pixels", "photons")}
+    names = ("d_over_r0", "n_frames", "n_pixels", "photons")
+    common = {name: getattr(options, name) for name in names} | {"torchmask": torchmask.__version__}
     tasks = [common | {"oversampling": finer} | of_mask(mask) for mask in masks for finer in (1.0, OVERSAMPLING)]
     found = run_tasks(predict, tasks, options.sweep / "tasks", stage="smearing_predicted", **options.keywords(callback))
     expected = []

@@ -59,8 +59,9 @@ def instant_criterion(instrument: Instrument, area: float, n_pixels: int = 256) 
     """Return `instrument_criterion` with all the light of a frame in one instant and at one wavelength.
 
     >>> from torchmask.instrument.parts import Site, Source, Telescope
-    >>> parts = {"telescope": Telescope(1.0), "source": Source(photon_rate=1e9), "site": Site(r0=0.15, wind=10.0)}
-    >>> instrument = Instrument(**parts, wavelength=550e-9, width=10e-9, exposure=2e-3, n_frames=20)
+    >>> known = {"telescope": Telescope(diameter=1.0), "site": Site(r0=0.15, wind=10.0)}
+    >>> known |= {"source": Source(photon_rate=1e9), "wavelength": 550e-9, "width": 10e-9, "exposure": 2e-3}
+    >>> instrument = Instrument(**known, n_frames=20)
     >>> criterion = instant_criterion(instrument, area=0.05, n_pixels=64)
     >>> criterion.seeing.exposure, criterion.band, float(criterion.noise_psd[0, 0])
     (0.0, None, 100000.0)
