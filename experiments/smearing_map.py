@@ -142,7 +142,9 @@ def expect(options: Options, masks: Sequence[SparseAperture], callback: Callback
     """
     names = ("d_over_r0", "n_frames", "n_pixels", "photons")
     common = {name: getattr(options, name) for name in names} | {"torchmask": torchmask.__version__}
-    tasks = [common | {"oversampling": finer} | of_mask(mask) for mask in masks for finer in (1.0, OVERSAMPLING)]
+    tasks: list[dict[str, Any]] = [
+        common | {"oversampling": finer} | of_mask(mask) for mask in masks for finer in (1.0, OVERSAMPLING)
+    ]
     found = run_tasks(predict, tasks, options.sweep / "tasks", stage="smearing_predicted", **options.keywords(callback))
     expected = []
     for task, row in zip(tasks, found, strict=True):
