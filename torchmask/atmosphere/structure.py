@@ -68,14 +68,15 @@ class StructureFunction:
     def of_square(self, squared: Tensor) -> Tensor:
         """Return the structure function at the squared distance (...) [m^2]."""
         # The offset, a billionth of r0 squared, keeps the derivative finite at 0.
-        unit = squared / self.r0**2 + 1e-18
         if math.isinf(self.outer_scale):
-            return STRUCTURE_CONSTANT * unit ** (5 / 6)
+            unit = squared * (STRUCTURE_CONSTANT**1.2 / self.r0**2) + 1e-18
+            return unit * torch.exp(unit.log() * (-1 / 6))  # unit^(5/6): a power takes twice as long
+        unit = squared * (1 / self.r0**2) + 1e-18
         longest = min(self.reach, _SATURATED * self.outer_scale)
-        root = unit.clamp(max=(longest / self.r0) ** 2) ** (1 / 6)  # (r / r0)^(1/3)
+        root = torch.exp(unit.clamp(max=(longest / self.r0) ** 2).log() / 6)  # (r / r0)^(1/3)
         series = _series(longest / self.outer_scale)
         position = root * (2 / (longest / self.r0) ** (1 / 3)) - 1
-        return STRUCTURE_CONSTANT * root**5 * _clenshaw(series, position)
+        return STRUCTURE_CONSTANT * root * (root * root) ** 2 * _clenshaw(series, position)
 
 
 def coherence_distance(r0: float) -> float:
@@ -109,7 +110,7 @@ def _series(longest: float) -> tuple[float, ...]:
 
 def _clenshaw(coefficients: tuple[float, ...], x: Tensor) -> Tensor:
     """Evaluate the Chebyshev series at x (...)."""
-    after, current = torch.zeros_like(x), torch.full_like(x, coefficients[-1])
+    after, current, twice = torch.zeros_like(x), torch.full_like(x, coefficients[-1]), 2 * x
     for coefficient in coefficients[-2:0:-1]:
-        current, after = 2 * x * current - after + coefficient, current
-    return x * current - after + coefficients[0]
+        current, after = torch.addcmul(coefficient - after, twice, current), current
+    return torch.addcmul(coefficients[0] - after, x, current)

@@ -43,23 +43,12 @@ def mean_inverse(mean: Tensor, variance: Tensor, ratio: Tensor) -> Tensor:
     return 1 / rest
 
 
-def add_lenses(patches: LensPatches, lenses: Lenses, values: Tensor, factors: Tensor) -> Tensor:
-    """Return the sum over lenses on half the frequency plane (B, pixels), at nu and -nu.
-
-    values (B, parts, L, rows, columns) on the patches, each part with a map in `factors` (parts, pixels of the plane)
-    """
-    index = patches.plane.index(lenses.corner, *lenses.root.shape[-2:]).flatten(1)
-    planes = values.new_zeros(*values.shape[:2], patches.plane.n_pixels)
-    planes = planes.scatter_add(2, index[:, None].expand(-1, values.shape[1], -1), values.flatten(2))
-    return patches.plane.folded((planes * factors).sum(1))
-
-
 def steady_lenses(lenses: Lenses, n: int) -> Tensor:
     """Return the square of |OTF|^2 of each lens (B, L, rows, columns), N^4 times, without turbulence within it.
 
     All `n` holes with themselves are one lens. The modes of a band are independent. Every lens counts at nu and at -nu.
     """
-    power = (lenses.values**4).sum(2)
+    power = (lenses.values**4).sum(0)
     return torch.cat([power[:, :1] * (n**4 / 2), power[:, 1:]], 1)
 
 
@@ -69,10 +58,10 @@ def piston_powers(centers: Tensor, geometry: Geometry, wavelength: float) -> tup
     n, found = centers.shape[1], []
     for mask in centers.split(1):
         lenses = patches(mask)
-        power = (lenses.values**2).sum(2)
+        power = (lenses.values**2).sum(0)
         power = torch.cat([power[:, :1] * (n**2 / 2), power[:, 1:]], 1)
-        both = torch.stack([power / n**2, steady_lenses(lenses, n) / n**4], 1)
-        one = both.new_ones(1, 1)
-        found.append(torch.stack([add_lenses(patches, lenses, part[:, None], one) for part in both.unbind(1)]))
+        both = torch.cat([power / n**2, steady_lenses(lenses, n) / n**4])
+        planes = patches.plane.summed(lenses.index.expand_as(both), both)
+        found.append(patches.plane.folded(planes)[:, None])
     mean, steady = torch.cat(found, 1).unflatten(-1, (-1, geometry.grid[1]))
     return mean, steady

@@ -63,10 +63,15 @@ class FrequencyPlane(NamedTuple):
         y = pixel[..., 1:] + torch.arange(self.origin[0], self.origin[0] + n_rows, device=corner.device)
         return (y * self.size[1])[..., :, None] + x[..., None, :]
 
+    def summed(self, index: Tensor, values: Tensor) -> Tensor:
+        """Return planes (B, pixels): in each the sum of `values` (B, ...) at the pixels `index`, of the same shape."""
+        planes = values.new_zeros(len(values), self.n_pixels)
+        return planes.scatter_add_(1, index.flatten(1), values.flatten(1))
+
     def folded(self, plane: Tensor) -> Tensor:
         """Return the half-plane (..., pixels) of planes, row by row, columns in FFT order."""
         half = plane.new_zeros(*plane.shape[:-1], self.n_half)
-        return half.index_add(half.ndim - 1, self.target, plane[..., self.source])
+        return half.index_add(half.ndim - 1, self.target, plane.index_select(plane.ndim - 1, self.source))
 
 
 def half_plane(geometry: Geometry) -> Tensor:

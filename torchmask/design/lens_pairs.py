@@ -12,19 +12,22 @@ them in one place.
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from torchmask.design.frequency_plane import FrequencyPlane
 from torchmask.design.lens_patches import Lenses
 from torchmask.design.overlap import Geometry
 from torchmask.design.pair_coherence import PairCoherence
 
 _SMALLEST = 5e-4  # products T T' exp(-Q / 2) below, as estimated, are left out
 _RICH = 0.005  # of those that are never larger the coherence is taken to be constant
-_WINDOWS = (0.65, 0.85, 1.0)  # sizes of patches, of that of a lens
+_SIZES = 4  # of windows, along either axis
 _NODE = 0.4  # of the hole's reach: where the parabolas are fixed, as lenses transmit little further out
 _NOTHING, _MOST = 1e-30, 10.0  # coherence, and logarithm of it over `far`, that no pixel with light goes beyond
 
@@ -46,17 +49,17 @@ class Entries(NamedTuple):
 class LensPairs:
     """What pairs of lenses of a mask share, for holes of one geometry; `pixel` (2,) [m]."""
 
-    def __init__(self, geometry: Geometry, coherence: PairCoherence, pixel: Tensor) -> None:
-        self.geometry, self.coherence, self.pixel = geometry, coherence, pixel
+    def __init__(self, geometry: Geometry, coherence: PairCoherence, plane: FrequencyPlane, pixel: Tensor) -> None:
+        self.geometry, self.coherence, self.plane, self.pixel = geometry, coherence, plane, pixel
 
-    def __call__(self, lenses: Lenses, centers: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
-        """Return what lenses share over `far`, in patches of some sizes: mask (S,), corner (S, 2) [pixels] and values
-        (S, rows, columns). Each patch counts once more at the opposite frequencies."""
+    def __call__(self, lenses: Lenses, centers: Tensor) -> tuple[Tensor, Tensor]:
+        """Return where lenses share light, pixels (P,) of the planes of all masks one after the other, and what they
+        share over `far` (P,). It counts once more at the opposite frequencies."""
         baselines = lenses.baseline * self.pixel
         with torch.no_grad():
             entries, largest = self._select(lenses, baselines, centers)
         if len(entries.mask) == 0:
-            return []
+            return lenses.index.new_empty(0), centers.new_empty(0)
         sign = entries.sign[:, None]
         first, second = baselines[entries.mask, entries.first], sign * baselines[entries.mask, entries.second]
         separation = self._middles(lenses, centers, entries, 0) - self._middles(lenses, centers, entries, 1)
@@ -72,54 +75,38 @@ class LensPairs:
         pairs = Entries(*(part[one] for part in entries))
         own = pairs.first == pairs.second  # their own opposite
         nodes = (nodes * torch.where(own, 1.0, 2.0).to(nodes)[:, None]).clamp(min=_NOTHING).log().unflatten(1, (3, 3))
-        between = (first - second).detach()[one].norm(dim=-1)
-        return [
-            (pairs.mask[some], *self._patches(lenses, Entries(*(part[some] for part in pairs)), nodes[some], *places))
-            for some, places in self._windows(lenses, pairs, largest[one], between, middle[one], step[one])
-        ]
+        middle, step = middle[one], step[one]
+        both, targets, logarithms = [], [], []
+        for some, corner, n_rows, n_columns in self._windows(lenses, pairs):
+            part = Entries(*(entry[some] for entry in pairs))
+            both.append(_at_pixels(lenses, part, corner, n_rows, n_columns).flatten(1))
+            target = self.plane.index(corner, n_rows, n_columns) + part.mask[:, None, None] * self.plane.n_pixels
+            targets.append(target.flatten())
+            start, unit = (corner * self.pixel - middle[some]) / step[some], self.pixel / step[some]
+            logarithms.append(_parabola(nodes[some], start, unit, n_rows, n_columns).flatten())
+        coherence = torch.cat(logarithms).clamp(max=_MOST).exp()
+        layers = torch.nn.functional.pad(lenses.values, (1, 1, 1, 1)).flatten(1)
+        at, product = torch.cat(both, 1).flatten(), torch.zeros_like(coherence)
+        for layer in layers:
+            product = torch.addcmul(product, *layer.index_select(0, at).chunk(2))
+        return torch.cat(targets), product * coherence
 
-    def _windows(
-        self, lenses: Lenses, pairs: Entries, largest: Tensor, between: Tensor, middle: Tensor, step: Tensor
-    ) -> Iterator[tuple[Tensor, tuple[Tensor, Tensor, Tensor, int, int]]]:
-        """Yield pairs by the size of the window beyond which they share nothing: which they are, the windows' first
-        pixels, and what the parabolas need."""
-        rows, columns = lenses.values.shape[-2:]
-        if lenses.scale is not None:  # the lenses of a band are as wide as they are
-            every = torch.arange(len(largest), device=middle.device)
-            yield every, (lenses.corner[pairs.mask, pairs.first], middle, step, rows, columns)
-            return
-        needed = (1 - (between / (2 * self.geometry.reach)) ** 2).clamp(min=0).sqrt()
-        needed = torch.where(pairs.first == 0, 1.0, needed)
-        smallest = 0.0
-        for size in _WINDOWS:
-            some = ((needed > smallest) & (needed <= size)).nonzero()[:, 0]
-            smallest = size
-            if len(some) == 0:
-                continue
-            reach = size * self.geometry.reach / self.pixel
-            n_columns, n_rows = (2 * reach + 1).long().tolist()
-            corner = (middle[some].detach() / self.pixel - reach).ceil()
-            yield some, (corner, middle[some], step[some], min(n_rows, rows), min(n_columns, columns))
-
-    def _patches(
-        self,
-        lenses: Lenses,
-        pairs: Entries,
-        nodes: Tensor,
-        corner: Tensor,
-        middle: Tensor,
-        step: Tensor,
-        n_rows: int,
-        n_columns: int,
-    ) -> tuple[Tensor, Tensor]:
-        """Return corner (S, 2) and values (S, rows, columns) of what pairs share, from their coherence at the nodes."""
-        size = (n_rows, n_columns)
-        first = _at_pixels(lenses, pairs.mask, pairs.first, torch.ones_like(pairs.sign), corner, size)
-        second = _at_pixels(lenses, pairs.mask, pairs.second, pairs.sign, corner, size)
-        start = (corner * self.pixel - middle) / step
-        return corner, (first * second).sum(1) * _parabola(nodes, start, self.pixel / step, *size).clamp(
-            max=_MOST
-        ).exp()
+    def _windows(self, lenses: Lenses, pairs: Entries) -> Iterator[tuple[Tensor, Tensor, int, int]]:
+        """Yield the pairs whose patches have about as many rows and columns in common: which they are, the first common
+        pixel (S, 2), rows and columns."""
+        corner, end = [], []
+        for lens, sign in ((pairs.first, torch.ones_like(pairs.sign)), (pairs.second, pairs.sign)):
+            first, size = lenses.corner[pairs.mask, lens], lenses.size[pairs.mask, lens]
+            corner.append(torch.where(sign[:, None] > 0, first, 1 - first - size))
+            end.append(corner[-1] + size)
+        first = torch.maximum(*corner)
+        common = torch.minimum(*end) - first
+        steps = [math.ceil(n / _SIZES) for n in lenses.values.shape[:2:-1]]
+        sizes = (common / common.new_tensor(steps)).ceil()  # of the windows, in steps
+        for column, row in itertools.product(range(1, _SIZES + 1), repeat=2):
+            some = ((sizes[:, 0] == column) & (sizes[:, 1] == row)).nonzero()[:, 0]
+            if len(some) > 0:
+                yield some, first[some], row * steps[1], column * steps[0]
 
     def _select(self, lenses: Lenses, baselines: Tensor, centers: Tensor) -> tuple[Entries, Tensor]:
         """Return the pairs that share something, and about the most that each gives anywhere."""
@@ -195,22 +182,21 @@ def _coefficients(nodes: Tensor, start: Tensor, step: Tensor) -> Tensor:
     return torch.stack([at_start, step * (slope + 2 * start * curvature), step**2 * curvature], 1)
 
 
-def _at_pixels(
-    lenses: Lenses, mask: Tensor, lens: Tensor, sign: Tensor, corner: Tensor, size: tuple[int, int]
-) -> Tensor:
-    """Return lenses (S,) on patches of `size` whose first pixel is `corner` (S, 2), (S, modes, rows, columns).
+def _at_pixels(lenses: Lenses, pairs: Entries, corner: Tensor, n_rows: int, n_columns: int) -> Tensor:
+    """Return where lenses with a border of one dark pixel have the pixels of patches, (2, S, rows, columns).
 
-    They are turned by half a turn where their sign is -1.
+    The patches' first pixels are `corner` (S, 2). The second lens is turned by half a turn where its sign is -1.
     """
-    n_modes, rows, columns = lenses.values.shape[-3:]
-    padded = torch.nn.functional.pad(lenses.values, (1, 1, 1, 1))
-    first, own, sign = corner.long(), lenses.corner[mask, lens].long(), sign[:, None]
-    y, x = (
-        (sign * (first[:, axis, None] + torch.arange(n, device=mask.device)) - own[:, axis, None]).clamp(-1, last) + 1
-        for axis, n, last in ((1, size[0], rows), (0, size[1], columns))
-    )
-    layer = (rows + 2) * (columns + 2)
-    start = (mask * lenses.values.shape[1] + lens) * (n_modes * layer)
-    start = start[:, None] + torch.arange(n_modes, device=mask.device) * layer
-    index = (start[:, :, None] + (y * (columns + 2))[:, None])[..., None] + x[:, None, None]
-    return padded.flatten().index_select(0, index.flatten()).view(index.shape)
+    rows, columns = lenses.root.shape[-2:]
+    found = []
+    for lens, sign in ((pairs.first, torch.ones_like(pairs.sign)), (pairs.second, pairs.sign)):
+        own, sign = lenses.corner[pairs.mask, lens].long(), sign[:, None]
+        x, y = (
+            (sign * (corner[:, axis, None].long() + torch.arange(n, device=sign.device)) - own[:, axis, None])
+            .clamp(-1, most)
+            .add(1)
+            for axis, n, most in ((0, n_columns, columns), (1, n_rows, rows))
+        )
+        start = (pairs.mask * lenses.root.shape[1] + lens) * ((rows + 2) * (columns + 2))
+        found.append((start[:, None] + y * (columns + 2))[..., None] + x[:, None])
+    return torch.stack(found)

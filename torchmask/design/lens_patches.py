@@ -26,26 +26,29 @@ _FAINT = 1e-4  # of T: light that does not say which wavelength it has
 class Lenses(NamedTuple):
     """The lenses (B, L) of masks: L - 1 pairs of holes after those of the holes with themselves.
 
-    values (B, L, M, rows, columns) T on the pixels of each one's patch, in M modes; `root` (B, L, rows, columns) the
+    values (M, B, L, rows, columns) T on the pixels of each one's patch, in M modes; `root` (B, L, rows, columns) the
     square root of the T that the light there sees, for `lens_functions`; `scale` (B, L, rows, columns) the phases of
-    that light over those at the reference wavelength, None for 1; `baseline`, `turns`, `corner` (B, L, 2) [pixels],
-    that on the frequency torus, with nu_y >= 0 (sign (B, L, 1) times that of the pair), what had to be taken off it,
-    and the first pixel; `middle` (B, L, 2) [m] between the holes
+    that light over those at the reference wavelength, None for 1; `index` (B, L, rows, columns) the pixels of the
+    plane; `baseline`, `turns`, `corner`, `size` (B, L, 2) [pixels], that on the frequency torus, with nu_y >= 0 (sign
+    (B, L, 1) times that of the pair), what had to be taken off it, the first pixel, and the columns and rows that may
+    hold light; `middle` (B, L, 2) [m] between the holes
     """
 
     values: Tensor
     root: Tensor
     scale: Tensor | None
+    index: Tensor
     baseline: Tensor
     turns: Tensor
     corner: Tensor
+    size: Tensor
     sign: Tensor
     middle: Tensor
 
 
 class Colour(NamedTuple):
     """One wavelength of a band: its phases over those at the reference wavelength, its share of the light, its patches,
-    the exact T (rows * columns) of a hole with itself, and the modes (M, n_plane) that it takes part in."""
+    and the exact T (rows * columns) of a hole with itself."""
 
     scale: float
     share: float
@@ -53,7 +56,6 @@ class Colour(NamedTuple):
     splines: SplinePatches
     slices: Tensor
     central: Tensor
-    modes: Tensor
 
 
 class LensPatches:
@@ -74,11 +76,13 @@ class LensPatches:
         modes = torch.ones(1, 1, len(self.plane.baselines), dtype=torch.float64)
         if coherence is not None:
             modes = coherence.modes(self.plane.baselines)
-        self.n_modes: int = len(modes)
-        self.n_layers: int = 1 if len(band.wavelengths) == 1 else 4 * (self.n_modes + 3)  # patches of a band are wider
+        shares = torch.tensor(band.shares, dtype=torch.float64)
+        # (M, wavelengths * pixels of the plane): what each wavelength adds to each mode
+        self.modes: Tensor = (modes * shares[:, None]).flatten(1).to(device, dtype)
+        self.n_layers: int = 1 if len(band.wavelengths) == 1 else 4 * (len(modes) + 3)  # patches of a band are wider
         self.n_pixels: int = 0  # of a patch of one wavelength
         self.colours: list[Colour] = []
-        for index, (wavelength, share) in enumerate(zip(band.wavelengths, band.shares, strict=True)):
+        for wavelength, share in zip(band.wavelengths, band.shares, strict=True):
             scale = reference / wavelength
             own = geometry._replace(period=geometry.period / scale)
             plan = cached_plan(own, 1, dtype, device)
@@ -93,8 +97,7 @@ class LensPatches:
             y = (first[1] + torch.arange(len(plan.row))) * pixels[1]
             places = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
             central = geometry.shape.otf(places, geometry.diameter).flatten().to(device, dtype)
-            own_modes = modes[:, index].to(device, dtype)
-            self.colours.append(Colour(scale, share, plan, splines, slices, central, own_modes))
+            self.colours.append(Colour(scale, share, plan, splines, slices, central))
 
     def __call__(self, centers: Tensor) -> Lenses:
         """Return the lenses of masks with `centers` (B, N, 2) [m]."""
@@ -109,11 +112,13 @@ class LensPatches:
         baseline, turns = nu * sign * size, turns * sign * size
         middle = (one + other) / 2
         if len(self.colours) == 1 and self.colours[0].scale == 1:
-            values, corner = self._lens(self.colours[0], baseline, turns)
-            root = values.clamp(min=_NOTHING).sqrt()
-            return Lenses(values[:, :, None], root, None, baseline, turns, corner, sign, middle)
-        values, root, scale, corner = self._merged(baseline, turns)
-        return Lenses(values, root, scale, baseline, turns, corner, sign, middle)
+            lens, corner = self._lens(self.colours[0], baseline, turns)
+            values, root, scale = lens[None], lens.clamp(min=_NOTHING).sqrt(), None
+            extent = size.new_tensor(lens.shape[:1:-1]).expand_as(corner)
+        else:
+            values, root, scale, corner, extent = self._merged(baseline, turns)
+        index = self.plane.index(corner, *values.shape[-2:])
+        return Lenses(values, root, scale, index, baseline, turns, corner, extent, sign, middle)
 
     def _lens(self, colour: Colour, baseline: Tensor, turns: Tensor) -> tuple[Tensor, Tensor]:
         """Return T (B, L, rows, columns) at one wavelength, and the first pixel of the patch (B, L, 2)."""
@@ -123,32 +128,35 @@ class LensPatches:
         values[:, 0] = colour.central  # N holes share it: what a spline makes of its edge would count N times
         return values.unflatten(-1, (len(colour.plan.row), len(colour.plan.column))), corner
 
-    def _merged(self, baseline: Tensor, turns: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return values, root, scale and corner of the lenses of all wavelengths together."""
+    def _merged(self, baseline: Tensor, turns: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Return values, root, scale, corner and size of the lenses of all wavelengths together."""
         lenses = [self._lens(colour, baseline, turns) for colour in self.colours]
-        corners = torch.stack([corner for _, corner in lenses])
-        ends = torch.stack([corner + corner.new_tensor(lens.shape[:1:-1]) for lens, corner in lenses])
-        corner = corners.amin(0)
-        columns, rows = (ends.amax(0) - corner).nan_to_num(1.0).amax((0, 1)).long().tolist()
-        layers = baseline.new_zeros(*baseline.shape[:2], self.n_modes + 3, rows * columns)
-        for colour, (lens, own) in zip(self.colours, lenses, strict=True):
+        corner = torch.stack([own for _, own in lenses]).amin(0)
+        ends = torch.stack([own + own.new_tensor(lens.shape[:1:-1]) for lens, own in lenses])
+        size = (ends.amax(0) - corner).nan_to_num(1.0)
+        columns, rows = size.amax((0, 1)).long().tolist()
+        first = torch.arange(corner[..., 0].numel(), device=corner.device).view(*corner.shape[:2], 1, 1) * rows * columns
+        sources, targets, lights = [], [], []
+        for number, (colour, (lens, own)) in enumerate(zip(self.colours, lenses, strict=True)):
             n_rows, n_columns = lens.shape[-2:]
-            at = self.plane.index(own, n_rows, n_columns).flatten(2)
-            lens = lens.flatten(2)
-            modes = colour.modes[:, at] * (colour.share * lens)  # (M, B, L, pixels)
+            sources.append((self.plane.index(own, n_rows, n_columns) + number * self.plane.n_pixels).flatten())
+            x, y = (own - corner).nan_to_num(0.0).long()[..., None].unbind(2)
+            row = (y + torch.arange(n_rows, device=y.device)) * columns
+            targets.append((first + row[..., None] + (x + torch.arange(n_columns, device=x.device))[..., None, :]).flatten())
+            lens = lens.flatten()
             positive = lens * lens * torch.rsqrt(lens * lens + _FAINT**2)  # a spline overshoots
             light = colour.share * positive
-            moments = torch.stack([light, light * (positive + _NOTHING).sqrt(), light * colour.scale])
-            shift = (own - corner).nan_to_num(0.0).long()
-            index = (shift[..., 1:] + torch.arange(n_rows, device=at.device))[..., None] * columns
-            index = index + (shift[..., :1] + torch.arange(n_columns, device=at.device))[..., None, :]
-            source = torch.cat([modes, moments]).movedim(0, 2)
-            layers = layers.scatter_add(3, index.flatten(2)[:, :, None].expand_as(source), source)
-        layers = layers.unflatten(-1, (rows, columns))
-        values, (total, roots, phases) = layers[:, :, :-3], layers[:, :, -3:].unbind(2)
+            lights.append(torch.stack([light, light * (positive + _NOTHING).sqrt(), light * colour.scale]))
+        source, target, lens = torch.cat(sources), torch.cat(targets), torch.cat([lens.flatten() for lens, _ in lenses])
+        dark = lens.new_zeros(first.numel() * rows * columns)
+
+        def merged(light: Tensor) -> Tensor:
+            return dark.scatter_add(0, target, light).view(*corner.shape[:2], rows, columns)
+
+        values = torch.stack([merged(mode.index_select(0, source) * lens) for mode in self.modes])
+        total, roots, phases = (merged(moment) for moment in torch.cat(lights, 1))
         total = total + _NOTHING
-        scale = (phases + _NOTHING) / total
-        return values, roots / total, scale, corner
+        return values, roots / total, (phases + _NOTHING) / total, corner, size
 
 
 def _pairs(n: int, device: torch.device) -> Tensor:

@@ -17,7 +17,7 @@ from torchmask.atmosphere.colour_coherence import ColourCoherence
 from torchmask.atmosphere.lens_coherence import lens_coherence, lens_functions
 from torchmask.atmosphere.seeing import Seeing
 from torchmask.design.central_lenses import CentralLenses
-from torchmask.design.fluctuation import add_lenses, steady_lenses
+from torchmask.design.fluctuation import steady_lenses
 from torchmask.design.frequency_plane import FrequencyPlane, half_plane
 from torchmask.design.lens_pairs import LensPairs
 from torchmask.design.lens_patches import Lenses, LensPatches
@@ -65,7 +65,7 @@ class MaskTransfer:
             geometry, seeing, band, reference, longest, half_plane(geometry), dtype, device
         )
         coherence = PairCoherence(geometry, seeing, colours, furthest, dtype, device)
-        self.pairs: LensPairs = LensPairs(geometry, coherence, self.pixel)
+        self.pairs: LensPairs = LensPairs(geometry, coherence, self.plane, self.pixel)
         self.far: Tensor = coherence.far(*self.plane.baselines.to(device).unbind(-1)).to(dtype)
 
     def __call__(self, centers: Tensor) -> Tensor:
@@ -77,36 +77,34 @@ class MaskTransfer:
 
     def _transfer(self, centers: Tensor) -> Tensor:
         lenses = self.patches(centers)
-        count = torch.ones_like(lenses.root[:1, :, :1, :1])
-        count[:, 0] = centers.shape[1] / 2  # every patch counts twice in the end, at nu and at -nu
-        alone = self._parts(lenses, (lenses.values**2).sum(2) * count)
-        total = add_lenses(self.patches, lenses, alone, self.factors) + self.central(centers)
-        shared = self.pairs(lenses, centers)
-        if shared:
-            together = centers.new_zeros(len(centers) * self.plane.n_pixels)
-            for mask, corner, values in shared:
-                index = self.plane.index(corner, *values.shape[-2:]) + mask[:, None, None] * self.plane.n_pixels
-                together = together.scatter_add(0, index.flatten(), values.flatten())
-            total = total + self.plane.folded(together.view(len(centers), -1) * self.far)
-        return total
+        power = (lenses.values**2).sum(0)
+        # every patch counts twice in the end, at nu and at -nu
+        power = torch.cat([power[:, :1] * (centers.shape[1] / 2), power[:, 1:]], 1)
+        alone = self.plane.summed(lenses.index, power * self._kept(lenses, self.factors))
+        index, shared = self.pairs(lenses, centers)
+        together = alone.new_zeros(alone.numel()).scatter_add_(0, index, shared).view_as(alone)
+        return self.plane.folded(torch.addcmul(alone, together, self.far)) + self.central(centers)
 
     def steady(self, centers: Tensor) -> Tensor:
         """Return N^4 times the sum over lenses of the square of the steady part of |OTF|^2 (B, H // 2 + 1, W)."""
         found = []
         for mask in centers.split(1):
             lenses = self.patches(mask)
-            parts = self._parts(lenses, steady_lenses(lenses, centers.shape[1]))
-            found.append(add_lenses(self.patches, lenses, parts, self._steady_factors))
+            power = steady_lenses(lenses, centers.shape[1]) * self._kept(lenses, self._steady_factors)
+            found.append(self.plane.folded(self.plane.summed(lenses.index, power)))
         return torch.cat(found).clamp(min=0).unflatten(1, (-1, self.plane.n_columns))
 
     @cached_property
     def _steady_factors(self) -> Tensor:
         return self._coherence(steady=True)(self.plane.baselines).to(self.factors)
 
-    def _parts(self, lenses: Lenses, power: Tensor) -> Tensor:
-        """Return what lenses give with themselves, in parts that have a factor each (B, parts, L, rows, columns)."""
-        places = self._places(lenses, *lenses.root.shape[-2:])
-        return torch.stack([power * function for function in lens_functions(lenses.root, *places, lenses.scale)], 1)
+    def _kept(self, lenses: Lenses, factors: Tensor) -> Tensor:
+        """Return the coherence (B, L, rows, columns) of lenses with themselves, by `factors` (parts, pixels)."""
+        functions = lens_functions(lenses.root, *self._places(lenses, *lenses.root.shape[-2:]), lenses.scale)
+        index, total = lenses.index.flatten(), torch.zeros_like(lenses.root)
+        for function, factor in zip(functions, factors, strict=True):
+            total = torch.addcmul(total, function, factor.index_select(0, index).view_as(total))
+        return total
 
     def _places(self, lenses: Lenses, rows: int, columns: int) -> tuple[Tensor, Tensor]:
         """Return the distance of the pixels from the lenses' baselines, x and y, over the holes' outer diameter."""
