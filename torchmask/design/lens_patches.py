@@ -79,8 +79,7 @@ class LensPatches:
         shares = torch.tensor(band.shares, dtype=torch.float64)
         # (M, wavelengths * pixels of the plane): what each wavelength adds to each mode
         self.modes: Tensor = (modes * shares[:, None]).flatten(1).to(device, dtype)
-        self.n_layers: int = 1 if len(band.wavelengths) == 1 else 4 * (len(modes) + 3)  # patches of a band are wider
-        self.n_pixels: int = 0  # of a patch of one wavelength
+        self.n_pixels: int = 0  # of the patches of a lens, one for each wavelength
         self.colours: list[Colour] = []
         for wavelength, share in zip(band.wavelengths, band.shares, strict=True):
             scale = reference / wavelength
@@ -91,7 +90,7 @@ class LensPatches:
             x, y = splines.lattice()
             places = torch.stack(torch.meshgrid(x * pixels[0], y * pixels[1], indexing="xy"), -1)
             slices = splines.slices(geometry.shape.otf(places, geometry.diameter)[None]).to(device, dtype)
-            self.n_pixels = max(self.n_pixels, len(plan.row) * len(plan.column))
+            self.n_pixels += len(plan.row) * len(plan.column)
             first = (-plan.reach).ceil().double().cpu()
             x = (first[0] + torch.arange(len(plan.column))) * pixels[0]
             y = (first[1] + torch.arange(len(plan.row))) * pixels[1]
@@ -135,14 +134,15 @@ class LensPatches:
         ends = torch.stack([own + own.new_tensor(lens.shape[:1:-1]) for lens, own in lenses])
         size = (ends.amax(0) - corner).nan_to_num(1.0)
         columns, rows = size.amax((0, 1)).long().tolist()
-        first = torch.arange(corner[..., 0].numel(), device=corner.device).view(*corner.shape[:2], 1, 1) * rows * columns
+        first = torch.arange(corner[..., 0].numel(), device=corner.device).view(*corner.shape[:2], 1) * (rows * columns)
         sources, targets, lights = [], [], []
         for number, (colour, (lens, own)) in enumerate(zip(self.colours, lenses, strict=True)):
             n_rows, n_columns = lens.shape[-2:]
             sources.append((self.plane.index(own, n_rows, n_columns) + number * self.plane.n_pixels).flatten())
             x, y = (own - corner).nan_to_num(0.0).long()[..., None].unbind(2)
-            row = (y + torch.arange(n_rows, device=y.device)) * columns
-            targets.append((first + row[..., None] + (x + torch.arange(n_columns, device=x.device))[..., None, :]).flatten())
+            row = first + (y + torch.arange(n_rows, device=y.device)) * columns
+            column = x + torch.arange(n_columns, device=x.device)
+            targets.append((row[..., :, None] + column[..., None, :]).flatten())
             lens = lens.flatten()
             positive = lens * lens * torch.rsqrt(lens * lens + _FAINT**2)  # a spline overshoots
             light = colour.share * positive

@@ -70,10 +70,12 @@ class MaskTransfer:
 
     def __call__(self, centers: Tensor) -> Tensor:
         """Return N^2 E|OTF|^2 (B, H // 2 + 1, W) of masks with `centers` (B, N, 2) [m]."""
-        n = centers.shape[1]
-        pixels = (1 + n * (n - 1) // 2) * self.patches.n_pixels * self.patches.n_layers
-        parts = [self._transfer(chunk) for chunk in centers.split(max(1, _CHUNK // pixels))]
+        parts = [self._transfer(chunk) for chunk in centers.split(self.n_masks(centers.shape[1]))]
         return torch.cat(parts).unflatten(1, (-1, self.plane.n_columns))
+
+    def n_masks(self, n: int) -> int:
+        """Return how many masks of `n` holes to work on at a time."""
+        return max(1, _CHUNK // ((1 + n * (n - 1) // 2) * self.patches.n_pixels))
 
     def _transfer(self, centers: Tensor) -> Tensor:
         lenses = self.patches(centers)

@@ -125,7 +125,7 @@ class _BaselineMSE(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grad: Tensor) -> tuple[Tensor, None, None, None, None]:
         centers, gradient = ctx.saved_tensors
-        return grad[0][:, None, None] * _DifferentiatedOnce.apply(gradient, centers), None, None, None, None
+        return grad[0][:, None, None] * DifferentiatedOnce.apply(gradient, centers), None, None, None, None
 
     @staticmethod
     def vmap(
@@ -147,7 +147,7 @@ class _BaselineMSE(torch.autograd.Function):
         return (value, gradient), (0, 0)
 
 
-class _DifferentiatedOnce(torch.autograd.Function):
+class DifferentiatedOnce(torch.autograd.Function):
     """A gradient that raises an error when it is differentiated, where torch would give zero Hessians silently."""
 
     generate_vmap_rule = True

@@ -14,6 +14,7 @@ from torchmask.atmosphere.lens_coherence import PolarTable
 from torchmask.atmosphere.seeing import Seeing
 from torchmask.atmosphere.transfer import mean_square_otf, steady_square_otf
 from torchmask.design.criterion import AsymptoticMSE
+from torchmask.design.early_gradient import by_chunks
 from torchmask.design.frequency_plane import half_plane
 from torchmask.design.mask_transfer import MaskTransfer
 from torchmask.design.overlap import Geometry
@@ -151,7 +152,15 @@ class TurbulentMSE(AsymptoticMSE):
     def forward(self, aperture: Aperture) -> Tensor:
         if self.seeing is None:
             return super().forward(aperture)
-        power = self._half_power(aperture)
+        if not isinstance(aperture, Aperture) or aperture.is_full:
+            return self._error(self._half_power(aperture))
+        transfer, n, centers = self._table(aperture, self._mask_transfer), aperture.n_subapertures, aperture.centers
+        flat = centers.reshape(math.prod(centers.shape[:-2]), n, 2)
+        found = by_chunks(lambda some: self._error(transfer(some) / n**2), flat, transfer.n_masks(n))
+        return found.reshape(centers.shape[:-2])
+
+    def _error(self, power: Tensor) -> Tensor:
+        """Return the mean squared error (...) for E|OTF|^2 (..., H // 2 + 1, W)."""
         weight, ratio = self._weight.to(power.dtype), self._ratio.to(power.dtype)
         return (weight / (power[..., None, :, :] + ratio)).sum((-3, -2, -1))
 

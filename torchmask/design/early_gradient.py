@@ -1,0 +1,52 @@
+"""Values of a population whose gradient is computed right after them, chunk by chunk.
+
+The graph of a chunk is gone when the next one begins: memory does not grow with the population, and stays in the cache.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchmask.design.overlap import DifferentiatedOnce
+
+
+def by_chunks(function: Callable[[Tensor], Tensor], centers: Tensor, size: int) -> Tensor:
+    """Return `function` (B,) of masks with `centers` (B, N, 2), `size` of them at a time, differentiable once.
+
+    The function must know nothing else that is to be differentiated, and treat each mask by itself.
+    """
+    differentiate = centers.requires_grad and torch.is_grad_enabled()
+    return _EarlyGradient.apply(centers, function, size, differentiate)[0]  # type: ignore[no-any-return]
+
+
+class _EarlyGradient(torch.autograd.Function):
+    """`by_chunks` and, if requested, its gradient, which the backward pass only scales."""
+
+    @staticmethod
+    def forward(
+        centers: Tensor, function: Callable[[Tensor], Tensor], size: int, differentiate: bool
+    ) -> tuple[Tensor, Tensor]:
+        values, gradients = [], [centers.new_empty(0, *centers.shape[1:])]
+        for chunk in centers.split(size):
+            with torch.set_grad_enabled(differentiate):
+                some = chunk.detach().requires_grad_(differentiate)
+                value = function(some)
+                if differentiate:
+                    gradients.extend(torch.autograd.grad(value.sum(), some))
+            values.append(value.detach())
+        return torch.cat(values), torch.cat(gradients)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
+        centers, gradient = inputs[0], output[1]
+        ctx.mark_non_differentiable(gradient)
+        ctx.save_for_backward(centers, gradient)
+
+    @staticmethod
+    def backward(ctx: Any, *grad: Tensor) -> tuple[Tensor, None, None, None]:
+        centers, gradient = ctx.saved_tensors
+        return grad[0][:, None, None] * DifferentiatedOnce.apply(gradient, centers), None, None, None
