@@ -314,6 +314,26 @@ def test_gradients_through_a_band():
     assert float(criterion.relative(single)) == pytest.approx(float(criterion.relative(double)), rel=1e-4)
 
 
+def test_gradients_are_the_same_however_many_masks_are_in_work(monkeypatch):
+    criterion = criterion_of(Grid.nyquist(1.0, 550e-9, 24), r0=0.25)
+    centers = torch.tensor(list(CENTERS.values())[:3], dtype=torch.float64, requires_grad=True)
+    weight = torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64)
+    found = []
+    for pixels in (1, 2**20):
+        monkeypatch.setattr("torchmask.design.mask_transfer._CHUNK", pixels)
+        found.append(torch.autograd.grad(weight @ criterion.relative(SparseAperture(centers, 0.2, 1.0)), centers)[0])
+    # sums over the same pixels in another order, at some thousand of them
+    torch.testing.assert_close(*found, rtol=0, atol=1e-12 * float(found[0].abs().max()))
+
+
+def test_a_second_derivative_is_refused():
+    criterion = criterion_of(Grid.nyquist(1.0, 550e-9, 24), r0=0.25)
+    centers = torch.tensor(CENTERS["random"], dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(criterion(SparseAperture(centers, 0.2, 1.0)), centers, create_graph=True)
+    with pytest.raises(RuntimeError, match="first derivative only"):
+        torch.autograd.grad(slope.sum(), centers)
+
+
 @pytest.mark.slow
 def test_turning_everything_changes_little():
     """Criterion and wind turned by 90 degrees: the same but for rounding. Turned alone, the mask differs."""
