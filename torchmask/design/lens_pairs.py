@@ -76,17 +76,19 @@ class LensPairs:
         own = pairs.first == pairs.second  # their own opposite
         nodes = (nodes * torch.where(own, 1.0, 2.0).to(nodes)[:, None]).clamp(min=_NOTHING).log().unflatten(1, (3, 3))
         middle, step = middle[one], step[one]
-        both, targets, logarithms = [], [], []
+        firsts, seconds, targets, logarithms = [], [], [], []
         for some, corner, n_rows, n_columns in self._windows(lenses, pairs):
             part = Entries(*(entry[some] for entry in pairs))
-            both.append(_at_pixels(lenses, part, corner, n_rows, n_columns).flatten(1))
+            size = (n_rows, n_columns)
+            firsts.append(_at_pixels(lenses, part.mask, part.first, torch.ones_like(part.sign), corner, size))
+            seconds.append(_at_pixels(lenses, part.mask, part.second, part.sign, corner, size))
             target = self.plane.index(corner, n_rows, n_columns) + part.mask[:, None, None] * self.plane.n_pixels
             targets.append(target.flatten())
             start, unit = (corner * self.pixel - middle[some]) / step[some], self.pixel / step[some]
             logarithms.append(_parabola(nodes[some], start, unit, n_rows, n_columns).flatten())
         coherence = torch.cat(logarithms).clamp(max=_MOST).exp()
         layers = torch.nn.functional.pad(lenses.values, (1, 1, 1, 1)).flatten(1)
-        at, product = torch.cat(both, 1).flatten(), torch.zeros_like(coherence)
+        at, product = torch.cat(firsts + seconds), torch.zeros_like(coherence)
         for layer in layers:
             product = torch.addcmul(product, *layer.index_select(0, at).chunk(2))
         return torch.cat(targets), product * coherence
@@ -182,21 +184,21 @@ def _coefficients(nodes: Tensor, start: Tensor, step: Tensor) -> Tensor:
     return torch.stack([at_start, step * (slope + 2 * start * curvature), step**2 * curvature], 1)
 
 
-def _at_pixels(lenses: Lenses, pairs: Entries, corner: Tensor, n_rows: int, n_columns: int) -> Tensor:
-    """Return where lenses with a border of one dark pixel have the pixels of patches, (2, S, rows, columns).
+def _at_pixels(
+    lenses: Lenses, mask: Tensor, lens: Tensor, sign: Tensor, corner: Tensor, size: tuple[int, int]
+) -> Tensor:
+    """Return where lenses (S,) with a border of one dark pixel have the pixels of patches, (S * rows * columns,).
 
-    The patches' first pixels are `corner` (S, 2). The second lens is turned by half a turn where its sign is -1.
+    The patches are of one `size`, and their first pixels are `corner` (S, 2). Lenses are turned by half a turn where
+    their sign is -1.
     """
     rows, columns = lenses.root.shape[-2:]
-    found = []
-    for lens, sign in ((pairs.first, torch.ones_like(pairs.sign)), (pairs.second, pairs.sign)):
-        own, sign = lenses.corner[pairs.mask, lens].long(), sign[:, None]
-        x, y = (
-            (sign * (corner[:, axis, None].long() + torch.arange(n, device=sign.device)) - own[:, axis, None])
-            .clamp(-1, most)
-            .add(1)
-            for axis, n, most in ((0, n_columns, columns), (1, n_rows, rows))
+    own, sign = lenses.corner[mask, lens].long(), sign[:, None]
+    y, x = (
+        (sign * (corner[:, axis, None].long() + torch.arange(n, device=sign.device)) - own[:, axis, None]).clamp(
+            -1, most
         )
-        start = (pairs.mask * lenses.root.shape[1] + lens) * ((rows + 2) * (columns + 2))
-        found.append((start[:, None] + y * (columns + 2))[..., None] + x[:, None])
-    return torch.stack(found)
+        for axis, n, most in ((1, size[0], rows), (0, size[1], columns))
+    )
+    start = ((mask * lenses.root.shape[1] + lens) * (rows + 2) + 1) * (columns + 2) + 1
+    return ((start[:, None] + y * (columns + 2))[..., None] + x[:, None]).flatten()
