@@ -11,7 +11,7 @@ from mask_vs_full_report import interval
 from scipy.optimize import isotonic_regression
 
 from torchmask.planning.smearing import phase_spread
-from torchmask.viz.style import COLORS, new_figure, styled
+from torchmask.viz.style import COLORS, FAINT, new_figure, styled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -95,8 +95,10 @@ def figure(cells: Sequence[Mapping[str, Any]]) -> Figure:
             ax.plot(amounts, expected, ":", color=color, lw=1.1)
             ax.plot(amounts, [cell["ratio"] * cell["expected"] for cell in own], "-", color=color, lw=1.2)
         ax.set(yscale="log", xlabel=label)
-        ax.set_yticks([0.1, 0.2, 0.5, 1], ["0.1", "0.2", "0.5", "1"])
+        ax.set_yticks(ticks := (0.1, 0.2, 0.3, 0.4), map(str, ticks))
         ax.minorticks_off()
     axes[0].set_ylabel("score (0 is perfect)")
-    sheet.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
+    axes[0].plot([], [], ":", color=FAINT, lw=1.1, label="expected of instants in narrow light")
+    axes[0].plot([], [], "-", color=FAINT, lw=1.2, label="expected by a plan")
+    sheet.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=2)
     return sheet
