@@ -334,6 +334,14 @@ def test_a_second_derivative_is_refused():
         torch.autograd.grad(slope.sum(), centers)
 
 
+def test_light_of_another_wavelength_is_a_grid_of_that_wavelength():
+    """The same angles, with r0 at the wavelength of the light: it grows by its power 6/5."""
+    grid, mask, other = Grid.nyquist(1.0, 550e-9, 24), mask_of(4), 605e-9
+    found = criterion_of(grid, r0=0.2, wavelengths=[other]).expected_power(mask)
+    there = criterion_of(Grid(grid.shape, grid.pixel_scale, other), r0=0.2 * 1.1**1.2)
+    torch.testing.assert_close(found, there.expected_power(mask), rtol=0, atol=1e-12)
+
+
 @pytest.mark.slow
 def test_turning_everything_changes_little():
     """Criterion and wind turned by 90 degrees: the same but for rounding. Turned alone, the mask differs."""

@@ -127,7 +127,7 @@ def lens_coherence(
         functions = torch.stack(lens_functions(root, x, y, scale if scales else None), -1)
         rows.append(functions * weight[:, None])
         tables.append(_table(coherence, baselines, _PLACES, shape.is_round and seeing.is_isotropic) * weight)
-    # at one scale, not 1, some functions are multiples of others: of its solutions "gelsy" may return none
+    # in a narrow band some functions are nearly multiples of others, which "gelsy" may leave out wrongly
     factors = torch.linalg.lstsq(torch.cat(rows), torch.cat(tables, -1).T, driver="gelsd").solution
     return PolarTable(factors.unflatten(-1, _BASELINES), longest, 2.0)
 

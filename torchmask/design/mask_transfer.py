@@ -32,7 +32,8 @@ class MaskTransfer:
     """E|OTF|^2 of any masks with the holes of one geometry, on one grid, under one turbulence and in one band.
 
     Its tables take a second to make, and hold for any number and places of holes. `reference` [m] is the wavelength of
-    the seeing and of the geometry, `longest` [m] the longest baseline on the frequency torus.
+    the seeing and of the geometry, that of the light if it has only one; `longest` [m] is the longest baseline on the
+    frequency torus.
     """
 
     def __init__(
@@ -47,18 +48,15 @@ class MaskTransfer:
     ) -> None:
         scales = [reference / wavelength for wavelength in band.wavelengths]
         furthest = longest * max(1.0, *scales)
-        several = len(scales) > 1
-        colours = None
-        if several:
+        colours = spread = None
+        if len(scales) > 1:
+            spread = tuple(sorted({min(scales), sum(scales) / len(scales), max(scales)}))
             colours = ColourCoherence(geometry.shape, geometry.diameter, seeing, band, reference, furthest)
         self.patches: LensPatches = LensPatches(geometry, band, reference, colours, dtype, device)
         self.plane: FrequencyPlane = self.patches.plane
         self.pixel: Tensor = torch.tensor([geometry.period / side for side in geometry.grid[::-1]], dtype=dtype)
         self.pixel = self.pixel.to(device)
         self.reach: float = geometry.reach
-        spread = None
-        if scales != [1.0]:
-            spread = tuple(sorted({min(scales), sum(scales) / len(scales), max(scales)}))
         self._coherence = partial(lens_coherence, geometry.shape, geometry.diameter, seeing, furthest, spread)
         self.factors: Tensor = self._coherence()(self.plane.baselines).to(device, dtype)
         self.central: CentralLenses = CentralLenses(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import torch
@@ -213,10 +213,13 @@ class TurbulentMSE(AsymptoticMSE):
     def _mask_transfer(self, aperture: Aperture) -> MaskTransfer:
         assert self.seeing is not None
         dtype, device = aperture.centers.dtype, aperture.centers.device
-        longest = math.sqrt(0.5) * self.grid.period
-        band = Band.of([self.grid.wavelength]) if self.band is None else self.band
+        band, grid, seeing = Band.of([self.grid.wavelength]) if self.band is None else self.band, self.grid, self.seeing
         self._check_sampling(aperture, band)
-        return MaskTransfer(self._geometry(aperture), self.seeing, band, self.grid.wavelength, longest, dtype, device)
+        if len(band.wavelengths) == 1:  # its tables are best at the wavelength of the light
+            grid = replace(grid, wavelength=band.shortest)
+            seeing = replace(seeing, r0=seeing.r0 * (grid.wavelength / self.grid.wavelength) ** 1.2)
+        geometry, longest = self._geometry(aperture)._replace(period=grid.period), math.sqrt(0.5) * grid.period
+        return MaskTransfer(geometry, seeing, band, grid.wavelength, longest, dtype, device)
 
     def _pupil_power(self, aperture: Aperture) -> Tensor:
         """Return E|OTF|^2 of a full pupil (H // 2 + 1, W)."""
