@@ -1,4 +1,4 @@
-"""Values of a population whose gradient is computed right after them, chunk by chunk.
+"""Values of a population whose gradient is computed together with them, and once only.
 
 The graph of a chunk is gone when the next one begins: memory does not grow with the population, and stays in the cache.
 """
@@ -11,7 +11,39 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchmask.design.overlap import DifferentiatedOnce
+
+class EarlyGradient(torch.autograd.Function):
+    """Values (B,) of centres (B, N, 2), its first argument, and their gradient, which the backward pass only scales."""
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
+        centers, gradient = inputs[0], output[1]
+        ctx.mark_non_differentiable(gradient)
+        ctx.save_for_backward(centers, gradient)
+
+    @staticmethod
+    def backward(ctx: Any, *grad: Tensor) -> tuple[Tensor | None, ...]:
+        centers, gradient = ctx.saved_tensors
+        slope = grad[0][:, None, None] * DifferentiatedOnce.apply(gradient, centers)
+        return slope, *[None] * (len(ctx.needs_input_grad) - 1)
+
+
+class DifferentiatedOnce(torch.autograd.Function):
+    """A gradient that raises an error when it is differentiated, where torch would give zero Hessians silently."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(gradient: Tensor, centers: Tensor) -> Tensor:
+        return gradient.view_as(gradient)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
+        pass
+
+    @staticmethod
+    def backward(ctx: Any, *grad: Tensor) -> tuple[Tensor, Tensor]:
+        raise RuntimeError("the criterion has a first derivative only: take differences of its gradient for a Hessian")
 
 
 def by_chunks(function: Callable[[Tensor], Tensor], centers: Tensor, size: int) -> Tensor:
@@ -20,11 +52,11 @@ def by_chunks(function: Callable[[Tensor], Tensor], centers: Tensor, size: int) 
     The function must know nothing else that is to be differentiated, and treat each mask by itself.
     """
     differentiate = centers.requires_grad and torch.is_grad_enabled()
-    return _EarlyGradient.apply(centers, function, size, differentiate)[0]  # type: ignore[no-any-return]
+    return _ByChunks.apply(centers, function, size, differentiate)[0]  # type: ignore[no-any-return]
 
 
-class _EarlyGradient(torch.autograd.Function):
-    """`by_chunks` and, if requested, its gradient, which the backward pass only scales."""
+class _ByChunks(EarlyGradient):
+    """`by_chunks` and, if requested, its gradient."""
 
     @staticmethod
     def forward(
@@ -39,14 +71,3 @@ class _EarlyGradient(torch.autograd.Function):
                     gradients.extend(torch.autograd.grad(value.sum(), some))
             values.append(value.detach())
         return torch.cat(values), torch.cat(gradients)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
-        centers, gradient = inputs[0], output[1]
-        ctx.mark_non_differentiable(gradient)
-        ctx.save_for_backward(centers, gradient)
-
-    @staticmethod
-    def backward(ctx: Any, *grad: Tensor) -> tuple[Tensor, None, None, None]:
-        centers, gradient = ctx.saved_tensors
-        return grad[0][:, None, None] * DifferentiatedOnce.apply(gradient, centers), None, None, None

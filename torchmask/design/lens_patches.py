@@ -110,7 +110,7 @@ class LensPatches:
         size = nu.new_tensor(self.size)
         baseline, turns = nu * sign * size, turns * sign * size
         middle = (one + other) / 2
-        if len(self.colours) == 1 and self.colours[0].scale == 1:
+        if len(self.colours) == 1:
             lens, corner = self._lens(self.colours[0], baseline, turns)
             values, root, scale = lens[None], lens.clamp(min=_NOTHING).sqrt(), None
             extent = size.new_tensor(lens.shape[:1:-1]).expand_as(corner)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 from torchmask.design.conditions import ExposureConditions
 from torchmask.design.turbulent import TurbulentMSE
@@ -50,9 +51,7 @@ def instrument_criterion(
     known = ExposureConditions.of_instrument(instrument, area).keywords(site.r0, site.outer_scale)
     if not turbulence:
         known = {name: known[name] for name in ("pixel", "sky")}
-    return TurbulentMSE(
-        instrument.grid(n_pixels), instrument.object_psd(area), instrument.noise_psd(area), instrument.frames, **known
-    )
+    return _criterion(instrument, area, n_pixels, known)
 
 
 def instant_criterion(instrument: Instrument, area: float, n_pixels: int = 256) -> TurbulentMSE:
@@ -68,9 +67,12 @@ def instant_criterion(instrument: Instrument, area: float, n_pixels: int = 256) 
     """
     conditions = ExposureConditions.of_instrument(instrument, area)
     still = replace(conditions, exposure=0.0, wind=0.0, wavelengths=None, weights=None)
+    return _criterion(instrument, area, n_pixels, still.keywords(instrument.site.r0, instrument.site.outer_scale))
+
+
+def _criterion(instrument: Instrument, area: float, n_pixels: int, known: dict[str, Any]) -> TurbulentMSE:
     return TurbulentMSE(
-        *(instrument.grid(n_pixels), instrument.object_psd(area), instrument.noise_psd(area), instrument.frames),
-        **still.keywords(instrument.site.r0, instrument.site.outer_scale),
+        instrument.grid(n_pixels), instrument.object_psd(area), instrument.noise_psd(area), instrument.frames, **known
     )
 
 

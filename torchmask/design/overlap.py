@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torchmask.design.early_gradient import EarlyGradient
 from torchmask.optics.shape_base import Patches, Shape
 
 # pixels of patches in work at a time: what a cache holds, and what amortises the launches of kernels
@@ -100,8 +101,8 @@ def baseline_mse(centers: Tensor, weight: Tensor, ratio: Tensor, geometry: Geome
     return _BaselineMSE.apply(centers, weight, ratio, geometry, differentiate)[0]  # type: ignore[no-any-return]
 
 
-class _BaselineMSE(torch.autograd.Function):
-    """`baseline_mse` and, if requested, its gradient, which the backward pass only scales."""
+class _BaselineMSE(EarlyGradient):
+    """`baseline_mse` and, if requested, its gradient."""
 
     @staticmethod
     def forward(
@@ -115,17 +116,6 @@ class _BaselineMSE(torch.autograd.Function):
         chunks = centers.split(math.ceil(len(centers) / n_chunks)) if n_chunks > 1 else (centers,)
         parts = [_mse_and_gradient(chunk, weight, ratio, geometry, plan, differentiate) for chunk in chunks]
         return torch.cat([value for value, _ in parts]), torch.cat([gradient for _, gradient in parts])
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
-        centers, gradient = inputs[0], output[1]
-        ctx.mark_non_differentiable(gradient)
-        ctx.save_for_backward(centers, gradient)
-
-    @staticmethod
-    def backward(ctx: Any, *grad: Tensor) -> tuple[Tensor, None, None, None, None]:
-        centers, gradient = ctx.saved_tensors
-        return grad[0][:, None, None] * DifferentiatedOnce.apply(gradient, centers), None, None, None, None
 
     @staticmethod
     def vmap(
@@ -145,24 +135,6 @@ class _BaselineMSE(torch.autograd.Function):
         found = _BaselineMSE.apply(rows.flatten(0, 1), weight, ratio, geometry, differentiate)
         value, gradient = (part.reshape(len(rows), -1, *part.shape[1:]) for part in found)
         return (value, gradient), (0, 0)
-
-
-class DifferentiatedOnce(torch.autograd.Function):
-    """A gradient that raises an error when it is differentiated, where torch would give zero Hessians silently."""
-
-    generate_vmap_rule = True
-
-    @staticmethod
-    def forward(gradient: Tensor, centers: Tensor) -> Tensor:
-        return gradient.view_as(gradient)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
-        pass
-
-    @staticmethod
-    def backward(ctx: Any, *grad: Tensor) -> tuple[Tensor, Tensor]:
-        raise RuntimeError("MSE_a has a first derivative only: take differences of its gradient for a Hessian")
 
 
 def _mse_and_gradient(
