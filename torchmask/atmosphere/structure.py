@@ -70,7 +70,7 @@ class StructureFunction:
         # The offset, a billionth of r0 squared, keeps the derivative finite at 0.
         if math.isinf(self.outer_scale):
             unit = squared * (STRUCTURE_CONSTANT**1.2 / self.r0**2) + 1e-18
-            return unit * torch.exp(unit.log() * (-1 / 6))  # unit^(5/6): a power takes twice as long
+            return unit.log().mul_(5 / 6).exp_()  # a power takes twice as long
         unit = squared * (1 / self.r0**2) + 1e-18
         longest = min(self.reach, _SATURATED * self.outer_scale)
         root = torch.exp(unit.clamp(max=(longest / self.r0) ** 2).log() / 6)  # (r / r0)^(1/3)

@@ -12,14 +12,12 @@ them in one place.
 
 from __future__ import annotations
 
-import itertools
-import math
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from torchmask.design.common_pixels import CommonPixels
 from torchmask.design.frequency_plane import FrequencyPlane
 from torchmask.design.lens_patches import Lenses
 from torchmask.design.overlap import Geometry
@@ -27,7 +25,6 @@ from torchmask.design.pair_coherence import PairCoherence
 
 _SMALLEST = 5e-4  # products T T' exp(-Q / 2) below, as estimated, are left out
 _RICH = 0.005  # of those that are never larger the coherence is taken to be constant
-_SIZES = 4  # of windows, along either axis
 _NODE = 0.4  # of the hole's reach: where the parabolas are fixed, as lenses transmit little further out
 _NOTHING, _MOST = 1e-30, 10.0  # coherence, and logarithm of it over `far`, that no pixel with light goes beyond
 
@@ -76,39 +73,13 @@ class LensPairs:
         own = pairs.first == pairs.second  # their own opposite
         nodes = (nodes * torch.where(own, 1.0, 2.0).to(nodes)[:, None]).clamp(min=_NOTHING).log().unflatten(1, (3, 3))
         middle, step = middle[one], step[one]
-        firsts, seconds, targets, logarithms = [], [], [], []
-        for some, corner, n_rows, n_columns in self._windows(lenses, pairs):
-            part = Entries(*(entry[some] for entry in pairs))
-            size = (n_rows, n_columns)
-            firsts.append(_at_pixels(lenses, part.mask, part.first, torch.ones_like(part.sign), corner, size))
-            seconds.append(_at_pixels(lenses, part.mask, part.second, part.sign, corner, size))
-            target = self.plane.index(corner, n_rows, n_columns) + part.mask[:, None, None] * self.plane.n_pixels
-            targets.append(target.flatten())
-            start, unit = (corner * self.pixel - middle[some]) / step[some], self.pixel / step[some]
-            logarithms.append(_parabola(nodes[some], start, unit, n_rows, n_columns).flatten())
-        coherence = torch.cat(logarithms).clamp(max=_MOST).exp()
-        layers = torch.nn.functional.pad(lenses.values, (1, 1, 1, 1)).flatten(1)
-        at, product = torch.cat(firsts + seconds), torch.zeros_like(coherence)
-        for layer in layers:
-            product = torch.addcmul(product, *layer.index_select(0, at).chunk(2))
-        return torch.cat(targets), product * coherence
-
-    def _windows(self, lenses: Lenses, pairs: Entries) -> Iterator[tuple[Tensor, Tensor, int, int]]:
-        """Yield the pairs whose patches have about as many rows and columns in common: which they are, the first common
-        pixel (S, 2), rows and columns."""
-        corner, end = [], []
-        for lens, sign in ((pairs.first, torch.ones_like(pairs.sign)), (pairs.second, pairs.sign)):
-            first, size = lenses.corner[pairs.mask, lens], lenses.size[pairs.mask, lens]
-            corner.append(torch.where(sign[:, None] > 0, first, 1 - first - size))
-            end.append(corner[-1] + size)
-        first = torch.maximum(*corner)
-        common = torch.minimum(*end) - first
-        steps = [math.ceil(n / _SIZES) for n in lenses.values.shape[:2:-1]]
-        sizes = (common / common.new_tensor(steps)).ceil()  # of the windows, in steps
-        for column, row in itertools.product(range(1, _SIZES + 1), repeat=2):
-            some = ((sizes[:, 0] == column) & (sizes[:, 1] == row)).nonzero()[:, 0]
-            if len(some) > 0:
-                yield some, first[some], row * steps[1], column * steps[0]
+        pixels = CommonPixels.of(lenses, self.plane, pairs.mask, pairs.first, pairs.second, pairs.sign)
+        start, unit = (pixels.corner * self.pixel - middle) / step, self.pixel / step
+        logarithm = _parabolas(nodes, start, unit, pixels)
+        coherence, product = logarithm.clamp(max=_MOST).exp(), torch.zeros_like(logarithm)
+        for layer in lenses.values.flatten(1):
+            product = torch.addcmul(product, layer.index_select(0, pixels.first), layer.index_select(0, pixels.second))
+        return pixels.target, product * coherence
 
     def _select(self, lenses: Lenses, baselines: Tensor, centers: Tensor) -> tuple[Entries, Tensor]:
         """Return the pairs that share something, and about the most that each gives anywhere."""
@@ -163,17 +134,26 @@ class LensPairs:
         return torch.where((lens == 0)[:, None], hole, lenses.middle[entries.mask, lens])
 
 
-def _parabola(nodes: Tensor, start: Tensor, step: Tensor, n_rows: int, n_columns: int) -> Tensor:
-    """Return values at 3 x 3 nodes (S, y, x), interpolated by a polynomial on patches (S, rows, columns).
+def _parabolas(nodes: Tensor, start: Tensor, step: Tensor, pixels: CommonPixels) -> Tensor:
+    """Return values at 3 x 3 nodes (S, y, x) of pairs, interpolated by a polynomial to their pixels (P,).
 
     The first pixel lies at `start` (S, 2), the others are `step` (S, 2) apart, in units of the nodes' distance.
     """
     rows = _coefficients(nodes, start[:, 1:], step[:, 1:])  # (S, 3, x)
     both = _coefficients(rows.transpose(1, 2), start[:, :1], step[:, :1])  # (S, 3 of x, 3 of y)
-    row, column = (torch.arange(n, dtype=nodes.dtype, device=nodes.device) for n in (n_rows, n_columns))
-    powers = [[(row**j)[:, None] * (column**i) for j in range(3)] for i in range(3)]
-    matrix = torch.stack([torch.stack(some) for some in powers]).flatten(0, 1).flatten(1)
-    return (both.flatten(1) @ matrix).unflatten(1, (n_rows, n_columns))
+    row = torch.arange(int(pixels.row.max()) + 1, device=nodes.device)
+    column = torch.arange(len(pixels.counts), device=nodes.device)
+    lines = (both @ _powers(row, nodes.dtype)).flatten()  # (S, 3 of x, rows)
+    parts = torch.arange(3, device=nodes.device)
+    index = (pixels.pair[:, None] * 3 + parts) * len(row) + pixels.row[:, None]
+    lines = lines.index_select(0, index.flatten()).view(-1, 3)
+    powers = _powers(column, nodes.dtype)
+    return torch.cat([(lines[some] @ powers[:, :width]).flatten() for some, _, width in pixels.blocks()])
+
+
+def _powers(number: Tensor, dtype: torch.dtype) -> Tensor:
+    """Return the powers 0, 1 and 2 (3, n) of numbers (n,)."""
+    return torch.stack([number**0, number, number**2]).to(dtype)
 
 
 def _coefficients(nodes: Tensor, start: Tensor, step: Tensor) -> Tensor:
@@ -182,23 +162,3 @@ def _coefficients(nodes: Tensor, start: Tensor, step: Tensor) -> Tensor:
     slope, curvature = (above - below) / 2, (above + below) / 2 - middle
     at_start = middle + start * (slope + start * curvature)
     return torch.stack([at_start, step * (slope + 2 * start * curvature), step**2 * curvature], 1)
-
-
-def _at_pixels(
-    lenses: Lenses, mask: Tensor, lens: Tensor, sign: Tensor, corner: Tensor, size: tuple[int, int]
-) -> Tensor:
-    """Return where lenses (S,) with a border of one dark pixel have the pixels of patches, (S * rows * columns,).
-
-    The patches are of one `size`, and their first pixels are `corner` (S, 2). Lenses are turned by half a turn where
-    their sign is -1.
-    """
-    rows, columns = lenses.root.shape[-2:]
-    own, sign = lenses.corner[mask, lens].long(), sign[:, None]
-    y, x = (
-        (sign * (corner[:, axis, None].long() + torch.arange(n, device=sign.device)) - own[:, axis, None]).clamp(
-            -1, most
-        )
-        for axis, n, most in ((1, size[0], rows), (0, size[1], columns))
-    )
-    start = ((mask * lenses.root.shape[1] + lens) * (rows + 2) + 1) * (columns + 2) + 1
-    return ((start[:, None] + y * (columns + 2))[..., None] + x[:, None]).flatten()

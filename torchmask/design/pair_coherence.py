@@ -12,6 +12,7 @@ is known by its second moments, to which the exposure adds those of the drift: n
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,15 +20,22 @@ from torch import Tensor
 from torchmask.atmosphere.colour_coherence import ColourCoherence, colour_loss
 from torchmask.atmosphere.seeing import Seeing
 from torchmask.atmosphere.structure import StructureFunction
+from torchmask.design.early_gradient import by_chunks
 from torchmask.design.overlap import Geometry
 from torchmask.design.spline_table import SplineTable
 
 _KURTOSIS = 2.5  # along one axis, of the separation of two points of two discs
-_POINTS = [
+_PLACES = [
     (i * math.sqrt(_KURTOSIS), (1 - abs(i)) * (1 - 1 / _KURTOSIS) + abs(i) / (2 * _KURTOSIS)) for i in (-1, 0, 1)
 ]
+_POINTS = [(i, j, a * b) for i, a in _PLACES for j, b in _PLACES]
+# what the exponent sums, by the signs of the baselines that are added to a separation, and the factor of the structure
+# function there: -Q(b, s) / 2, and the same of two colours, b being the mean and half the difference of their baselines
+_ONE_COLOUR = [(1, 0.5), (-1, 0.5), (0, -1.0)]
+_TWO_COLOURS = [(1, 0, 0.5), (-1, 0, 0.5), (0, 1, -0.5), (0, -1, -0.5)]
 _LIGHT = 0.13  # mean square of a place in a lens's T, a Gaussian here, along either axis, over the hole's diameter^2
 _STEPS = 4  # of the spline to a hole
+_CHUNK = 2**12  # baselines in work at a time: few enough for a cache, enough to amortise launches
 
 
 class PairCoherence:
@@ -46,6 +54,13 @@ class PairCoherence:
         device: torch.device,
     ) -> None:
         self.reach: float = geometry.reach
+        terms = _ONE_COLOUR if colours is None else _TWO_COLOURS
+        # (terms * points, axes): the displacements of each term, over the middles' separation, the axes of the lenses'
+        # own separations, and the baselines
+        rows = [(1.0, i, j, *signs) for *signs, _ in terms for i, j, _ in _POINTS]
+        self.displacements: Tensor = torch.tensor(rows, dtype=torch.float64).to(device, dtype)
+        self.factors: list[float] = [factor for *_, factor in terms]
+        self.weights: Tensor = torch.tensor([weight for *_, weight in _POINTS], dtype=torch.float64).to(device, dtype)
         points, weights = geometry.shape.quadrature(4, geometry.diameter)
         self.variance: float = float((weights @ points**2).mean())  # of the points of a hole, along either axis [m^2]
         steps, shares = seeing.drift()
@@ -62,18 +77,12 @@ class PairCoherence:
 
     def far(self, x: Tensor, y: Tensor) -> Tensor:
         """Return a factor (...) that follows exp(-D), the coherence of far lenses, where that is not small."""
-        d = self.structure.of_square(x * x + y * y)
-        return torch.exp(-d / (1 + d / 3))
+        return torch.exp(_log_far(self._structure(x, y)))
 
-    def of_points(self, bx: Tensor, by: Tensor, sx: Tensor, sy: Tensor, own: Tensor | None = None) -> Tensor:
-        """Return exp(-Q(b, s) / 2) (...) for pairs of points s apart at the reference wavelength.
-
-        own : the structure function of b, if it is known already
-        """
-        structure = self.structure.of_square
-        own = structure(bx * bx + by * by) if own is None else own
-        crossed = structure((sx + bx) ** 2 + (sy + by) ** 2) + structure((sx - bx) ** 2 + (sy - by) ** 2)
-        return torch.exp(crossed / 2 - own - structure(sx * sx + sy * sy))
+    def of_points(self, bx: Tensor, by: Tensor, sx: Tensor, sy: Tensor) -> Tensor:
+        """Return exp(-Q(b, s) / 2) (...) for pairs of points s apart at the reference wavelength."""
+        crossed = self._structure(sx + bx, sy + by) + self._structure(sx - bx, sy - by)
+        return torch.exp(crossed / 2 - self._structure(bx, by) - self._structure(sx, sy))
 
     def around(self, first: Tensor, second: Tensor, separation: Tensor, step: Tensor, n: int) -> Tensor:
         """Return the coherence over `far`, (E, rows, columns), at n x n baselines around that midway.
@@ -82,84 +91,63 @@ class PairCoherence:
         are `step` (E, 2) apart, all in m.
         """
         nodes = torch.arange(n, dtype=first.dtype, device=first.device) - (n - 1) / 2
-        middle = (first + second) / 2
-        zero = torch.zeros(n, n, dtype=first.dtype, device=first.device)
-        bx = middle[:, :1, None] + step[:, :1, None] * nodes + zero
-        by = middle[:, 1:, None] + step[:, 1:, None] * nodes[:, None] + zero
-        sx, sy = separation[:, :1, None], separation[:, 1:, None]
-        if self.colours is None:
-            points = self._points(bx, by, bx, by, first, second, sx, sy)
-            return self._of_one_colour(bx, by, points) / self.far(bx, by)
-        one, other = self._phases(bx, by, first), self._phases(bx, by, second)
-        points = self._points(bx / one, by / one, bx / other, by / other, first, second, sx, sy)
-        return self._of_two_colours(bx, by, one, other, points) / self.far(bx, by)
+        nodes = torch.stack(torch.meshgrid(nodes, nodes, indexing="xy"), -1)
+        first, second, separation, step = (one[:, None, None] for one in (first, second, separation, step))
+        parts = torch.broadcast_tensors((first + second) / 2 + step * nodes, first, second, separation)
+        found = by_chunks(self._over_far, torch.stack(parts, -2).flatten(0, 2), _CHUNK)
+        return found.view(-1, n, n)
 
-    def _points(
-        self,
-        x: Tensor,
-        y: Tensor,
-        other_x: Tensor,
-        other_y: Tensor,
-        first: Tensor,
-        second: Tensor,
-        sx: Tensor,
-        sy: Tensor,
-    ) -> list[tuple[float, Tensor, Tensor]]:
-        """Return weights and x, y of separations that stand for those of two lenses at their baselines."""
+    def _over_far(self, places: Tensor) -> Tensor:
+        """Return the coherence over `far` (Q,) at baselines of two lenses, which is the first of `places` (Q, 4, 2) [m];
+        the others are the lenses' own, and the separation of their middles."""
+        (bx, by), first, second, separation = places.permute(1, 2, 0).contiguous()
+        if self.colours is None:
+            axes = self._axes(bx - first[0], by - first[1], bx - second[0], by - second[1])
+            known, found = -self._structure(bx, by), self._changing([separation, *axes, (bx, by)])
+        else:
+            one, other = self._phases(bx, by, first), self._phases(bx, by, second)
+            axes = self._axes(bx / one - first[0], by / one - first[1], bx / other - second[0], by / other - second[1])
+            mean, half = (1 / one + 1 / other) / 2, (1 / one - 1 / other) / 2
+            mx, my, hx, hy = bx * mean, by * mean, bx * half, by * half
+            own = self._structure(mx + hx, my + hy) * one**2 + self._structure(mx - hx, my - hy) * other**2
+            second, fourth = self.colours(torch.stack([bx, by], -1)[None] / ((one + other) / 2)[:, None])[0].unbind(-1)
+            known = colour_loss(second, fourth, one, other) - own / 2
+            found = self._changing([separation, *axes, (mx, my), (hx, hy)]) * (one * other)
+        return self.weights @ torch.exp(found + (known - _log_far(self._structure(bx, by))))
+
+    def _axes(self, x: Tensor, y: Tensor, other_x: Tensor, other_y: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Return x and y (Q,) of the two axes in which `_POINTS` count, for lenses at the places (x, y)."""
         xx, xy, yy = (
             one + other + drift
-            for one, other, drift in zip(
-                self._moments(x - first[:, :1, None], y - first[:, 1:, None]),
-                self._moments(other_x - second[:, :1, None], other_y - second[:, 1:, None]),
-                self.drift,
-                strict=True,
-            )
+            for one, other, drift in zip(self._moments(x, y), self._moments(other_x, other_y), self.drift, strict=True)
         )
         # the symmetric square root: a mask that is turned by 90 degrees has the same points
         root = torch.sqrt((xx * yy - xy**2).clamp(min=1e-6 * self.variance**2))
         trace = torch.sqrt(xx + yy + 2 * root)
-        along, skew, across = (xx + root) / trace, xy / trace, (yy + root) / trace
-        return [
-            (share * other, sx + i * along + j * skew, sy + i * skew + j * across)
-            for i, share in _POINTS
-            for j, other in _POINTS
-        ]
+        skew = xy / trace
+        return [((xx + root) / trace, skew), (skew, (yy + root) / trace)]
 
-    def _of_one_colour(self, bx: Tensor, by: Tensor, points: list[tuple[float, Tensor, Tensor]]) -> Tensor:
-        own, total = self.structure.of_square(bx * bx + by * by), torch.zeros_like(bx)
-        for weight, sx, sy in points:
-            total = total + weight * self.of_points(bx, by, sx, sy, own)
+    def _changing(self, axes: list[Any]) -> Tensor:
+        """Return the part of the exponent (points, Q) that changes with the points' separation, over the product of the
+        phases, by x and y (Q,) of all that `displacements` count in."""
+        x, y = (self.displacements @ torch.stack(parts) for parts in zip(*axes, strict=True))
+        terms = self._structure(x, y).unflatten(0, (len(self.factors), -1))
+        total = terms[0] * self.factors[0]
+        for term, factor in zip(terms[1:], self.factors[1:], strict=True):
+            total = torch.add(total, term, alpha=factor)
         return total
 
-    def _of_two_colours(
-        self, bx: Tensor, by: Tensor, one: Tensor, other: Tensor, points: list[tuple[float, Tensor, Tensor]]
-    ) -> Tensor:
-        """Return the coherence of light whose phases are `one` and `other` times those at the reference wavelength,
-        over what the same two colours have in common in the same lens, which the modes of the lenses know."""
-        assert self.colours is not None
-        structure = self.structure.of_square
-        mean, half = (1 / one + 1 / other) / 2, (1 / one - 1 / other) / 2
-        mx, my, hx, hy = bx * mean, by * mean, bx * half, by * half
-        own = (
-            structure((mx + hx) ** 2 + (my + hy) ** 2) * one**2 + structure((mx - hx) ** 2 + (my - hy) ** 2) * other**2
-        )
-        middle = torch.stack([bx, by], -1) / ((one + other) / 2)[..., None]
-        second, fourth = self.colours(middle.flatten(1, 2)).unflatten(1, bx.shape[1:]).unbind(-1)
-        known = colour_loss(second, fourth, one, other) - own / 2
-        total = torch.zeros_like(bx)
-        for weight, sx, sy in points:
-            crossed = structure((sx + mx) ** 2 + (sy + my) ** 2) + structure((sx - mx) ** 2 + (sy - my) ** 2)
-            parallel = structure((sx + hx) ** 2 + (sy + hy) ** 2) + structure((sx - hx) ** 2 + (sy - hy) ** 2)
-            total = total + weight * torch.exp(known + one * other / 2 * (crossed - parallel))
-        return total
+    def _structure(self, x: Tensor, y: Tensor) -> Tensor:
+        """Return the structure function of displacements (x, y) (...) [m]."""
+        return self.structure.of_square(torch.addcmul(x * x, y, y))
 
     def _phases(self, bx: Tensor, by: Tensor, lens: Tensor) -> Tensor:
-        """Return the phases (E, rows, columns), over those at the reference wavelength, of the light of a band that
-        lenses (E, 2) transmit, on average."""
-        inverse = 1 / self.scales[:, None, None]
-        x, y = (at[:, None] * inverse - lens[:, axis, None, None, None] for axis, at in enumerate((bx, by)))
-        brightness = self.shares.log()[:, None, None] - (x * x + y * y) / (2 * _LIGHT * self.reach**2)
-        return (torch.softmax(brightness, 1) * self.scales[:, None, None]).sum(1)
+        """Return the phases (Q,), over those at the reference wavelength, of the light of a band that lenses (2, Q)
+        transmit, on average."""
+        inverse = 1 / self.scales[:, None]
+        x, y = bx * inverse - lens[0], by * inverse - lens[1]
+        brightness = self.shares.log()[:, None] - (x * x + y * y) / (2 * _LIGHT * self.reach**2)
+        return (torch.softmax(brightness, 0) * self.scales[:, None]).sum(0)
 
     def _moments(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the moments xx, xy and yy (...) [m^2] of the lens at the place (x, y).
@@ -173,3 +161,8 @@ class PairCoherence:
         height, width = inside * (1 + 0.6 * r), inside * inside * (1 - 0.1 * r)
         narrow, base = (width - height) / (r * r) * self.variance, height * self.variance
         return base + narrow * x * x, narrow * x * y, base + narrow * y * y
+
+
+def _log_far(structure: Tensor) -> Tensor:
+    """Return the logarithm (...) of `PairCoherence.far` where the structure function is D."""
+    return -structure / (1 + structure / 3)
