@@ -16,7 +16,7 @@ DISTANCE = torch.logspace(-5, 1.4, 500, dtype=torch.float64)
 def test_it_is_that_of_the_bessel_function(outer_scale, reach):
     distance = DISTANCE[reach >= DISTANCE]
     exact = von_karman_structure_function(distance, 0.1, outer_scale)
-    found = StructureFunction(0.1, outer_scale, reach).of_square(distance**2)
+    found = StructureFunction(0.1, outer_scale, reach).at(distance, torch.zeros_like(distance))
     assert (found / exact - 1).abs().max() < 1e-7
 
 
@@ -44,10 +44,10 @@ def test_gradcheck_with_the_origin(outer_scale):
 @pytest.mark.parametrize("outer_scale", [2.0, math.inf])
 def test_single_precision(outer_scale):
     structure = StructureFunction(0.1, outer_scale)
-    found = structure.of_square(DISTANCE.float() ** 2)
+    found = structure.at(DISTANCE.float(), torch.zeros_like(DISTANCE).float())
     assert found.dtype == torch.float32
     # 48 steps of a recurrence of terms up to a few times the result, whose smallest part is 1e-3 of its largest
-    assert (found / structure.of_square(DISTANCE**2) - 1)[DISTANCE < 6].abs().max() < 1e-3
+    assert (found / structure.at(DISTANCE, torch.zeros_like(DISTANCE)) - 1)[DISTANCE < 6].abs().max() < 1e-3
 
 
 @pytest.mark.parametrize(

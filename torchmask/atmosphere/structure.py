@@ -63,15 +63,16 @@ class StructureFunction:
 
         It has the dtype of `displacement` and is differentiable in it, with gradient 0 at 0.
         """
-        return self.of_square((displacement**2).sum(-1))
+        return self.at(*displacement.unbind(-1))
 
-    def of_square(self, squared: Tensor) -> Tensor:
-        """Return the structure function at the squared distance (...) [m^2]."""
+    def at(self, x: Tensor, y: Tensor) -> Tensor:
+        """Return the structure function (...) at displacements (x, y) (...) [m]."""
+        squared = (x * x).addcmul_(y, y)  # in place where autograd permits it: arrays that stay in the cache
         # The offset, a billionth of r0 squared, keeps the derivative finite at 0.
         if math.isinf(self.outer_scale):
-            unit = squared * (STRUCTURE_CONSTANT**1.2 / self.r0**2) + 1e-18
+            unit = squared.mul_(STRUCTURE_CONSTANT**1.2 / self.r0**2).add_(1e-18)
             return unit.log().mul_(5 / 6).exp_()  # a power takes twice as long
-        unit = squared * (1 / self.r0**2) + 1e-18
+        unit = squared.mul_(1 / self.r0**2).add_(1e-18)
         longest = min(self.reach, _SATURATED * self.outer_scale)
         root = torch.exp(unit.clamp(max=(longest / self.r0) ** 2).log() / 6)  # (r / r0)^(1/3)
         series = _series(longest / self.outer_scale)

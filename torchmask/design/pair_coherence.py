@@ -77,12 +77,12 @@ class PairCoherence:
 
     def far(self, x: Tensor, y: Tensor) -> Tensor:
         """Return a factor (...) that follows exp(-D), the coherence of far lenses, where that is not small."""
-        return torch.exp(_log_far(self._structure(x, y)))
+        return torch.exp(_log_far(self.structure.at(x, y)))
 
     def of_points(self, bx: Tensor, by: Tensor, sx: Tensor, sy: Tensor) -> Tensor:
         """Return exp(-Q(b, s) / 2) (...) for pairs of points s apart at the reference wavelength."""
-        crossed = self._structure(sx + bx, sy + by) + self._structure(sx - bx, sy - by)
-        return torch.exp(crossed / 2 - self._structure(bx, by) - self._structure(sx, sy))
+        crossed = self.structure.at(sx + bx, sy + by) + self.structure.at(sx - bx, sy - by)
+        return torch.exp(crossed / 2 - self.structure.at(bx, by) - self.structure.at(sx, sy))
 
     def around(self, first: Tensor, second: Tensor, separation: Tensor, step: Tensor, n: int) -> Tensor:
         """Return the coherence over `far`, (E, rows, columns), at n x n baselines around that midway.
@@ -100,27 +100,25 @@ class PairCoherence:
     def _over_far(self, places: Tensor) -> Tensor:
         """Return the coherence over `far` (Q,) at baselines of two lenses, which is the first of `places` (Q, 4, 2) [m];
         the others are the lenses' own, and the separation of their middles."""
-        (bx, by), first, second, separation = places.permute(1, 2, 0).contiguous()
+        (bx, by), *lenses, separation = places.permute(1, 2, 0).contiguous()
+        x, y = torch.stack(lenses, 1)
         if self.colours is None:
-            axes = self._axes(bx - first[0], by - first[1], bx - second[0], by - second[1])
-            known, found = -self._structure(bx, by), self._changing([separation, *axes, (bx, by)])
+            axes = self._axes(bx - x, by - y)
+            known, found = -self.structure.at(bx, by), self._changing([separation, *axes, (bx, by)])
         else:
-            one, other = self._phases(bx, by, first), self._phases(bx, by, second)
-            axes = self._axes(bx / one - first[0], by / one - first[1], bx / other - second[0], by / other - second[1])
+            one, other = phases = self._phases(bx, by, x, y)
+            axes = self._axes(bx / phases - x, by / phases - y)
             mean, half = (1 / one + 1 / other) / 2, (1 / one - 1 / other) / 2
             mx, my, hx, hy = bx * mean, by * mean, bx * half, by * half
-            own = self._structure(mx + hx, my + hy) * one**2 + self._structure(mx - hx, my - hy) * other**2
+            own = self.structure.at(mx + hx, my + hy) * one**2 + self.structure.at(mx - hx, my - hy) * other**2
             second, fourth = self.colours(torch.stack([bx, by], -1)[None] / ((one + other) / 2)[:, None])[0].unbind(-1)
             known = colour_loss(second, fourth, one, other) - own / 2
             found = self._changing([separation, *axes, (mx, my), (hx, hy)]) * (one * other)
-        return self.weights @ torch.exp(found + (known - _log_far(self._structure(bx, by))))
+        return self.weights @ torch.exp(found + (known - _log_far(self.structure.at(bx, by))))
 
-    def _axes(self, x: Tensor, y: Tensor, other_x: Tensor, other_y: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Return x and y (Q,) of the two axes in which `_POINTS` count, for lenses at the places (x, y)."""
-        xx, xy, yy = (
-            one + other + drift
-            for one, other, drift in zip(self._moments(x, y), self._moments(other_x, other_y), self.drift, strict=True)
-        )
+    def _axes(self, x: Tensor, y: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Return x and y (Q,) of the two axes in which `_POINTS` count, for two lenses at the places (x, y) (2, Q)."""
+        xx, xy, yy = (sum(parts) + drift for parts, drift in zip(self._moments(x, y), self.drift, strict=True))
         # the symmetric square root: a mask that is turned by 90 degrees has the same points
         root = torch.sqrt((xx * yy - xy**2).clamp(min=1e-6 * self.variance**2))
         trace = torch.sqrt(xx + yy + 2 * root)
@@ -131,23 +129,19 @@ class PairCoherence:
         """Return the part of the exponent (points, Q) that changes with the points' separation, over the product of the
         phases, by x and y (Q,) of all that `displacements` count in."""
         x, y = (self.displacements @ torch.stack(parts) for parts in zip(*axes, strict=True))
-        terms = self._structure(x, y).unflatten(0, (len(self.factors), -1))
+        terms = self.structure.at(x, y).unflatten(0, (len(self.factors), -1))
         total = terms[0] * self.factors[0]
         for term, factor in zip(terms[1:], self.factors[1:], strict=True):
             total = torch.add(total, term, alpha=factor)
         return total
 
-    def _structure(self, x: Tensor, y: Tensor) -> Tensor:
-        """Return the structure function of displacements (x, y) (...) [m]."""
-        return self.structure.of_square(torch.addcmul(x * x, y, y))
-
-    def _phases(self, bx: Tensor, by: Tensor, lens: Tensor) -> Tensor:
-        """Return the phases (Q,), over those at the reference wavelength, of the light of a band that lenses (2, Q)
-        transmit, on average."""
-        inverse = 1 / self.scales[:, None]
-        x, y = bx * inverse - lens[0], by * inverse - lens[1]
-        brightness = self.shares.log()[:, None] - (x * x + y * y) / (2 * _LIGHT * self.reach**2)
-        return (torch.softmax(brightness, 0) * self.scales[:, None]).sum(0)
+    def _phases(self, bx: Tensor, by: Tensor, x: Tensor, y: Tensor) -> Tensor:
+        """Return the phases (2, Q), over those at the reference wavelength, of the light of a band that lenses with the
+        baselines (x, y) (2, Q) transmit, on average."""
+        scales = self.scales[:, None, None]
+        x, y = bx / scales - x, by / scales - y
+        brightness = self.shares.log()[:, None, None] - (x * x + y * y) / (2 * _LIGHT * self.reach**2)
+        return (torch.softmax(brightness, 0) * scales).sum(0)
 
     def _moments(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the moments xx, xy and yy (...) [m^2] of the lens at the place (x, y).
