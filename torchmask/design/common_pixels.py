@@ -1,83 +1,121 @@
-"""The pixels that pairs of lenses have in common, row by row.
+"""The pixels that pairs of lenses have in common, row by row, and what the pairs share there.
 
-Rows are ordered by their length, so that those of one length make one block and none is padded.
+Rows are ordered by their length, so that those of one length make one block: none is padded, and a block stays in the
+cache from the pixels' places to their sums, forwards and backwards.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from torchmask.design.frequency_plane import FrequencyPlane
 from torchmask.design.lens_patches import Lenses
 
+_MOST = 10.0  # logarithm of the coherence over `far`, that no pixel with light goes beyond
+
 
 class CommonPixels(NamedTuple):
-    """R rows of P pixels that S pairs of lenses have in common, the shortest first.
+    """R rows of pixels that S pairs of lenses have in common, the shortest first.
 
     corner (S, 2) the first pixel of each pair; pair, row (R,) which pair a row belongs to, and which of its rows it is;
-    counts how many rows have 0, 1, 2 ... pixels; first, second, target (P,) where the values of either lens, of all
-    masks one after the other, and their planes have the pixels
+    sign (R,) -1 where the second lens is turned by half a turn; first, second, target (R,) where the values of either
+    lens, of all masks one after the other, and their planes have the first pixel; counts how many rows have 0, 1, 2 ...
+    pixels
     """
 
     corner: Tensor
     pair: Tensor
     row: Tensor
-    counts: list[int]
+    sign: Tensor
     first: Tensor
     second: Tensor
     target: Tensor
+    counts: list[int]
 
     @classmethod
     def of(
         cls, lenses: Lenses, plane: FrequencyPlane, mask: Tensor, first: Tensor, second: Tensor, sign: Tensor
     ) -> CommonPixels:
-        """Find those of the lenses `first` and `second` of a `mask` (S,); where `sign` (S,) is -1, the second one is
-        turned by half a turn."""
-        corner, size = lenses.corner[mask, first], lenses.size[mask, first]
-        own, extent = lenses.corner[mask, second], lenses.size[mask, second]
-        facing = torch.where(sign[:, None] > 0, own, 1 - own - extent)
+        """Find those of the lenses `first` and `second` of a `mask`, turned by half a turn where `sign` is -1; (S,)."""
+        rows, columns = lenses.values.shape[-2:]
+        first, second = (mask * lenses.values.shape[2] + lens for lens in (first, second))
+        corner, other = (lenses.corner.flatten(0, 1).index_select(0, lens) for lens in (first, second))
+        size, extent = (lenses.size.flatten(0, 1).index_select(0, lens) for lens in (first, second))
+        facing = torch.where(sign[:, None] > 0, other, 1 - other - extent)
         start = torch.maximum(corner, facing)
         n_columns, n_rows = (torch.minimum(corner + size, facing + extent) - start).clamp(min=0).long().unbind(-1)
         order = n_columns.argsort()
         n_rows = (n_rows * (n_columns > 0))[order]
         pair = order.repeat_interleave(n_rows)
         row = torch.arange(len(pair), device=pair.device) - (n_rows.cumsum(0) - n_rows).repeat_interleave(n_rows)
-        counts: list[int] = n_columns[pair].bincount().tolist()
 
-        rows, columns = lenses.values.shape[-2:]
-        n_lenses, (x, y) = lenses.values.shape[2], start.long().unbind(-1)
-        (left, top), (own_left, own_top) = corner.long().unbind(-1), own.long().unbind(-1)
-        places = torch.stack(
-            [
-                ((mask * n_lenses + first) * rows + y - top) * columns + x - left,
-                ((mask * n_lenses + second) * rows + sign * y - own_top) * columns + sign * x - own_left,
-                mask * plane.n_pixels + (y + plane.origin[0]) * plane.size[1] + x + plane.origin[1],
-            ],
-            -1,
+        (x, y), (left, top), (own_left, own_top) = (place.long().unbind(-1) for place in (start, corner, other))
+        places = (
+            ((first * rows + y - top) * columns + x - left, columns),
+            ((second * rows + sign * y - own_top) * columns + sign * x - own_left, sign * columns),
+            (mask * plane.n_pixels + plane.first(start), plane.size[1]),
         )
-        one = torch.ones_like(sign)
-        steps = torch.stack([one, sign, one], -1)
-        lines = steps * steps.new_tensor([columns, columns, plane.size[1]])
-        by_row = torch.addcmul(places.index_select(0, pair), lines.index_select(0, pair), row[:, None])
-        found = pair.new_empty(3, sum(width * n for width, n in enumerate(counts)))
-        step = sign.index_select(0, pair)[:, None]
-        result = cls(start, pair, row, counts, *found)
-        for some, pixels, width in result.blocks():
-            column = torch.arange(width, device=pair.device)
-            first_, second_, target_ = (part[pixels].view(-1, width) for part in found)
-            torch.add(by_row[some, :1], column, out=first_)
-            torch.addcmul(by_row[some, 1:2], step[some], column, out=second_)
-            torch.add(by_row[some, 2:], column, out=target_)
-        return result
+        by_row = [place.index_select(0, pair) for place, _ in places]
+        steps = [row * (step[pair] if isinstance(step, Tensor) else step) for _, step in places]
+        counts: list[int] = n_columns[pair].bincount().tolist()
+        return cls(start, pair, row, sign[pair], *map(torch.add, by_row, steps), counts)
 
-    def blocks(self) -> Iterator[tuple[slice, slice, int]]:
-        """Yield rows of one length: which rows and which pixels they are, and their length."""
-        row = pixel = 0
+    def blocks(self) -> Iterator[tuple[slice, int, Tensor, Tensor, Tensor]]:
+        """Yield rows of one length: which they are, their length, and where the values of either lens and the planes
+        have their pixels, one row after the other."""
+        column, begin = torch.arange(len(self.counts), device=self.pair.device), 0
         for width, n in enumerate(self.counts):
-            if n > 0 and width > 0:
-                yield slice(row, row + n), slice(pixel, pixel + n * width), width
-            row, pixel = row + n, pixel + n * width
+            some, x, begin = slice(begin, begin + n), column[:width], begin + n
+            if n > 0:
+                first, target = (place[some, None] + x for place in (self.first, self.target))
+                second = torch.addcmul(self.second[some, None], self.sign[some, None], x)
+                yield some, width, first.flatten(), second.flatten(), target.flatten()
+
+
+class SharedLight(torch.autograd.Function):
+    """Planes (P,), the sum of the products of `values` (M, V) of both lenses times the coherence, in `pixels`.
+
+    `lines` (R, 3) are the coefficients of its logarithm in powers of the pixel's number, row by row.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, lines: Tensor, pixels: CommonPixels, n_pixels: int) -> Tensor:
+        ctx.save_for_backward(values, lines)
+        ctx.pixels = pixels
+        powers, planes = powers_of(len(pixels.counts), lines), values.new_zeros(n_pixels)
+        for some, width, first, second, target in pixels.blocks():
+            coherence = (lines[some] @ powers[:, :width]).clamp_(max=_MOST).exp_().flatten()
+            light = torch.zeros_like(coherence)
+            for layer in values:
+                light.addcmul_(layer.index_select(0, first), layer.index_select(0, second))
+            planes.scatter_add_(0, target, light.mul_(coherence))
+        return planes
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grad: Tensor) -> tuple[Tensor, Tensor, None, None]:
+        values, lines = ctx.saved_tensors
+        powers = powers_of(len(ctx.pixels.counts), lines)
+        by_value, by_line = torch.zeros_like(values), torch.zeros_like(lines)
+        for some, width, first, second, target in ctx.pixels.blocks():
+            logarithm = (lines[some] @ powers[:, :width]).flatten()
+            slope = logarithm.clamp(max=_MOST).exp_().mul_(grad[0].index_select(0, target))
+            light = torch.zeros_like(slope)
+            for layer, by_layer in zip(values, by_value, strict=True):
+                one, other = layer.index_select(0, first), layer.index_select(0, second)
+                light.addcmul_(one, other)
+                by_layer.scatter_add_(0, first, other.mul_(slope)).scatter_add_(0, second, one.mul_(slope))
+            light.mul_(slope).mul_(logarithm <= _MOST)
+            torch.mm(light.view(-1, width), powers[:, :width].T, out=by_line[some])
+        return by_value, by_line, None, None
+
+
+def powers_of(n: int, like: Tensor) -> Tensor:
+    """Return the powers 0, 1 and 2 (3, n) of the numbers below n."""
+    number = torch.arange(n, dtype=like.dtype, device=like.device)
+    return torch.stack([number**0, number, number**2])

@@ -58,10 +58,14 @@ class FrequencyPlane(NamedTuple):
 
     def index(self, corner: Tensor, n_rows: int, n_columns: int) -> Tensor:
         """Return the indices (..., rows, columns) of the pixels of patches whose first pixel is `corner` (..., 2)."""
-        pixel = corner.nan_to_num(0.0).long()  # NaN, of an optimiser that diverged, must not become an index
-        x = pixel[..., :1] + torch.arange(self.origin[1], self.origin[1] + n_columns, device=corner.device)
-        y = pixel[..., 1:] + torch.arange(self.origin[0], self.origin[0] + n_rows, device=corner.device)
-        return (y * self.size[1])[..., :, None] + x[..., None, :]
+        y = torch.arange(n_rows, device=corner.device) * self.size[1]
+        x = torch.arange(n_columns, device=corner.device)
+        return self.first(corner)[..., None, None] + (y[:, None] + x)
+
+    def first(self, corner: Tensor) -> Tensor:
+        """Return the index (...) of the pixel `corner` (..., 2)."""
+        x, y = corner.nan_to_num(0.0).long().unbind(-1)  # NaN, of an optimiser that diverged, must not become an index
+        return (y + self.origin[0]) * self.size[1] + (x + self.origin[1])
 
     def summed(self, index: Tensor, values: Tensor) -> Tensor:
         """Return planes (B, pixels): in each the sum of `values` (B, ...) at the pixels `index`, of the same shape."""

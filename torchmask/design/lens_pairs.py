@@ -17,7 +17,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchmask.design.common_pixels import CommonPixels
+from torchmask.design.common_pixels import CommonPixels, SharedLight, powers_of
 from torchmask.design.frequency_plane import FrequencyPlane
 from torchmask.design.lens_patches import Lenses
 from torchmask.design.overlap import Geometry
@@ -26,7 +26,7 @@ from torchmask.design.pair_coherence import PairCoherence
 _SMALLEST = 5e-4  # products T T' exp(-Q / 2) below, as estimated, are left out
 _RICH = 0.005  # of those that are never larger the coherence is taken to be constant
 _NODE = 0.4  # of the hole's reach: where the parabolas are fixed, as lenses transmit little further out
-_NOTHING, _MOST = 1e-30, 10.0  # coherence, and logarithm of it over `far`, that no pixel with light goes beyond
+_NOTHING = 1e-30  # coherence
 
 
 class Entries(NamedTuple):
@@ -49,14 +49,14 @@ class LensPairs:
     def __init__(self, geometry: Geometry, coherence: PairCoherence, plane: FrequencyPlane, pixel: Tensor) -> None:
         self.geometry, self.coherence, self.plane, self.pixel = geometry, coherence, plane, pixel
 
-    def __call__(self, lenses: Lenses, centers: Tensor) -> tuple[Tensor, Tensor]:
-        """Return where lenses share light, pixels (P,) of the planes of all masks one after the other, and what they
-        share over `far` (P,). It counts once more at the opposite frequencies."""
+    def __call__(self, lenses: Lenses, centers: Tensor) -> Tensor:
+        """Return what lenses share over `far`, on planes (B, pixels). It counts once more at the opposite frequencies."""
+        n_pixels = len(centers) * self.plane.n_pixels
         baselines = lenses.baseline * self.pixel
         with torch.no_grad():
             entries, largest = self._select(lenses, baselines, centers)
         if len(entries.mask) == 0:
-            return lenses.index.new_empty(0), centers.new_empty(0)
+            return centers.new_zeros(len(centers), self.plane.n_pixels)
         sign = entries.sign[:, None]
         first, second = baselines[entries.mask, entries.first], sign * baselines[entries.mask, entries.second]
         separation = self._middles(lenses, centers, entries, 0) - self._middles(lenses, centers, entries, 1)
@@ -75,11 +75,9 @@ class LensPairs:
         middle, step = middle[one], step[one]
         pixels = CommonPixels.of(lenses, self.plane, pairs.mask, pairs.first, pairs.second, pairs.sign)
         start, unit = (pixels.corner * self.pixel - middle) / step, self.pixel / step
-        logarithm = _parabolas(nodes, start, unit, pixels)
-        coherence, product = logarithm.clamp(max=_MOST).exp(), torch.zeros_like(logarithm)
-        for layer in lenses.values.flatten(1):
-            product = torch.addcmul(product, layer.index_select(0, pixels.first), layer.index_select(0, pixels.second))
-        return pixels.target, product * coherence
+        lines = _lines(nodes, start, unit, pixels)
+        found = SharedLight.apply(lenses.values.flatten(1), lines, pixels, n_pixels)
+        return found.view(len(centers), -1)  # type: ignore[no-any-return]
 
     def _select(self, lenses: Lenses, baselines: Tensor, centers: Tensor) -> tuple[Entries, Tensor]:
         """Return the pairs that share something, and about the most that each gives anywhere."""
@@ -134,26 +132,19 @@ class LensPairs:
         return torch.where((lens == 0)[:, None], hole, lenses.middle[entries.mask, lens])
 
 
-def _parabolas(nodes: Tensor, start: Tensor, step: Tensor, pixels: CommonPixels) -> Tensor:
-    """Return values at 3 x 3 nodes (S, y, x) of pairs, interpolated by a polynomial to their pixels (P,).
+def _lines(nodes: Tensor, start: Tensor, step: Tensor, pixels: CommonPixels) -> Tensor:
+    """Return the coefficients (R, 3), in powers of the pixel, of a polynomial through 3 x 3 nodes (S, y, x) on the rows
+    of pixels.
 
     The first pixel lies at `start` (S, 2), the others are `step` (S, 2) apart, in units of the nodes' distance.
     """
     rows = _coefficients(nodes, start[:, 1:], step[:, 1:])  # (S, 3, x)
     both = _coefficients(rows.transpose(1, 2), start[:, :1], step[:, :1])  # (S, 3 of x, 3 of y)
-    row = torch.arange(int(pixels.row.max()) + 1, device=nodes.device)
-    column = torch.arange(len(pixels.counts), device=nodes.device)
-    lines = (both @ _powers(row, nodes.dtype)).flatten()  # (S, 3 of x, rows)
-    parts = torch.arange(3, device=nodes.device)
-    index = (pixels.pair[:, None] * 3 + parts) * len(row) + pixels.row[:, None]
-    lines = lines.index_select(0, index.flatten()).view(-1, 3)
-    powers = _powers(column, nodes.dtype)
-    return torch.cat([(lines[some] @ powers[:, :width]).flatten() for some, _, width in pixels.blocks()])
-
-
-def _powers(number: Tensor, dtype: torch.dtype) -> Tensor:
-    """Return the powers 0, 1 and 2 (3, n) of numbers (n,)."""
-    return torch.stack([number**0, number, number**2]).to(dtype)
+    n_rows = int(pixels.row.max()) + 1
+    lines = (both @ powers_of(n_rows, nodes)).flatten()  # (S, 3 of x, rows)
+    powers = torch.arange(3, device=nodes.device)
+    index = (pixels.pair[:, None] * 3 + powers) * n_rows + pixels.row[:, None]
+    return lines.index_select(0, index.flatten()).view(-1, 3)
 
 
 def _coefficients(nodes: Tensor, start: Tensor, step: Tensor) -> Tensor:

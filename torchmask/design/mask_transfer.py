@@ -81,9 +81,8 @@ class MaskTransfer:
         # every patch counts twice in the end, at nu and at -nu
         power = torch.cat([power[:, :1] * (centers.shape[1] / 2), power[:, 1:]], 1)
         alone = self.plane.summed(lenses.index, power * self._kept(lenses, self.factors))
-        index, shared = self.pairs(lenses, centers)
-        together = alone.new_zeros(alone.numel()).scatter_add_(0, index, shared).view_as(alone)
-        return self.plane.folded(torch.addcmul(alone, together, self.far)) + self.central(centers)
+        together = torch.addcmul(alone, self.pairs(lenses, centers), self.far)
+        return self.plane.folded(together) + self.central(centers)
 
     def steady(self, centers: Tensor) -> Tensor:
         """Return N^4 times the sum over lenses of the square of the steady part of |OTF|^2 (B, H // 2 + 1, W)."""
