@@ -14,7 +14,7 @@ are scaled, as those of a band's other wavelengths, change both of its powers in
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -79,14 +79,20 @@ class SharedCoherence(NamedTuple):
     by_place: PolarTable
 
 
-def lens_functions(root: Tensor, x: Tensor, y: Tensor, scale: Tensor | float | None = None) -> list[Tensor]:
-    """Return the functions whose sum with the factors of `lens_coherence` is c, each of the shape of the arguments.
+def lens_sum(
+    factors: Iterable[Tensor], root: Tensor, x: Tensor, y: Tensor, scale: Tensor | float | None = None
+) -> Tensor:
+    """Return c, of the shape of the arguments, by the factors of `lens_coherence`.
 
     `root` is the square root of T; x and y are u over the holes' outer diameter. In a band, `scale` is that of the
-    phases, which c falls with, and two functions more are for it.
+    phases, which c falls with, and two factors more are for it.
     """
-    functions = [torch.ones_like(root), root, root * root, root * (x * x - y * y), root * (2 * x * y)]
-    return functions if scale is None else [*functions, (scale - 1) * root, (scale - 1) * root * root]
+    constant, linear, square, along, skew, *by_scale = factors
+    slope = torch.addcmul(linear, root, square)
+    slope.addcmul_(x * x - y * y, along).addcmul_(2 * x * y, skew)
+    if scale is not None:
+        slope.addcmul_(scale - 1, torch.addcmul(by_scale[0], root, by_scale[1]))
+    return torch.addcmul(constant, root, slope)
 
 
 def lens_coherence(
@@ -124,7 +130,9 @@ def lens_coherence(
             return (2 * total @ densities.T).exp() if steady else total @ densities.T
 
         x, y = (places / reach).unbind(-1)
-        functions = torch.stack(lens_functions(root, x, y, scale if scales else None), -1)
+        stretch = torch.full_like(root, scale) if scales else None
+        units = torch.eye(7 if scales else 5, dtype=torch.float64)
+        functions = torch.stack([lens_sum(unit, root, x, y, stretch) for unit in units], -1)
         rows.append(functions * weight[:, None])
         tables.append(_table(coherence, baselines, _PLACES, shape.is_round and seeing.is_isotropic) * weight)
     # in a narrow band some functions are nearly multiples of others, which "gelsy" may leave out wrongly

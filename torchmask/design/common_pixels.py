@@ -41,9 +41,11 @@ class CommonPixels(NamedTuple):
     def of(
         cls, lenses: Lenses, plane: FrequencyPlane, mask: Tensor, first: Tensor, second: Tensor, sign: Tensor
     ) -> CommonPixels:
-        """Find those of the lenses `first` and `second` of a `mask`, turned by half a turn where `sign` is -1; (S,)."""
+        """Find those of the lenses `first` and `second`, counted through all masks, of a `mask`; (S,) each.
+
+        The second lens is turned by half a turn where `sign` is -1.
+        """
         rows, columns = lenses.values.shape[-2:]
-        first, second = (mask * lenses.values.shape[2] + lens for lens in (first, second))
         corner, other = (lenses.corner.flatten(0, 1).index_select(0, lens) for lens in (first, second))
         size, extent = (lenses.size.flatten(0, 1).index_select(0, lens) for lens in (first, second))
         facing = torch.where(sign[:, None] > 0, other, 1 - other - extent)

@@ -32,14 +32,15 @@ _NOTHING = 1e-30  # coherence
 class Entries(NamedTuple):
     """E pairs of lenses: which mask, first and second lens, the sign of the second, and the place of what they give.
 
-    Pairs that share `slot` have the same baselines; `holes` (E, 2) says which holes the lenses at baseline 0 belong to.
+    Lenses are counted through all masks, and so is the `hole` to which a first lens at baseline 0 belongs; the second
+    one is never there. Pairs that share `slot` have the same baselines.
     """
 
     mask: Tensor
     first: Tensor
     second: Tensor
     sign: Tensor
-    holes: Tensor
+    hole: Tensor
     slot: Tensor
 
 
@@ -50,16 +51,13 @@ class LensPairs:
         self.geometry, self.coherence, self.plane, self.pixel = geometry, coherence, plane, pixel
 
     def __call__(self, lenses: Lenses, centers: Tensor) -> Tensor:
-        """Return what lenses share over `far`, on planes (B, pixels). It counts once more at the opposite frequencies."""
+        """Return what lenses share over `far`, on planes (B, pixels). It counts at the opposite frequencies too."""
         n_pixels = len(centers) * self.plane.n_pixels
-        baselines = lenses.baseline * self.pixel
         with torch.no_grad():
-            entries, largest = self._select(lenses, baselines, centers)
+            entries, largest = self._select(lenses, centers)
         if len(entries.mask) == 0:
             return centers.new_zeros(len(centers), self.plane.n_pixels)
-        sign = entries.sign[:, None]
-        first, second = baselines[entries.mask, entries.first], sign * baselines[entries.mask, entries.second]
-        separation = self._middles(lenses, centers, entries, 0) - self._middles(lenses, centers, entries, 1)
+        first, second, separation = self._places(entries, lenses, centers)
         middle = (first + second) / 2
         step = _NODE * (self.geometry.reach + self.coherence.spread / 2 * middle.abs())
         n_slots = int(entries.slot.max()) + 1
@@ -67,55 +65,53 @@ class LensPairs:
         for some, n in ((largest > _RICH, 3), (largest <= _RICH, 1)):
             found = self.coherence.around(first[some], second[some], separation[some], step[some], n).flatten(1)
             nodes = nodes.index_add(0, entries.slot[some], found.expand(-1, 9))
-        one = torch.zeros(n_slots, dtype=torch.long, device=sign.device)
-        one[entries.slot] = torch.arange(len(sign), device=sign.device)  # an entry of each slot
+        one = torch.zeros_like(entries.slot[:n_slots])
+        one[entries.slot] = torch.arange(len(largest), device=one.device)  # an entry of each slot
         pairs = Entries(*(part[one] for part in entries))
         own = pairs.first == pairs.second  # their own opposite
         nodes = (nodes * torch.where(own, 1.0, 2.0).to(nodes)[:, None]).clamp(min=_NOTHING).log().unflatten(1, (3, 3))
         middle, step = middle[one], step[one]
-        pixels = CommonPixels.of(lenses, self.plane, pairs.mask, pairs.first, pairs.second, pairs.sign)
+        pixels = CommonPixels.of(lenses, self.plane, *pairs[:4])
         start, unit = (pixels.corner * self.pixel - middle) / step, self.pixel / step
         lines = _lines(nodes, start, unit, pixels)
         found = SharedLight.apply(lenses.values.flatten(1), lines, pixels, n_pixels)
         return found.view(len(centers), -1)  # type: ignore[no-any-return]
 
-    def _select(self, lenses: Lenses, baselines: Tensor, centers: Tensor) -> tuple[Entries, Tensor]:
+    def _select(self, lenses: Lenses, centers: Tensor) -> tuple[Entries, Tensor]:
         """Return the pairs that share something, and about the most that each gives anywhere."""
-        n, count = centers.shape[1], baselines.shape[1]
-        upper = torch.ones(count, count, dtype=torch.bool, device=centers.device).triu(1)
+        n, count = centers.shape[1], lenses.baseline.shape[1]
+        one, other = torch.triu_indices(count, count, device=centers.device)
+        x, y = (lenses.baseline * self.pixel).unbind(-1)
         limit, found = (2 * self.geometry.reach) ** 2, []
-        x, y = baselines.unbind(-1)
-        for sign in (1, -1):
-            distance = (sign * x[:, None] - x[:, :, None]) ** 2 + (sign * y[:, None] - y[:, :, None]) ** 2
-            allowed = upper if sign > 0 else upper | torch.eye(count, dtype=torch.bool, device=centers.device)
-            allowed = allowed.clone()
-            if sign < 0:
-                allowed[0] = False  # the opposite of what the lenses at baseline 0 share with the others
-            pairs = ((distance < limit) & allowed).nonzero()
-            found.append(torch.cat([pairs, torch.full_like(pairs[:, :1], sign)], 1))
-        rows = torch.cat(found)
-        central = rows[:, 1] == 0
-        lone, short = rows[~central], rows[central]
-        holes = torch.arange(n, device=centers.device)
-        no_hole = lone.new_zeros(len(lone), 2)
-        entries = [torch.cat([lone, no_hole], 1)]
-        each = short.repeat_interleave(n, 0)
-        which = holes.repeat(len(short))[:, None]
-        entries.append(torch.cat([each, which, which], 1))
-        rows = torch.cat(entries)
-        result = Entries(rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3], rows[:, 4:], rows[:, 0])
-        largest = self._largest(result, lenses, baselines, centers)
+        # lenses at baseline 0 are their own opposites: what they share with another's opposite, they share with it
+        for sign, allowed in ((1, one < other), (-1, one > 0)):
+            i, j = one[allowed], other[allowed]
+            distance = (sign * x[:, i] - x[:, j]) ** 2 + (sign * y[:, i] - y[:, j]) ** 2
+            mask, pair = (distance < limit).nonzero().unbind(-1)
+            found.append((mask, mask * count + i[pair], mask * count + j[pair], torch.full_like(mask, sign)))
+        columns = [torch.cat(parts) for parts in zip(*found, strict=True)]
+        columns.append(torch.arange(len(columns[0]), device=centers.device))
+        central = columns[1] % count == 0
+        mask, first, second, sign, slot = (
+            torch.cat([column[~central], column[central].repeat_interleave(n)]) for column in columns
+        )
+        entries = Entries(mask, first, second, sign, mask * n + torch.arange(len(mask), device=mask.device) % n, slot)
+        largest = self._largest(*self._places(entries, lenses, centers))
         counts = largest > _SMALLEST
-        rows, largest = rows[counts], largest[counts]
-        key = ((rows[:, 0] * count + rows[:, 1]) * count + rows[:, 2]) * 2 + (rows[:, 3] > 0)
-        slot = torch.unique(key, return_inverse=True)[1]
-        return Entries(rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3], rows[:, 4:], slot), largest
+        entries = Entries(*(column[counts] for column in entries))
+        return entries._replace(slot=torch.unique(entries.slot, return_inverse=True)[1]), largest[counts]
 
-    def _largest(self, entries: Entries, lenses: Lenses, baselines: Tensor, centers: Tensor) -> Tensor:
-        """Return about the most that each entry gives anywhere (E,)."""
-        first = baselines[entries.mask, entries.first]
-        second = entries.sign[:, None] * baselines[entries.mask, entries.second]
-        separation = self._middles(lenses, centers, entries, 0) - self._middles(lenses, centers, entries, 1)
+    def _places(self, entries: Entries, lenses: Lenses, centers: Tensor) -> list[Tensor]:
+        """Return the baselines of both lenses of each entry and the separation of their middles, (E, 2) [m]."""
+        baselines, middles = (lenses.baseline * self.pixel).flatten(0, 1), lenses.middle.flatten(0, 1)
+        first, second = (baselines.index_select(0, lens) for lens in (entries.first, entries.second))
+        middle, other = (middles.index_select(0, lens) for lens in (entries.first, entries.second))
+        central = (entries.first % lenses.baseline.shape[1] == 0)[:, None]
+        middle = torch.where(central, centers.flatten(0, 1).index_select(0, entries.hole), middle)
+        return [first, second * entries.sign[:, None], middle - other]
+
+    def _largest(self, first: Tensor, second: Tensor, separation: Tensor) -> Tensor:
+        """Return about the most that lenses of each entry at these places (E, 2) [m] give anywhere (E,)."""
         reach = self.geometry.reach
         lens = self.geometry.shape.otf((first - second) / 2, self.geometry.diameter) ** 2
         near = []
@@ -124,12 +120,6 @@ class LensPairs:
             near += [shrunk * x, shrunk * y]
         near = [vector.nan_to_num(0.0) for vector in near]
         return lens * self.coherence.of_points(*near)
-
-    def _middles(self, lenses: Lenses, centers: Tensor, entries: Entries, which: int) -> Tensor:
-        """Return the middle of the first or second lens of each entry, (E, 2) [m]."""
-        lens = entries.second if which else entries.first
-        hole = centers[entries.mask, entries.holes[:, which]]
-        return torch.where((lens == 0)[:, None], hole, lenses.middle[entries.mask, lens])
 
 
 def _lines(nodes: Tensor, start: Tensor, step: Tensor, pixels: CommonPixels) -> Tensor:

@@ -27,7 +27,7 @@ class Lenses(NamedTuple):
     """The lenses (B, L) of masks: L - 1 pairs of holes after those of the holes with themselves.
 
     values (M, B, L, rows, columns) T on the pixels of each one's patch, in M modes; `root` (B, L, rows, columns) the
-    square root of the T that the light there sees, for `lens_functions`; `scale` (B, L, rows, columns) the phases of
+    square root of the T that the light there sees, for `lens_sum`; `scale` (B, L, rows, columns) the phases of
     that light over those at the reference wavelength, None for 1; `index` (B, L, rows, columns) the pixels of the
     plane; `baseline`, `turns`, `corner`, `size` (B, L, 2) [pixels], that on the frequency torus, with nu_y >= 0 (sign
     (B, L, 1) times that of the pair), what had to be taken off it, the first pixel, and the columns and rows that may

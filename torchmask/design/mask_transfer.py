@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchmask.atmosphere.colour_coherence import ColourCoherence
-from torchmask.atmosphere.lens_coherence import lens_coherence, lens_functions
+from torchmask.atmosphere.lens_coherence import lens_coherence, lens_sum
 from torchmask.atmosphere.seeing import Seeing
 from torchmask.design.central_lenses import CentralLenses
 from torchmask.design.fluctuation import steady_lenses
@@ -78,8 +78,7 @@ class MaskTransfer:
     def _transfer(self, centers: Tensor) -> Tensor:
         lenses = self.patches(centers)
         power = (lenses.values**2).sum(0)
-        # every patch counts twice in the end, at nu and at -nu
-        power = torch.cat([power[:, :1] * (centers.shape[1] / 2), power[:, 1:]], 1)
+        power[:, 0] *= centers.shape[1] / 2  # every patch counts twice in the end, at nu and at -nu
         alone = self.plane.summed(lenses.index, power * self._kept(lenses, self.factors))
         together = torch.addcmul(alone, self.pairs(lenses, centers), self.far)
         return self.plane.folded(together) + self.central(centers)
@@ -99,11 +98,9 @@ class MaskTransfer:
 
     def _kept(self, lenses: Lenses, factors: Tensor) -> Tensor:
         """Return the coherence (B, L, rows, columns) of lenses with themselves, by `factors` (parts, pixels)."""
-        functions = lens_functions(lenses.root, *self._places(lenses, *lenses.root.shape[-2:]), lenses.scale)
-        index, total = lenses.index.flatten(), torch.zeros_like(lenses.root)
-        for function, factor in zip(functions, factors, strict=True):
-            total = torch.addcmul(total, function, factor.index_select(0, index).view_as(total))
-        return total
+        index = lenses.index.flatten()
+        parts = [factor.index_select(0, index).view_as(lenses.root) for factor in factors]
+        return lens_sum(parts, lenses.root, *self._places(lenses, *lenses.root.shape[-2:]), lenses.scale)
 
     def _places(self, lenses: Lenses, rows: int, columns: int) -> tuple[Tensor, Tensor]:
         """Return the distance of the pixels from the lenses' baselines, x and y, over the holes' outer diameter."""

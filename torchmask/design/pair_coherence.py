@@ -98,13 +98,16 @@ class PairCoherence:
         return found.view(-1, n, n)
 
     def _over_far(self, places: Tensor) -> Tensor:
-        """Return the coherence over `far` (Q,) at baselines of two lenses, which is the first of `places` (Q, 4, 2) [m];
-        the others are the lenses' own, and the separation of their middles."""
+        """Return the coherence (Q,) over `far` at baselines of two lenses, by `places` (Q, 4, 2) [m].
+
+        They are the baseline, those of the lenses, and the separation of their middles.
+        """
         (bx, by), *lenses, separation = places.permute(1, 2, 0).contiguous()
         x, y = torch.stack(lenses, 1)
+        between = self.structure.at(bx, by)
         if self.colours is None:
             axes = self._axes(bx - x, by - y)
-            known, found = -self.structure.at(bx, by), self._changing([separation, *axes, (bx, by)])
+            known, found = -between, self._changing([separation, *axes, (bx, by)])
         else:
             one, other = phases = self._phases(bx, by, x, y)
             axes = self._axes(bx / phases - x, by / phases - y)
@@ -114,7 +117,7 @@ class PairCoherence:
             second, fourth = self.colours(torch.stack([bx, by], -1)[None] / ((one + other) / 2)[:, None])[0].unbind(-1)
             known = colour_loss(second, fourth, one, other) - own / 2
             found = self._changing([separation, *axes, (mx, my), (hx, hy)]) * (one * other)
-        return self.weights @ torch.exp(found + (known - _log_far(self.structure.at(bx, by))))
+        return self.weights @ torch.exp(found + (known - _log_far(between)))
 
     def _axes(self, x: Tensor, y: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Return x and y (Q,) of the two axes in which `_POINTS` count, for two lenses at the places (x, y) (2, Q)."""
@@ -150,11 +153,13 @@ class PairCoherence:
         the hole's diameter.
         """
         x, y = x / self.reach, y / self.reach
-        r = torch.sqrt(x * x + y * y + 1e-4)
+        square = torch.addcmul(x * x, y, y) + 1e-4
+        r = torch.sqrt(square)
         inside = (1 - r).clamp(min=0.03)  # no lens: it has no weight either
         height, width = inside * (1 + 0.6 * r), inside * inside * (1 - 0.1 * r)
-        narrow, base = (width - height) / (r * r) * self.variance, height * self.variance
-        return base + narrow * x * x, narrow * x * y, base + narrow * y * y
+        narrow, base = (width - height) * (self.variance / square), height * self.variance
+        along, across = narrow * x, narrow * y
+        return torch.addcmul(base, along, x), along * y, torch.addcmul(base, across, y)
 
 
 def _log_far(structure: Tensor) -> Tensor:
