@@ -79,9 +79,7 @@ class SharedCoherence(NamedTuple):
     by_place: PolarTable
 
 
-def lens_sum(
-    factors: Iterable[Tensor], root: Tensor, x: Tensor, y: Tensor, scale: Tensor | float | None = None
-) -> Tensor:
+def lens_sum(factors: Iterable[Tensor], root: Tensor, x: Tensor, y: Tensor, scale: Tensor | None = None) -> Tensor:
     """Return c, of the shape of the arguments, by the factors of `lens_coherence`.
 
     `root` is the square root of T; x and y are u over the holes' outer diameter. In a band, `scale` is that of the

@@ -59,13 +59,12 @@ class CommonPixels(NamedTuple):
         (x, y), (left, top), (own_left, own_top) = (place.long().unbind(-1) for place in (start, corner, other))
         places = (
             ((first * rows + y - top) * columns + x - left, columns),
-            ((second * rows + sign * y - own_top) * columns + sign * x - own_left, sign * columns),
+            ((second * rows + sign * y - own_top) * columns + sign * x - own_left, (sign * columns)[pair]),
             (mask * plane.n_pixels + plane.first(start), plane.size[1]),
         )
-        by_row = [place.index_select(0, pair) for place, _ in places]
-        steps = [row * (step[pair] if isinstance(step, Tensor) else step) for _, step in places]
+        own_place, other_place, target = (place[pair] + row * step for place, step in places)
         counts: list[int] = n_columns[pair].bincount().tolist()
-        return cls(start, pair, row, sign[pair], *map(torch.add, by_row, steps), counts)
+        return cls(start, pair, row, sign[pair], own_place, other_place, target, counts)
 
     def blocks(self) -> Iterator[tuple[slice, int, Tensor, Tensor, Tensor]]:
         """Yield rows of one length: which they are, their length, and where the values of either lens and the planes

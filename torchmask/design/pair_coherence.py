@@ -121,7 +121,7 @@ class PairCoherence:
 
     def _axes(self, x: Tensor, y: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Return x and y (Q,) of the two axes in which `_POINTS` count, for two lenses at the places (x, y) (2, Q)."""
-        xx, xy, yy = (sum(parts) + drift for parts, drift in zip(self._moments(x, y), self.drift, strict=True))
+        xx, xy, yy = (parts.sum(0) + drift for parts, drift in zip(self._moments(x, y), self.drift, strict=True))
         # the symmetric square root: a mask that is turned by 90 degrees has the same points
         root = torch.sqrt((xx * yy - xy**2).clamp(min=1e-6 * self.variance**2))
         trace = torch.sqrt(xx + yy + 2 * root)
