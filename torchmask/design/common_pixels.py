@@ -7,6 +7,7 @@ cache from the pixels' places to their sums, forwards and backwards.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import reduce
 from typing import Any, NamedTuple
 
 import torch
@@ -91,9 +92,8 @@ class SharedLight(torch.autograd.Function):
         powers, planes = powers_of(len(pixels.counts), lines), values.new_zeros(n_pixels)
         for some, width, first, second, target in pixels.blocks():
             coherence = (lines[some] @ powers[:, :width]).clamp_(max=_MOST).exp_().flatten()
-            light = torch.zeros_like(coherence)
-            for layer in values:
-                light.addcmul_(layer.index_select(0, first), layer.index_select(0, second))
+            products = (layer.index_select(0, first).mul_(layer.index_select(0, second)) for layer in values)
+            light = reduce(Tensor.add_, products)
             planes.scatter_add_(0, target, light.mul_(coherence))
         return planes
 

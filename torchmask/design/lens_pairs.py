@@ -86,8 +86,8 @@ class LensPairs:
         # lenses at baseline 0 are their own opposites: what they share with another's opposite, they share with it
         for sign, allowed in ((1, one < other), (-1, one > 0)):
             i, j = one[allowed], other[allowed]
-            distance = (sign * x[:, i] - x[:, j]) ** 2 + (sign * y[:, i] - y[:, j]) ** 2
-            mask, pair = (distance < limit).nonzero().unbind(-1)
+            dx, dy = (sign * part.index_select(1, i) - part.index_select(1, j) for part in (x, y))
+            mask, pair = (dx * dx + dy * dy < limit).nonzero().unbind(-1)
             found.append((mask, mask * count + i[pair], mask * count + j[pair], torch.full_like(mask, sign)))
         columns = [torch.cat(parts) for parts in zip(*found, strict=True)]
         columns.append(torch.arange(len(columns[0]), device=centers.device))
@@ -131,10 +131,8 @@ def _lines(nodes: Tensor, start: Tensor, step: Tensor, pixels: CommonPixels) -> 
     rows = _coefficients(nodes, start[:, 1:], step[:, 1:])  # (S, 3, x)
     both = _coefficients(rows.transpose(1, 2), start[:, :1], step[:, :1])  # (S, 3 of x, 3 of y)
     n_rows = int(pixels.row.max()) + 1
-    lines = (both @ powers_of(n_rows, nodes)).flatten()  # (S, 3 of x, rows)
-    powers = torch.arange(3, device=nodes.device)
-    index = (pixels.pair[:, None] * 3 + powers) * n_rows + pixels.row[:, None]
-    return lines.index_select(0, index.flatten()).view(-1, 3)
+    lines = powers_of(n_rows, nodes).T @ both.transpose(1, 2)  # (S, rows, 3 of x)
+    return lines.flatten(0, 1).index_select(0, pixels.pair * n_rows + pixels.row)
 
 
 def _coefficients(nodes: Tensor, start: Tensor, step: Tensor) -> Tensor:

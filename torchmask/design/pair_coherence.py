@@ -117,7 +117,7 @@ class PairCoherence:
             second, fourth = self.colours(torch.stack([bx, by], -1)[None] / ((one + other) / 2)[:, None])[0].unbind(-1)
             known = colour_loss(second, fourth, one, other) - own / 2
             found = self._changing([separation, *axes, (mx, my), (hx, hy)]) * (one * other)
-        return self.weights @ torch.exp(found + (known - _log_far(between)))
+        return self.weights @ found.add_(known - _log_far(between)).exp_()
 
     def _axes(self, x: Tensor, y: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Return x and y (Q,) of the two axes in which `_POINTS` count, for two lenses at the places (x, y) (2, Q)."""
@@ -135,7 +135,7 @@ class PairCoherence:
         terms = self.structure.at(x, y).unflatten(0, (len(self.factors), -1))
         total = terms[0] * self.factors[0]
         for term, factor in zip(terms[1:], self.factors[1:], strict=True):
-            total = torch.add(total, term, alpha=factor)
+            total.add_(term, alpha=factor)
         return total
 
     def _phases(self, bx: Tensor, by: Tensor, x: Tensor, y: Tensor) -> Tensor:
