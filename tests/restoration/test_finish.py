@@ -17,7 +17,7 @@ from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.motion import Setting
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.priors import EdgePreserving, SmoothVariation, TotalVariation
-from torchmask.restoration.projected_lbfgs import ProjectedLBFGS
+from torchmask.restoration.projected_lbfgs import Minimum, ProjectedLBFGS
 from torchmask.restoration.recipe import ModelRecipe
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.traits import Refinement, Traits
@@ -76,10 +76,12 @@ def test_a_recipe_has_a_finer_basis_if_it_has_more_modes(options, n_modes, five_
         assert torch.allclose(finer.mixing, basis_of(five_holes, 6).mixing)
 
 
-def ended(objective, state, setting, schedule, records=None):
+def ended(objective, state, setting, schedule, records=None, minimizer=None):
     progress = Progress(Candidates(state, 1))
     listen = None if records is None else records.append
-    found = finish(objective, setting, progress, schedule, ProjectedLBFGS(), listen, TRAITS, is_faint=False)
+    found = finish(
+        objective, setting, progress, schedule, minimizer or ProjectedLBFGS(), listen, TRAITS, is_faint=False
+    )
     return found, progress
 
 
@@ -98,7 +100,7 @@ def test_more_modes_explain_what_few_leave(five_holes, explain):
     begun = replace(state, z=basis.parameters_of(start))
     setting = Setting.of(few, finer=lambda: truth.model.aberrations)
     records = []
-    objective, progress = ended(few, begun, setting, Schedule(last_iterations=200), records)
+    objective, progress = ended(few, begun, setting, Schedule(last_segments=2, last_gain=0.0), records)
     chi_square = [float(fit_of_frames(*pair)[1].mean()) for pair in ((few, begun), (objective, progress.state))]
     assert chi_square[0] > 2
     pixels = truth.frames.numel()
@@ -111,7 +113,27 @@ def test_more_modes_explain_what_few_leave(five_holes, explain):
     assert [record.step for record in records] == list(range(1, len(records) + 1))
 
 
-def test_a_schedule_without_last_iterations_leaves_all_as_it_is(explained):
+def test_the_last_descent_ends_when_half_a_segment_gains_little(explained):
+    objective, state = explained
+    gains = [0.5, 0.02, 0.009, 0.5]
+
+    def says(cost, start, lower, *, max_iterations, callback):
+        """A minimiser of four iterations that stays where it is, and says what the second half of them gained."""
+        gain = gains.pop(0)
+        for step, told in enumerate((9.0, 9.0, 1 + gain, 1.0), start=1):
+            callback(start, told, step)
+        return Minimum(start, 1.0, 4, 4, False, "says so")
+
+    setting, schedule = Setting.of(objective), Schedule(last_gain=0.01)
+    _, progress = ended(objective, state, setting, schedule, minimizer=says)
+    assert gains == [0.5]
+    assert progress.n_evaluations == 3 * 4
+    gains = [0.5] * 4
+    ended(objective, state, setting, replace(schedule, last_segments=3), minimizer=says)
+    assert len(gains) == 1
+
+
+def test_a_schedule_without_last_segments_leaves_all_as_it_is(explained):
     objective, state = explained
     found, progress = ended(objective, state, Setting.of(objective), Schedule.plain())
     assert found is objective
@@ -130,11 +152,11 @@ def test_the_prior_of_the_last_descent_is_smoother():
 def test_a_result_holds_the_modes_of_the_search(observe, five_holes):
     """By default, and it can be continued."""
     seen = observe(n_frames=2, shape=(32, 32))
-    schedule = Schedule(start_iterations=20, last_iterations=3, last_modes=8, chance=math.inf, faint=0.0)
+    schedule = Schedule(start_iterations=20, segment=10, last_segments=1, last_modes=8, chance=math.inf, faint=0.0)
     method = MyopicDeconvolution(five_holes, seen.grid, readout_noise=1.5, schedule=schedule)
     stages = []
     result = method.restore(seen.frames, callback=lambda record: stages.append(record.stage))
-    assert stages == 20 * ["restoration"] + 3 * ["last descent"]
+    assert stages == 20 * ["restoration"] + 10 * ["last descent"]
     assert result.coefficients.shape == (2, 5, method.n_modes) == (2, 5, 6)
     assert "SmoothVariation" in result.prior
     assert method.restore(seen.frames, start=result).coefficients.shape == (2, 5, 6)

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from torchmask.restoration.aberrations import turbulent_basis
-from torchmask.restoration.checkpoint import Ending, Status
+from torchmask.restoration.candidates import Candidates
+from torchmask.restoration.checkpoint import Ending, Progress, Status
 from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.judge import Judge
 from torchmask.restoration.model_error import LeftOut, expected_error, fitted_parameters
@@ -101,3 +102,39 @@ def test_the_last_descent_is_held_to_the_modes_of_the_search(explain, five_holes
     fitted = expected_error(at_end, there, left_out).fitted
     assert fitted_parameters(at_end, there) == pytest.approx(fitted, rel=1e-9)
     assert after.degrees_of_freedom == round(objective.frames.numel() - fitted * len(objective.frames))
+
+
+def test_the_likelier_of_two_starts_is_kept(explain):
+    """Where both fit alike, the one whose aberrations are likelier, by the turbulence that each has found for itself.
+
+    For z of n numbers the weight n / ||z||^2 is the likeliest, and the noise that a start assumed last does not count.
+    """
+    objective, state = explain(noise=0.003)
+    judge = Judge(Setting.of(objective), stack_of(objective), TRAITS, Schedule())
+    found = state.z.numel() / float(state.z.square().sum())
+
+    def ending(weight, inflation=1.0):
+        calibration = replace(state.calibration, aberration_weight=weight)
+        return Ending(replace(state, calibration=calibration).with_noise_inflation(inflation), Status.CONVERGED)
+
+    for other in (0.8, 1.25):
+        best = ending(found, inflation=5.0)
+        for pair in ((best, ending(other * found)), (ending(other * found), best)):
+            assert judge.compare(objective, *pair).best is best
+    worse = Ending(replace(state, z=0.9 * state.z), Status.CONVERGED)
+    assert judge.compare(objective, worse, ending(0.5 * found)).best is not worse
+
+
+def test_faint_frames_get_several_starts_though_they_are_explained(explain):
+    """Their chi-square does not tell a wrong object; in bright frames it does."""
+    objective, state = explain(noise=0.003)
+    ending, schedule = Ending(state, Status.CONVERGED), Schedule(faint_starts=4)
+    starts = []
+    for is_faint in (False, True):
+        judge = Judge(Setting.of(objective), stack_of(objective), TRAITS, schedule, is_faint=is_faint)
+        verdict = judge.verdict(objective, ending)
+        assert verdict.explained
+        starts.append(judge.most_starts(verdict))
+        progress = Progress(Candidates(replace(state, z=0 * state.z), 1), schedule.glance * [1.0], rival=ending)
+        assert judge.gives_up(objective, progress) is not is_faint
+    assert starts == [1, 4]

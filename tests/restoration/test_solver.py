@@ -108,7 +108,7 @@ def test_a_plain_course_is_one_cost_lowered_and_nothing_else(many_minima, segmen
 @pytest.mark.parametrize("max_iterations", [1, 3, 6, 7, 13, 18, 40])
 def test_iterations_are_those_of_all_starts(max_iterations, explained):
     """Four starts of six at most; the third and fourth are cut short, or do not begin."""
-    schedule = Schedule(start_iterations=6, starts=4, alike=-1.0, last_iterations=0, **ALL_MISSED, **BRISK)
+    schedule = Schedule(start_iterations=6, starts=4, alike=-1.0, last_segments=0, **ALL_MISSED, **BRISK)
     records: list[Record] = []
     solver = solver_of(explained[0], records.append, schedule=schedule, max_iterations=max_iterations)
     progress = solver.solve(Known())
@@ -422,7 +422,7 @@ def test_frames_of_a_full_pupil_have_had_their_starts(monkeypatch, explained):
 )
 def test_aberrations_of_faint_frames_are_integrated_out(faint, traits, integrated, explained):
     """After the descents, whose costs stay as they are."""
-    numbers = {"rounds": 2, "moves": 2, "start_iterations": 5, "averaged": 1}
+    numbers = {"rounds": 2, "moves": 2, "start_iterations": 5, "averaged": 1, "faint_starts": 1}
     schedule = Schedule(faint=faint, candidates=(), **numbers, **NONE_MISSED, **BRISK)
     records: list[Record] = []
     progress = solver_of(explained[0], records.append, schedule=schedule, **traits).solve(Known())

@@ -10,7 +10,7 @@ from __future__ import annotations
 from torchmask.record import Callback
 from torchmask.restoration.calibration import recalibrate
 from torchmask.restoration.checkpoint import Progress
-from torchmask.restoration.descent import descend
+from torchmask.restoration.descent import Variables, descend
 from torchmask.restoration.escapes import settle
 from torchmask.restoration.marginal import integrate_aberrations
 from torchmask.restoration.motion import Setting
@@ -38,14 +38,22 @@ def finish(
         ended.n_evaluations += spent
         ended.integrated = True
         return objective
-    if not schedule.last_iterations:
+    if not schedule.last_segments:
         return objective
     state = setting.in_finer_modes(ended.state)
     objective = setting.objective_at(objective, state).with_changes(prior=objective.prior.smoother())
-    if schedule.recalibrates:
-        state = recalibrate(objective, state, power=1, follow_r0=traits.r0_is_open)
+    report, costs = ended.reporter("last descent", schedule.last_segments * schedule.segment, callback), []
 
-    listen = ended.reporter("last descent", schedule.last_iterations, callback)
-    state = descend(objective, state, schedule.last_iterations, minimizer, listen)
+    def listen(cost: float, evaluations: int, variables: Variables) -> None:
+        costs.append(cost)
+        report(cost, evaluations, variables)
+
+    for _ in range(schedule.last_segments):
+        costs.clear()
+        if schedule.recalibrates:
+            state = recalibrate(objective, state, power=1, follow_r0=traits.r0_is_open)
+        state = descend(objective, state, schedule.segment, minimizer, listen)
+        if not costs or costs[len(costs) // 2] - costs[-1] <= schedule.last_gain * costs[-1]:
+            break
     ended.state = settle(objective, state, schedule.last_settling)  # a descent moves flat parts of the object slowly
     return objective

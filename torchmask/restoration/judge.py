@@ -31,11 +31,14 @@ class Comparison(NamedTuple):
 class Judge:
     """Judges the endings of a stack's starts, each with the mask geometry and motion that it found."""
 
-    def __init__(self, setting: Setting, stack: FrameStack, traits: Traits, schedule: Schedule) -> None:
+    def __init__(
+        self, setting: Setting, stack: FrameStack, traits: Traits, schedule: Schedule, *, is_faint: bool = False
+    ) -> None:
         least = schedule.missed * stack.change if traits.many_minima else 0.0  # allows for its usual minima
         self.setting: Setting = setting
         self.traits: Traits = traits
         self.schedule: Schedule = schedule
+        self.is_faint: bool = is_faint
         self.contrast: float = stack.contrast
         self.noise: FrameNoise = stack.noise_of_frames
         self.tolerance: Tolerance = Tolerance(schedule.model_errors, schedule.chance, least)
@@ -69,7 +72,8 @@ class Judge:
         before = self.verdict(objective, rival)
         if now.status is Status.GIVEN_UP:
             return Comparison(rival, before, after, alike=False)
-        best, verdict = (rival, before) if before.excess < after.excess else (now, after)
+        rival_is_better = self._cost(objective, rival.state) < self._cost(objective, now.state)
+        best, verdict = (rival, before) if rival_is_better else (now, after)
         near = self.schedule.alike * max(verdict.excess, verdict.limit - 1)
         # Starts of a mask end alike at a wrong twin too, which is no reason to stop.
         alike = self.traits.many_minima and abs(before.excess - after.excess) < near
@@ -79,16 +83,31 @@ class Judge:
         """Return the maximum number of starts if this is the verdict on the best."""
         if verdict.finding is Finding.NOT_EXPLAINED:
             return self.schedule.starts
+        if not verdict.explained or self.traits.many_minima:
+            return 1
+        if self.is_faint:
+            return self.schedule.faint_starts
         noise = verdict.limit - 1 - self.schedule.model_errors * verdict.model_error
         is_doubtful = verdict.excess - noise > self.schedule.doubtful * verdict.model_error
-        return self.schedule.doubtful_starts if is_doubtful and verdict.explained and not self.traits.many_minima else 1
+        return self.schedule.doubtful_starts if is_doubtful else 1
 
     def gives_up(self, objective: MyopicObjective, progress: Progress) -> bool:
         """Return whether it is time to see that the present start is not well ahead of the best earlier one."""
-        if progress.rival is None or progress.iterations != self.schedule.glance:
+        if self.is_faint or progress.rival is None or progress.iterations != self.schedule.glance:
             return False
         left, least = (self.verdict(objective, ending).excess for ending in (progress.ending, progress.rival))
         return left >= self.schedule.promising * least
+
+    def _cost(self, objective: MyopicObjective, state: State) -> float:
+        """Return the joint cost of object and aberrations, comparable between starts: with the noise as given.
+
+        Each start has estimated the strength of the turbulence for itself, so the norm of their prior counts.
+        """
+        objective, weight = self.setting.objective_at(objective, state), state.calibration.aberration_weight
+        told = state.with_noise_inflation(1.0).calibration
+        cost = float(objective.evaluator(told)(state.image, state.z).value)
+        n_own = len(state.z) * objective.model.aberrations.n_own
+        return cost - 0.5 * n_own * math.log(weight) if weight else cost
 
     def _expected_error(self, objective: MyopicObjective, state: State) -> ModelError:
         """Return the model error that is allowed for, which is that of the modes of the search.

@@ -31,6 +31,7 @@ class Schedule:
     twins : number of further starts of a mask from twins of its object before one from random aberrations
     doubtful : the fit of a mask is doubted if the excess is larger than this number times that expected
     doubtful_starts : maximum number of starts of a mask whose fit is explained but doubted
+    faint_starts : minimum number of starts of a mask where frames are faint, of which the likeliest is kept
     glance : number of iterations after which a start from a twin is given up
     promising : unless its excess chi-square is below this fraction of that of the best start so far
     averaged : for a full pupil, number of starts that explain the frames, the mean of whose objects is the result
@@ -54,7 +55,8 @@ class Schedule:
     settling : maximum number of iterations that fit the object in a round
     last_settling : maximum number of iterations that fit it at the end, under a prior that suits it better
     last_modes : number of modes of each sub-aperture of a mask in the last descent of frames that are not faint
-    last_iterations : maximum number of iterations of that descent; 0: there is none
+    last_segments : maximum number of segments of that descent; 0: there is none
+    last_gain : it ends when the second half of a segment lowers the cost by less than this fraction
     """
 
     segment: int = 100
@@ -73,6 +75,7 @@ class Schedule:
     twins: int = 3
     doubtful: float = 1.0
     doubtful_starts: int = 3
+    faint_starts: int = 3
     glance: int = 300
     promising: float = 0.7
     averaged: int = 3
@@ -95,8 +98,9 @@ class Schedule:
     memory: float = 0.7
     settling: int = 30
     last_settling: int = 80
-    last_modes: int = 15
-    last_iterations: int = 100
+    last_modes: int = 28
+    last_segments: int = 8
+    last_gain: float = 0.01
 
     def __post_init__(self) -> None:
         stages = [number for number, _ in self.candidates] + [1]
@@ -124,10 +128,11 @@ class Schedule:
             candidates=(),
             starts=1,
             doubtful_starts=1,
+            faint_starts=1,
             averaged=1,
             faint=0.0,
             last_modes=0,
-            last_iterations=0,
+            last_segments=0,
             misplaced_gain=math.inf,
         )
 

@@ -97,7 +97,7 @@ class Solver:
         self.prior_r0: float | None = traits.r0 if turbulent else None  # of the aberrations' prior, at first [m]
         many_ends = turbulent and traits.many_minima and Free.OBJECT in objective.free
         self.averages: bool = many_ends and schedule.averaged > 1
-        self.judge: Judge = Judge(self.setting, stack, traits, schedule)
+        self.judge: Judge = Judge(self.setting, stack, traits, schedule, is_faint=self.is_faint)
 
     def solve(self, known: Known, start: RestorationResult | None = None, file: Checkpoint | None = None) -> Progress:
         """Run a restoration to its end, from scratch, from an earlier result or from a checkpoint."""
@@ -266,9 +266,10 @@ class Solver:
         best, verdict, now, progress.alike = self.judge.compare(self.objective, progress.ending, progress.rival)
         if self.averages and now.explained:
             progress.explained += (progress.ending,)
-        again, needed = progress.starts < self.judge.most_starts(verdict) and not progress.alike, 1  # iterations
+        again = progress.starts < self.judge.most_starts(verdict) and not progress.alike
         if progress.explained:
-            again, needed = len(progress.explained) < self.schedule.averaged, self.schedule.start_iterations
+            again = len(progress.explained) < self.schedule.averaged
+        needed = self.schedule.start_iterations if verdict.explained else 1  # one that could be spared is not cut short
         if again and len(progress.costs) + needed <= self.traits.max_iterations:
             self._start_again(progress, best)
         else:
