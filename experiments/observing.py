@@ -66,7 +66,7 @@ class ObservingOptions(MaskSearchOptions):
     """Number of short exposures."""
     n_pixels: int = 64
     """Number of pixels per side of the image."""
-    iterations: int = 300
+    iterations: int = 4000
     """Maximum number of iterations of a restoration."""
 
 

@@ -1,12 +1,12 @@
 """What restorations that have to find the aberrations attain in long exposures and wide bands, over what is predicted.
 
-    python experiments/smearing_map.py                    # 240 restorations: an hour of one core
+    python experiments/smearing_map.py                    # 240 restorations: an hour and a half of one core
     python experiments/smearing_map.py --draws 2          # fewer of each
     python experiments/smearing_map.py --smoke            # everything, tiny, in seconds
 
 Each draw is another mask, scene, turbulence and noise, and is restored from instants in narrow light, from ever longer
-exposures and from ever wider bands, with the same photons in each frame. The library's defaults with one start are told
-the read-out noise and the band, not how long a frame lasts. What is predicted is `TurbulentMSE` for instants in narrow
+exposures and from ever wider bands, with the same photons in each frame. The library's defaults are told the read-out
+noise and the band, not how long a frame lasts. What is predicted is `TurbulentMSE` for instants in narrow
 light and known PSFs, times what `success_map` says that unknown ones cost: measure that map first.
 
 The table, the figure and the numbers go to a new folder, and with them smearing.json, which `torchmask plan`
@@ -80,7 +80,7 @@ class Options(SweepOptions):
     """Number of frames."""
     n_pixels: int = 64
     """Number of pixels per side of the image."""
-    iterations: int = 400
+    iterations: int = 4000
     """Maximum number of iterations of a restoration."""
 
 
