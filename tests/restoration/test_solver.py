@@ -431,6 +431,17 @@ def test_aberrations_of_faint_frames_are_integrated_out(faint, traits, integrate
     assert len(progress.costs) == min(5, traits.get("max_iterations", 5))
 
 
+@pytest.mark.parametrize(("max_iterations", "n_starts"), [(1000, 3), (15, 2), (10, 1)])
+def test_faint_frames_get_whole_starts_from_twins(max_iterations, n_starts, explained):
+    """As many as there is time for, so that the aberrations can still be integrated out."""
+    numbers = {"rounds": 2, "moves": 2, "start_iterations": 5}
+    schedule = Schedule(faint=math.inf, **numbers, **NONE_MISSED, **BRISK)
+    progress = solver_of(explained[0], schedule=schedule, max_iterations=max_iterations).solve(Known())
+    assert progress.starts == n_starts
+    assert len(progress.costs) == 5 * n_starts
+    assert progress.integrated
+
+
 def test_frames_are_faint_by_how_they_change(explained):
     objective, _ = explained
     change = FrameStack(objective.frames, torch.ones_like(objective.frames, dtype=torch.bool), 1.0, 0.03**2).change

@@ -2,7 +2,7 @@
 
 A descent from far away takes few modes per sub-aperture. Close to the solution, more of them take away much of what the
 model leaves unexplained. So once all has come to rest, the aberrations gain modes, and the object a smoother prior
-(`ObjectPrior.smoother`).
+(`ObjectPrior.smoother`), and that descent goes on while it gains.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def finish(
         if schedule.recalibrates:
             state = recalibrate(objective, state, power=1, follow_r0=traits.r0_is_open)
         state = descend(objective, state, schedule.segment, minimizer, listen)
-        if not costs or costs[len(costs) // 2] - costs[-1] <= schedule.last_gain * costs[-1]:
+        if not costs or costs[len(costs) // 2] - costs[-1] <= schedule.last_gain * abs(costs[-1]):
             break
     ended.state = settle(objective, state, schedule.last_settling)  # a descent moves flat parts of the object slowly
     return objective

@@ -72,7 +72,7 @@ class Judge:
         before = self.verdict(objective, rival)
         if now.status is Status.GIVEN_UP:
             return Comparison(rival, before, after, alike=False)
-        rival_is_better = self._cost(objective, rival.state) < self._cost(objective, now.state)
+        rival_is_better = self._rank(objective, rival) < self._rank(objective, now)
         best, verdict = (rival, before) if rival_is_better else (now, after)
         near = self.schedule.alike * max(verdict.excess, verdict.limit - 1)
         # Starts of a mask end alike at a wrong twin too, which is no reason to stop.
@@ -98,6 +98,13 @@ class Judge:
         left, least = (self.verdict(objective, ending).excess for ending in (progress.ending, progress.rival))
         return left >= self.schedule.promising * least
 
+    def _rank(self, objective: MyopicObjective, ending: Ending) -> tuple[bool, float]:
+        """Return what is least for the best ending: the residual, or in faint frames the cost of those explained."""
+        verdict = self.verdict(objective, ending)
+        return (
+            (not verdict.explained, self._cost(objective, ending.state)) if self.is_faint else (False, verdict.excess)
+        )
+
     def _cost(self, objective: MyopicObjective, state: State) -> float:
         """Return the joint cost of object and aberrations, comparable between starts: with the noise as given.
 
@@ -112,8 +119,8 @@ class Judge:
     def _expected_error(self, objective: MyopicObjective, state: State) -> ModelError:
         """Return the model error that is allowed for, which is that of the modes of the search.
 
-        The last descent is too short to bring all its modes to rest, so the fit is not held to what they could explain;
-        the degrees of freedom count them nonetheless.
+        The last descent need not bring all its modes to rest, so the fit is not held to what they could explain; the
+        degrees of freedom count them nonetheless.
         """
         first = self.setting.in_first_modes(state)
         error = expected_error(self.setting.objective_at(objective, first), first, self._left_out)

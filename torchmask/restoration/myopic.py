@@ -89,8 +89,8 @@ class MyopicDeconvolution:
     aberration_prior : bool
         False: leave out 1/2 ||z||^2; z are then the Zernike coefficients themselves.
     max_iterations : int
-        Maximum number over all starts, each of at most 1000; the object behind a full pupil is the mean of three, if
-        there is room for them. While none explains the frames, up to nine are made; the best is kept.
+        Maximum number over all starts, each of at most 1000; the object behind a full pupil is the mean of three. Faint
+        frames through a mask get three too, and up to nine are made while none explains the frames; the best is kept.
     tolerance : float
         The restoration has converged when 100 iterations lower the cost by less than this fraction.
     minimizer : Minimizer

@@ -31,8 +31,9 @@ class Schedule:
     twins : number of further starts of a mask from twins of its object before one from random aberrations
     doubtful : the fit of a mask is doubted if the excess is larger than this number times that expected
     doubtful_starts : maximum number of starts of a mask whose fit is explained but doubted
-    faint_starts : minimum number of starts of a mask where frames are faint, of which the likeliest is kept
-    glance : number of iterations after which a start from a twin is given up
+    faint_starts : number of starts of a mask whose faint frames are explained, of which the likeliest is kept, as far
+        as the maximum number of iterations leaves room for whole ones
+    glance : number of iterations after which a start from a twin is given up, unless frames are faint
     promising : unless its excess chi-square is below this fraction of that of the best start so far
     averaged : for a full pupil, number of starts that explain the frames, the mean of whose objects is the result
     alike : relative difference of the excess chi-square of two starts of a full pupil below which they are the same
@@ -106,7 +107,7 @@ class Schedule:
         stages = [number for number, _ in self.candidates] + [1]
         if any(later * 2 != earlier for earlier, later in pairwise(stages)):
             raise ValueError(f"candidates is {self.candidates}: each stage must have half as many as the one before it")
-        for name in ("segment", "start_iterations", "starts", "averaged"):
+        for name in ("segment", "start_iterations", "starts", "faint_starts", "averaged"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}: it must be at least 1")
 

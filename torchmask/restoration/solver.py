@@ -5,9 +5,9 @@ proceeds in segments. Between two of them, the scales of the variables, the tran
 turbulence and the noise are updated; the assumed noise falls from the residual of the mean frame to the true noise, or
 to the residual of the model, if that is larger. Once the object is sharp, frames and object escape from local minima;
 when nothing changes any more, each frame is weighted by how well it fits. A start ends when a segment gains nothing or
-its iterations are used up. If its verdict is that it missed the object, another one starts, from random aberrations or,
-for a mask, from twins of the object, and the best is kept. At the end, the aberrations of faint frames are integrated
-out, those of others gain modes. For a full pupil the objects of several good starts are averaged.
+its iterations are used up. If its verdict is that it missed the object, or in faint frames, others start, from random
+aberrations or, for a mask, from twins of the object, and the best is kept. At the end, the aberrations of faint frames
+are integrated out, those of others gain modes. For a full pupil the objects of several good starts are averaged.
 """
 
 from __future__ import annotations
@@ -267,9 +267,9 @@ class Solver:
         if self.averages and now.explained:
             progress.explained += (progress.ending,)
         again = progress.starts < self.judge.most_starts(verdict) and not progress.alike
+        needed = self.schedule.start_iterations + 1 if verdict.explained else 1  # what could be spared is not cut short
         if progress.explained:
-            again = len(progress.explained) < self.schedule.averaged
-        needed = self.schedule.start_iterations if verdict.explained else 1  # one that could be spared is not cut short
+            again, needed = len(progress.explained) < self.schedule.averaged, self.schedule.start_iterations
         if again and len(progress.costs) + needed <= self.traits.max_iterations:
             self._start_again(progress, best)
         else:
