@@ -110,7 +110,7 @@ def test_the_likelier_of_two_starts_is_kept(explain):
     For z of n numbers the weight n / ||z||^2 is the likeliest, and the noise that a start assumed last does not count.
     """
     objective, state = explain(noise=0.003)
-    judge = Judge(Setting.of(objective), stack_of(objective), TRAITS, Schedule(), is_faint=True)
+    judge = Judge(Setting.of(objective), stack_of(objective), TRAITS, Schedule(likelier=0.0), is_faint=True)
     found = state.z.numel() / float(state.z.square().sum())
 
     def ending(weight, inflation=1.0):
@@ -121,6 +121,8 @@ def test_the_likelier_of_two_starts_is_kept(explain):
         best, rival = ending(found), ending(other * found, inflation=5.0)
         for pair in ((best, rival), (rival, best)):
             assert judge.compare(objective, *pair).best is best
+    careful = Judge(Setting.of(objective), stack_of(objective), TRAITS, Schedule(likelier=1e3), is_faint=True)
+    assert careful.compare(objective, best, rival).best is rival  # the earlier one, as the costs are close
     worse = Ending(replace(state, z=0.9 * state.z), Status.CONVERGED)
     assert judge.compare(objective, worse, ending(0.5 * found)).best is not worse
 

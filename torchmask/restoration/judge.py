@@ -72,8 +72,7 @@ class Judge:
         before = self.verdict(objective, rival)
         if now.status is Status.GIVEN_UP:
             return Comparison(rival, before, after, alike=False)
-        rival_is_better = self._rank(objective, rival) < self._rank(objective, now)
-        best, verdict = (rival, before) if rival_is_better else (now, after)
+        best, verdict = (rival, before) if self._stays(objective, rival, now) else (now, after)
         near = self.schedule.alike * max(verdict.excess, verdict.limit - 1)
         # Starts of a mask end alike at a wrong twin too, which is no reason to stop.
         alike = self.traits.many_minima and abs(before.excess - after.excess) < near
@@ -98,12 +97,18 @@ class Judge:
         left, least = (self.verdict(objective, ending).excess for ending in (progress.ending, progress.rival))
         return left >= self.schedule.promising * least
 
-    def _rank(self, objective: MyopicObjective, ending: Ending) -> tuple[bool, float]:
-        """Return what is least for the best ending: the residual, or in faint frames the cost of those explained."""
-        verdict = self.verdict(objective, ending)
-        return (
-            (not verdict.explained, self._cost(objective, ending.state)) if self.is_faint else (False, verdict.excess)
-        )
+    def _stays(self, objective: MyopicObjective, rival: Ending, now: Ending) -> bool:
+        """Return whether the earlier ending is the better one: by the residual, or in faint frames by the cost.
+
+        Costs that are close tell nothing there, so the later one has to be clearly likelier, unless it alone explains.
+        """
+        before, after = self.verdict(objective, rival), self.verdict(objective, now)
+        if not self.is_faint:
+            return before.excess < after.excess
+        if before.explained is not after.explained:
+            return before.explained
+        gain = self._cost(objective, rival.state) - self._cost(objective, now.state)
+        return gain <= self.schedule.likelier
 
     def _cost(self, objective: MyopicObjective, state: State) -> float:
         """Return the joint cost of object and aberrations, comparable between starts: with the noise as given.

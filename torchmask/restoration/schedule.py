@@ -33,6 +33,7 @@ class Schedule:
     doubtful_starts : maximum number of starts of a mask whose fit is explained but doubted
     faint_starts : number of starts of a mask whose faint frames are explained, of which the likeliest is kept, as far
         as the maximum number of iterations leaves room for whole ones
+    likelier : cost by which a later of these starts has to be lower to replace an earlier one
     glance : number of iterations after which a start from a twin is given up, unless frames are faint
     promising : unless its excess chi-square is below this fraction of that of the best start so far
     averaged : for a full pupil, number of starts that explain the frames, the mean of whose objects is the result
@@ -77,6 +78,7 @@ class Schedule:
     doubtful: float = 1.0
     doubtful_starts: int = 3
     faint_starts: int = 3
+    likelier: float = 50.0
     glance: int = 300
     promising: float = 0.7
     averaged: int = 3
