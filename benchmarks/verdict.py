@@ -71,9 +71,11 @@ def explained(name: str, observation: Observation) -> bool:
     verdict, truth = result.verdict, observation.object
     assert verdict is not None
     assert truth is not None
+    # Nothing but noise may be restored as an object without light.
+    error = relative_error(result.object, truth, 0.5) if result.object.any() else 1.0
     print(
         f"{name:32s} chi-square {verdict.chi_square:8.3f}, expected {1 + verdict.model_error:6.3f}, passes "
-        f"{verdict.limit:6.3f}: {verdict.finding.value}; score {relative_error(result.object, truth, 0.5):.3f}, "
+        f"{verdict.limit:6.3f}: {verdict.finding.value}; score {error:.3f}, "
         f"{len(result.cost)} iterations, {result.seconds:.0f} s",
         flush=True,
     )
