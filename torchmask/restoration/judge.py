@@ -65,14 +65,23 @@ class Judge:
         return judge(frames, self.contrast, error, self.tolerance, at_rest=at_rest)
 
     def compare(self, objective: MyopicObjective, now: Ending, rival: Ending | None) -> Comparison:
-        """Compare the present ending with the best of the earlier ones, if there is one."""
+        """Compare the present ending with the best of the earlier ones, if there is one.
+
+        The better one has the smaller residual. In faint frames it is the earlier one, unless the later one alone
+        explains them, or is clearly likelier and no less explained.
+        """
         after = self.verdict(objective, now)
         if rival is None:
             return Comparison(now, after, after, alike=False)
         before = self.verdict(objective, rival)
         if now.status is Status.GIVEN_UP:
             return Comparison(rival, before, after, alike=False)
-        best, verdict = (rival, before) if self._stays(objective, rival, now) else (now, after)
+        stays = before.excess < after.excess
+        if self.is_faint:  # the residual does not tell, nor do costs that are close
+            lower = self._cost(objective, rival.state) - self._cost(objective, now.state)
+            alone = before.explained is not after.explained
+            stays = before.explained if alone else lower <= self.schedule.likelier
+        best, verdict = (rival, before) if stays else (now, after)
         near = self.schedule.alike * max(verdict.excess, verdict.limit - 1)
         # Starts of a mask end alike at a wrong twin too, which is no reason to stop.
         alike = self.traits.many_minima and abs(before.excess - after.excess) < near
@@ -96,19 +105,6 @@ class Judge:
             return False
         left, least = (self.verdict(objective, ending).excess for ending in (progress.ending, progress.rival))
         return left >= self.schedule.promising * least
-
-    def _stays(self, objective: MyopicObjective, rival: Ending, now: Ending) -> bool:
-        """Return whether the earlier ending is the better one: by the residual, or in faint frames by the cost.
-
-        Costs that are close tell nothing there, so the later one has to be clearly likelier, unless it alone explains.
-        """
-        before, after = self.verdict(objective, rival), self.verdict(objective, now)
-        if not self.is_faint:
-            return before.excess < after.excess
-        if before.explained is not after.explained:
-            return before.explained
-        gain = self._cost(objective, rival.state) - self._cost(objective, now.state)
-        return gain <= self.schedule.likelier
 
     def _cost(self, objective: MyopicObjective, state: State) -> float:
         """Return the joint cost of object and aberrations, comparable between starts: with the noise as given.
