@@ -48,6 +48,8 @@ def progress_with(**changes):
         "rival": Ending(random_state(1), Status.START_LIMIT),
         "explained": (Ending(random_state(3), Status.START_LIMIT), Ending(random_state(4), Status.CONVERGED, 2e-5)),
         "alike": True,
+        "finer": random_state(5),
+        "last_segments": 2,
     }
     return Progress(several(random_state(0), 4), **given | changes)
 
@@ -64,7 +66,7 @@ def same_state(one, other):
     "changes",
     [
         {},
-        {"rival": None, "explained": ()},
+        {"rival": None, "explained": (), "finer": None},
         {"rival": Ending(random_state(2), Status.CONVERGED, 1e-6), "status": Status.ITERATION_LIMIT},
         {"status": Status.RUNNING, "decrease": None, "alike": False, "costs": [], "began": 0},
         {"costs": [1.0]},
@@ -79,12 +81,14 @@ def test_everything_comes_back(changes, tmp_path):
     same_state(back.state, saved.state)
     assert back.candidates.n_each == 4
     for item in fields(Progress):
-        if item.name not in ("candidates", "rival", "explained"):
+        if item.name not in ("candidates", "rival", "explained", "finer"):
             assert getattr(back, item.name) == getattr(saved, item.name), item.name
     for one, other in zip(back.explained, saved.explained, strict=True):
         same_state(one.state, other.state)
         assert (one.status, one.decrease) == (other.status, other.decrease)
-    assert (back.rival is None) == (saved.rival is None)
+    assert [back.rival is None, back.finer is None] == [saved.rival is None, saved.finer is None]
+    if saved.finer is not None:
+        same_state(back.finer, saved.finer)
     if saved.rival is not None:
         same_state(back.rival.state, saved.rival.state)
         assert (back.rival.status, back.rival.decrease) == (saved.rival.status, saved.rival.decrease)

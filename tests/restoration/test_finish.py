@@ -80,7 +80,15 @@ def ended(objective, state, setting, schedule, records=None, minimizer=None):
     progress = Progress(Candidates(state, 1))
     listen = None if records is None else records.append
     found = finish(
-        objective, setting, progress, schedule, minimizer or ProjectedLBFGS(), listen, TRAITS, is_faint=False
+        objective,
+        setting,
+        progress,
+        schedule,
+        minimizer or ProjectedLBFGS(),
+        listen,
+        TRAITS,
+        lambda progress: None,
+        is_faint=False,
     )
     return found, progress
 
@@ -162,3 +170,30 @@ def test_a_result_holds_the_modes_of_the_search(observe, five_holes):
     assert method.restore(seen.frames, start=result).coefficients.shape == (2, 5, 6)
     known = method.restore(seen.frames, coefficients=result.coefficients)
     assert "TotalVariation" in known.prior
+
+
+def test_an_interrupted_last_descent_goes_on(observe, five_holes, tmp_path):
+    """After its first segment; what has ended is not done again."""
+    seen = observe(n_frames=2, shape=(32, 32))
+    options = {"start_iterations": 20, "segment": 10, "last_modes": 8, "chance": math.inf, "faint": 0.0}
+    schedule = Schedule(**options, last_segments=3, last_gain=0.0)
+    method = MyopicDeconvolution(five_holes, seen.grid, readout_noise=1.5, schedule=schedule)
+    whole = method.restore(seen.frames)
+    path = tmp_path / "state.npz"
+
+    def interrupt(record):
+        if (record.stage, record.step) == ("last descent", 15):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        method.restore(seen.frames, checkpoint=path, callback=interrupt)
+    records = []
+    for n_left in (20, 0):
+        resumed = method.restore(seen.frames, checkpoint=path, callback=records.append)
+        assert [(record.stage, record.step) for record in records] == [
+            ("last descent", 30 - n_left + 1 + i) for i in range(n_left)
+        ]
+        assert torch.equal(resumed.object, whole.object)
+        assert torch.equal(resumed.coefficients, whole.coefficients)
+        assert resumed.n_evaluations == whole.n_evaluations
+        records.clear()

@@ -64,6 +64,8 @@ class Progress:
     explained : final states of the starts that explain the frames, if the mean of several objects is wanted
     alike : whether the last two starts ended in the same result
     refinement : whether the position of the mask is fitted too, or will be if the frames require it
+    finer : state of the last descent, which may have more modes; None before it
+    last_segments : number of segments of the last descent that are done; all there may be, once it gains no more
     integrated : whether the aberrations have been integrated out, which is done at the end and not stored
     averaged : number of starts whose objects have been averaged, likewise
     """
@@ -80,6 +82,8 @@ class Progress:
     explained: tuple[Ending, ...] = ()
     alike: bool = False
     refinement: Refinement = Refinement.OFF
+    finer: State | None = None
+    last_segments: int = 0
     integrated: bool = False
     averaged: int = 1
 
@@ -102,9 +106,12 @@ class Progress:
         """Number of iterations of the present start."""
         return len(self.costs) - self.began
 
-    def reporter(self, stage: str, n_steps: int, callback: Callback | None) -> Listener:
-        """Return a listener of a descent after the search: it counts its evaluations and reports its iterations."""
-        steps = itertools.count(1)
+    def reporter(self, stage: str, n_steps: int, callback: Callback | None, done: int = 0) -> Listener:
+        """Return a listener of a descent after the search: it counts its evaluations and reports its iterations.
+
+        Some may have been `done` before an interruption.
+        """
+        steps = itertools.count(done + 1)
 
         def listen(cost: float, evaluations: int, variables: Variables) -> None:
             self.n_evaluations += evaluations
@@ -120,7 +127,7 @@ class Progress:
         self.status, self.decrease = Status.RUNNING, None
 
 
-_NUMBERS = ("n_evaluations", "escapes", "starts", "began", "alike")
+_NUMBERS = ("n_evaluations", "escapes", "starts", "began", "alike", "last_segments")
 # arrays of an ending
 _NEEDED = ("image", "z", "geometry", "modes", "status", *(item.name for item in fields(Calibration)))
 
@@ -154,6 +161,8 @@ class Checkpoint:
         arrays |= {"refinement": progress.refinement.name} | _ending_arrays("", progress.ending)
         if progress.rival is not None:
             arrays |= _ending_arrays("rival_", progress.rival)
+        if progress.finer is not None:
+            arrays |= _ending_arrays("finer_", Ending(progress.finer, progress.status))
         arrays["n_explained"] = len(progress.explained)
         for number, ending in enumerate(progress.explained):
             arrays |= _ending_arrays(f"explained{number}_", ending)
@@ -169,9 +178,9 @@ class Checkpoint:
                 f"{self.path} is the checkpoint of other frames or settings, or of another version: give another name "
                 "or delete it"
             )
-        rivals = ["rival_"] if any(name.startswith("rival_") for name in stored) else []
+        further = [prefix for prefix in ("rival_", "finer_") if any(name.startswith(prefix) for name in stored)]
         explained = [f"explained{number}_" for number in range(int(stored.get("n_explained", 0)))]
-        needed = [prefix + name for prefix in ("", *rivals, *explained) for name in _NEEDED]
+        needed = [prefix + name for prefix in ("", *further, *explained) for name in _NEEDED]
         needed += ["costs", "n_candidates", "n_explained", "refinement", *_NUMBERS]
         missing = [name for name in needed if name not in stored]
         if missing:
@@ -182,7 +191,8 @@ class Checkpoint:
             np.atleast_1d(stored["costs"]).tolist(),
             status=now.status,
             decrease=now.decrease,
-            rival=_ending(stored, "rival_", device) if rivals else None,
+            rival=_ending(stored, "rival_", device) if "rival_" in further else None,
+            finer=_ending(stored, "finer_", device).state if "finer_" in further else None,
             explained=tuple(_ending(stored, prefix, device) for prefix in explained),
             refinement=Refinement[stored["refinement"].item()],
             **{name: stored[name].item() for name in _NUMBERS},

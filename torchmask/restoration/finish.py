@@ -7,6 +7,8 @@ model leaves unexplained. So once all has come to rest, the aberrations gain mod
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from torchmask.record import Callback
 from torchmask.restoration.calibration import recalibrate
 from torchmask.restoration.checkpoint import Progress
@@ -28,10 +30,14 @@ def finish(
     minimizer: Minimizer,
     callback: Callback | None,
     traits: Traits,
+    save: Callable[[Progress], None],
     *,
     is_faint: bool,
 ) -> MyopicObjective:
-    """Finish a restoration that has come to rest: update `ended`, and return the objective of its state."""
+    """Finish a restoration that has come to rest: update `ended`, and return the objective of its state.
+
+    `save` is called after every segment of the last descent, which goes on where an interrupted one was.
+    """
     if is_faint:
         how = {"seed": traits.seed, "follow_r0": traits.r0_is_open}
         ended.state, spent = integrate_aberrations(objective, ended.state, schedule, minimizer, callback, **how)
@@ -40,20 +46,22 @@ def finish(
         return objective
     if not schedule.last_segments:
         return objective
-    state = setting.in_finer_modes(ended.state)
+    state = setting.in_finer_modes(ended.state) if ended.finer is None else ended.finer
     objective = setting.objective_at(objective, state).with_changes(prior=objective.prior.smoother())
-    report, costs = ended.reporter("last descent", schedule.last_segments * schedule.segment, callback), []
+    most, done = (number * schedule.segment for number in (schedule.last_segments, ended.last_segments))
+    report, costs = ended.reporter("last descent", most, callback, done), []
 
     def listen(cost: float, evaluations: int, variables: Variables) -> None:
         costs.append(cost)
         report(cost, evaluations, variables)
 
-    for _ in range(schedule.last_segments):
+    while ended.last_segments < schedule.last_segments:
         costs.clear()
         if schedule.recalibrates:
             state = recalibrate(objective, state, power=1, follow_r0=traits.r0_is_open)
         state = descend(objective, state, schedule.segment, minimizer, listen)
-        if not costs or costs[len(costs) // 2] - costs[-1] <= schedule.last_gain * abs(costs[-1]):
-            break
+        gains = bool(costs) and costs[len(costs) // 2] - costs[-1] > schedule.last_gain * abs(costs[-1])
+        ended.finer, ended.last_segments = state, ended.last_segments + 1 if gains else schedule.last_segments
+        save(ended)
     ended.state = settle(objective, state, schedule.last_settling)  # a descent moves flat parts of the object slowly
     return objective

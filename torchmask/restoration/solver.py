@@ -109,10 +109,11 @@ class Solver:
         blind = known.nothing and start is None
         # Without a prior on the aberrations a poor fit is to be expected, and more starts would not help.
         may_start_again = blind and self.traits.prior_on_aberrations and len(self.objective.frames) > 1
-        ended = self.run(begun, may_start_again, file.save if file is not None else lambda progress: None)
+        save = file.save if file is not None else lambda progress: None
+        ended = self.run(begun, may_start_again, save)
         if self.is_open and ended.status is not Status.ITERATION_LIMIT:
-            how = (self.schedule, self.minimizer, self.callback)
-            self.objective = finish(self.objective, self.setting, ended, *how, self.traits, is_faint=self.is_faint)
+            how = (self.schedule, self.minimizer, self.callback, self.traits, save)
+            self.objective = finish(self.objective, self.setting, ended, *how, is_faint=self.is_faint)
         if len(ended.explained) > 1:
             average_starts(self.objective, ended, self.schedule, self.minimizer, self.callback)
         return ended
@@ -143,8 +144,7 @@ class Solver:
                 self._play(progress)
             else:
                 self._advance(progress)
-            ended = progress.status is not Status.RUNNING
-            if ended and may_start_again:
+            if progress.status is not Status.RUNNING and may_start_again:
                 self._judge_start(progress)
             save(progress)
         if progress.status is Status.ITERATION_LIMIT and progress.rival is not None:  # the last start was cut short
