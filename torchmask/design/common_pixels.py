@@ -60,12 +60,15 @@ class CommonPixels(NamedTuple):
         (x, y), (left, top), (own_left, own_top) = (place.long().unbind(-1) for place in (start, corner, other))
         places = (
             ((first * rows + y - top) * columns + x - left, columns),
-            ((second * rows + sign * y - own_top) * columns + sign * x - own_left, (sign * columns)[pair]),
+            (
+                (second * rows + sign * y - own_top) * columns + sign * x - own_left,
+                (sign * columns).index_select(0, pair),
+            ),
             (mask * plane.n_pixels + plane.first(start), plane.size[1]),
         )
-        own_place, other_place, target = (place[pair] + row * step for place, step in places)
+        own_place, other_place, target = (place.index_select(0, pair) + row * step for place, step in places)
         counts: list[int] = n_columns[pair].bincount().tolist()
-        return cls(start, pair, row, sign[pair], own_place, other_place, target, counts)
+        return cls(start, pair, row, sign.index_select(0, pair), own_place, other_place, target, counts)
 
     def blocks(self) -> Iterator[tuple[slice, int, Tensor, Tensor, Tensor]]:
         """Yield rows of one length: which they are, their length, and where the values of either lens and the planes

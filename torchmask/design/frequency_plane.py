@@ -74,8 +74,9 @@ class FrequencyPlane(NamedTuple):
 
     def folded(self, plane: Tensor) -> Tensor:
         """Return the half-plane (..., pixels) of planes, row by row, columns in FFT order."""
-        half = plane.new_zeros(*plane.shape[:-1], self.n_half)
-        return half.index_add(half.ndim - 1, self.target, plane.index_select(plane.ndim - 1, self.source))
+        # a third of the time of index_select and index_add along the last dimension
+        source, target = (index.expand(*plane.shape[:-1], -1) for index in (self.source, self.target))
+        return plane.new_zeros(*plane.shape[:-1], self.n_half).scatter_add(-1, target, plane.gather(-1, source))
 
 
 def half_plane(geometry: Geometry) -> Tensor:

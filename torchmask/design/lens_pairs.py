@@ -130,9 +130,8 @@ def _lines(nodes: Tensor, start: Tensor, step: Tensor, pixels: CommonPixels) -> 
     """
     rows = _coefficients(nodes, start[:, 1:], step[:, 1:])  # (S, 3, x)
     both = _coefficients(rows.transpose(1, 2), start[:, :1], step[:, :1])  # (S, 3 of x, 3 of y)
-    n_rows = int(pixels.row.max()) + 1
-    lines = powers_of(n_rows, nodes).T @ both.transpose(1, 2)  # (S, rows, 3 of x)
-    return lines.flatten(0, 1).index_select(0, pixels.pair * n_rows + pixels.row)
+    lines = powers_of(int(pixels.row.max()) + 1, nodes).T @ both.permute(2, 0, 1).flatten(1)  # (rows, S * 3 of x)
+    return lines.view(-1, 3).index_select(0, pixels.row * len(nodes) + pixels.pair)
 
 
 def _coefficients(nodes: Tensor, start: Tensor, step: Tensor) -> Tensor:

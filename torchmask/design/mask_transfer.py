@@ -80,7 +80,7 @@ class MaskTransfer:
         power = (lenses.values**2).sum(0)
         power[:, 0] *= centers.shape[1] / 2  # every patch counts twice in the end, at nu and at -nu
         alone = self.plane.summed(lenses.index, power * self._kept(lenses, self.factors))
-        together = torch.addcmul(alone, self.pairs(lenses, centers), self.far)
+        together = alone.addcmul_(self.pairs(lenses, centers), self.far)
         return self.plane.folded(together) + self.central(centers)
 
     def steady(self, centers: Tensor) -> Tensor:

@@ -75,7 +75,7 @@ class TurbulentMSE(AsymptoticMSE):
     integral for holes of 0.4 to 1.5 r0 (4 % for 1.5 r0 in a band 20 % wide, and for 20 holes in an exposure and a
     band), where it is above 2 % of what one pair of holes gives at most; that of full pupils, which is interpolated,
     within 2 % where it is above 1e-4 (4 % with vanes of D/25, or with an outer scale of 5 D). Baselines beyond the
-    frequency torus alias as in MSE_a. A value takes 8 to 20 times as long as that of MSE_a, 35 to 85 times for 7
+    frequency torus alias as in MSE_a. A value takes 7 to 18 times as long as that of MSE_a, 35 to 85 times for 7
     wavelengths over 20 %, and its gradient two to three times the value.
 
     Examples
