@@ -145,6 +145,14 @@ def test_a_restoration_is_not_told_the_turbulence_of_a_simulated_stack(folder):
     assert (told.known_r0, told.recipe.r0, told.recipe.outer_scale) == (True, 0.2, 7.0)
 
 
+def test_a_mask_wider_than_the_telescope_is_refused():
+    wide = MaskOptions(mask=Path("jwst_niriss_ami_7"))
+    with pytest.raises(ValueError, match=r"for a pupil of 6.559 m, but the telescope has 1.2 m: .* --mask-diameter"):
+        load_aperture(wide, KNOWN.telescope)
+    assert load_aperture(dataclasses.replace(wide, mask_diameter=1.2), KNOWN.telescope).mask_diameter == 1.2
+    assert load_aperture(wide, Telescope(diameter=6.5)).mask_diameter == 6.559  # as telescopes are rounded
+
+
 def test_a_full_pupil_is_that_of_the_telescope(folder, capsys):
     telescope = dataclasses.replace(KNOWN.telescope, vane_width=0.05, vane_angles=(0.0, 90.0))
     vaned = dataclasses.replace(KNOWN, telescope=telescope)
@@ -170,7 +178,7 @@ def test_what_is_given_of_a_full_pupil_wins():
 def test_patterns_without_a_size_are_as_wide_as_the_telescope():
     golay = load_aperture(MaskOptions(mask=Path("golay6"), fill_factor=0.1), KNOWN.telescope)
     assert golay.mask_diameter == 1.2
-    built = load_aperture(MaskOptions(mask=Path("niriss"), allow_overlap=True), KNOWN.telescope)
+    built = load_aperture(MaskOptions(mask=Path("niriss"), allow_overlap=True), Telescope(diameter=8.0))
     assert built.mask_diameter == SparseAperture.from_catalog("niriss").mask_diameter
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import json
+import warnings
 
 import matplotlib.figure
 import numpy as np
@@ -226,8 +227,46 @@ def test_the_map_is_asked_at_the_size_light_and_frames_of_each_point(monkeypatch
 
     monkeypatch.setattr(SuccessMap, "outlook", outlook)
     found = plan_observation(make(), aperture=MASK, exposures=(2e-3, 6e-3), n_frequencies=32)
-    expected = [(MASK.subaperture_diameter / 0.15, choice.photons, choice.frames) for choice in found.choices]
-    assert sorted(asked) == sorted(expected)
+    expected = []
+    for choice in found.choices:  # photons that would tell as much without sky and 3 electrons of read-out noise
+        photons = choice.photons**2 / (choice.photons + 64**2 * (choice.sky + 9))
+        expected.append((MASK.subaperture_diameter / 0.15, pytest.approx(photons, rel=1e-12), choice.frames))
+    assert asked == expected
+
+
+def test_less_light_than_was_tried_loses_the_share_that_the_linear_estimate_loses(monkeypatch, quick):
+    """Down to the least light tried errors are a quarter of those predicted; from no light nothing is expected."""
+    axes = {"n_photons": (1e5, 1e12), "exposures": (0, 100), "spreads": (0, 100)}
+    halves = SmearingMap(**axes, exposure_ratio=np.full((2, 2), 0.5), band_ratio=np.full((2, 2), 0.5))
+    monkeypatch.setattr(torchmask.planning.plan, "smearing_map", lambda: halves)
+    quiet = {"site": Site(r0=0.15, wind=10.0), "camera": Camera(n_pixels=64), "observing_time": None, "n_frames": 10}
+
+    def plan(photons, frames=10, **changes):
+        source = Source(photon_rate=photons / (0.5 * float(MASK.area) * 4e-3))
+        known = make(**(quiet | {"source": source, "n_frames": frames} | changes))
+        return plan_observation(known, aperture=MASK, exposures=(4e-3,), n_frequencies=32).best
+
+    tried = plan(1e5)
+    floor = tried.relative_mse - tried.above_floor
+    assert tried.blind_mse == pytest.approx(floor + tried.above_floor / 4, rel=1e-12)
+    with warnings.catch_warnings(action="ignore"):  # of photons beyond those tried
+        faint, dark = plan(20.0), plan(1e-3)
+        drowned = plan(2e5, camera=Camera(n_pixels=64, readout_noise=1e3))
+    kept = (1 - faint.relative_mse) / (1 - tried.relative_mse)
+    assert kept < 0.9
+    assert 1 - faint.blind_mse == pytest.approx(kept * (1 - tried.blind_mse), rel=1e-9)
+    gained = (1 - tried.blind_mse) / (1 - tried.relative_mse)
+    assert 0 <= 1 - dark.blind_mse <= 0.01 * gained  # a hundredth of a photon in all tells that share of an image
+    assert drowned.relative_mse > 0.5
+    assert drowned.blind_mse > 0.4  # a quarter of the prediction would be as good as bright light
+
+
+def test_pixels_that_undersample_are_refused_before_any_search(quick):
+    coarse = make(camera=Camera(pixel_scale=0.3))
+    with pytest.raises(ValueError, match=r"\(0.3 arcsec\) undersamples an aperture of 1 m"):
+        plan_observation(coarse, **AXES, **TINY)
+    with pytest.raises(ValueError, match="undersamples an aperture"):  # at the shortest wavelength of the widest band
+        plan_observation(make(camera=Camera(pixel_scale=0.0565)), widths=(10e-9, 100e-9), **AXES, **TINY)
 
 
 def test_exposure_and_width_are_best_where_light_balances_what_their_smearing_costs(monkeypatch, quick):

@@ -167,12 +167,25 @@ class MaskOptions(CatalogOptions):
 _PUPIL = ("central_obstruction", "vane_width", "vane_angles")  # of a full pupil, in `MaskOptions` and `Telescope`
 
 
+_BEYOND = 1.05  # times the telescope's diameter, by which nominal pupils of real masks differ from it
+
+
 def load_aperture(options: MaskOptions, telescope: Telescope | None = None) -> Aperture:
-    """Return the aperture of `options.mask`, float64. Raises ValueError if it is missing, unknown or invalid.
+    """Return the aperture of `options.mask`, float64.
 
     A full pupil, and a pattern of the catalogue that has no size, are those of the telescope where the options say
-    nothing else.
+    nothing else. Raises ValueError if the aperture is missing, unknown, invalid, or wider than the telescope.
     """
+    aperture = _find_aperture(options, telescope)
+    if telescope is not None and aperture.mask_diameter > _BEYOND * telescope.diameter:
+        raise ValueError(
+            f"--mask {options.mask} is for a pupil of {aperture.mask_diameter:.4g} m, but the telescope has "
+            f"{telescope.diameter:.4g} m: give another mask or telescope, or --mask-diameter to a mask of the catalogue"
+        )
+    return aperture
+
+
+def _find_aperture(options: MaskOptions, telescope: Telescope | None) -> Aperture:
     if options.mask is None:
         raise ValueError(
             f"--mask is missing: give a mask file ({', '.join(MASK_SUFFIXES)}), a name from `torchmask masks`, or "

@@ -184,6 +184,14 @@ class Instrument:
             return 0.0
         return self._rate(self.site.sky) * area * self.exposure * (self.pixel_scale / ARCSEC) ** 2
 
+    def equivalent_photons(self, area: float) -> float:
+        """Return the electrons per frame that would tell as much of the target without sky and read-out noise.
+
+        That is photons^2 / noise, where noise is the variance of a frame that photons, sky and read-out make [m^2].
+        """
+        photons, camera = self.photons(area), self.camera
+        return photons**2 / (photons + camera.n_pixels**2 * (self.sky(area) + camera.readout_noise**2))
+
     def noise_psd(self, area: float) -> NoisePSD:
         """Return the PSD of the target's photon noise and the camera's read-out noise, without that of the sky."""
         return NoisePSD(self.photons(area), self.camera.readout_noise, self.camera.n_pixels**2)

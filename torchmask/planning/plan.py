@@ -76,7 +76,8 @@ def plan_observation(
     Raises
     ------
     ValueError
-        For an axis that is empty or holds what cannot be, and if no point can be built: says why.
+        For an axis that is empty or holds what cannot be, pixels that undersample the image at the shortest wavelength,
+        and if no point can be built: says why.
 
     Warns
     -----
@@ -108,6 +109,7 @@ def plan_observation(
     exposed = [one for band in bands for one in _exposed(band, lengths, left_out)]
     if not exposed:
         raise ValueError(f"no exposure is short enough: {left_out[0]}")
+    _check_sampling(exposed, aperture)
     if aperture is None:
         masks = _search(
             instrument,
@@ -162,6 +164,14 @@ def _exposed(instrument: Instrument, lengths: Sequence[float], left_out: list[st
         except ValueError as error:
             left_out.append(str(error))
     return found
+
+
+def _check_sampling(exposed: Sequence[Instrument], aperture: Aperture | None) -> None:
+    """Raise ValueError if pixels undersample the image of the aperture, or of the telescope where it is None."""
+    for instrument in exposed:
+        diameter = instrument.telescope.diameter  # which some real masks reach beyond
+        extent = diameter if aperture is None else min(diameter, float(aperture.extent))
+        replace(instrument.grid(), wavelength=instrument.band.shortest).require_sampling(extent)
 
 
 def _rules(instrument: Instrument, constraints: Sequence[Constraint]) -> tuple[Constraint, ...]:
@@ -220,8 +230,8 @@ def _measure(
             light = instrument.exposure, instrument.width, instrument.frames, photons, sky
             blind, expected = None, error
             if not mask.is_full:
-                blind, still = _blind_outlook(instrument, hole, photons), instants[n, hole, place]
-                expected = blind.mse(still, still - floor)
+                blind = _blind_outlook(instrument, hole, area)
+                expected = _expected_error(blind, *instants[n, hole, place], floor)
             choices.append(Choice(n, hole, *light, error, error - floor, expected, blind))
             _tell(callback, "plan/map", len(choices), n_steps, error)
     return sorted(choices, key=lambda choice: tuple(getattr(choice, name) for name in AXES))
@@ -229,10 +239,11 @@ def _measure(
 
 def _predict_instants(
     exposed: Sequence[Instrument], masks: dict[tuple[int, float], Aperture], n_frequencies: int
-) -> dict[tuple[int, float, int], float]:
+) -> dict[tuple[int, float, int], tuple[float, float]]:
     """Return the error predicted for instants in narrow light with the photons of each exposure, for each mask.
 
-    What is known of the turbulence then depends on the holes alone.
+    What is known of the turbulence then depends on the holes alone. The second error is that in the least light in
+    which restorations were tried, if there is less: it is that of as many more frames.
     """
     errors, criterion = {}, None
     for (n, hole), mask in sorted(masks.items(), key=lambda item: item[0][1]):
@@ -240,13 +251,31 @@ def _predict_instants(
             area = float(mask.area)
             criterion = criterion or instant_criterion(instrument, area, n_frequencies)
             change_light(criterion, instrument, area)
-            errors[n, hole, place] = float(criterion.relative(mask))
+            error = tried = float(criterion.relative(mask))
+            if (lacking := smearing_map().n_photons[0] / instrument.equivalent_photons(area)) > 1:
+                more = replace(instrument, observing_time=None, n_frames=round(lacking * instrument.frames))
+                change_light(criterion, more, area)
+                tried = float(criterion.relative(mask))
+            errors[n, hole, place] = error, tried
     return errors
 
 
-def _blind_outlook(instrument: Instrument, hole: float, photons: float) -> BlindOutlook:
-    """Return what was measured of restorations that have to find the aberrations behind holes of this diameter [m]."""
-    r0, diameter = instrument.site.r0, instrument.telescope.diameter
+def _expected_error(blind: BlindOutlook, error: float, tried: float, floor: float) -> float:
+    """Return the error expected of a blind restoration, where `error` is predicted for instants in narrow light.
+
+    `tried` is predicted for the least light in which restorations were tried, or is `error` where there is more. In
+    less light a restoration is taken to lose the same share of the image as the linear estimate does, so that from no
+    light nothing is expected.
+    """
+    return 1 - (1 - blind.mse(tried, tried - floor)) * (1 - error) / (1 - tried)
+
+
+def _blind_outlook(instrument: Instrument, hole: float, area: float) -> BlindOutlook:
+    """Return what was measured of restorations that have to find the aberrations behind holes of this diameter [m].
+
+    `area` is that of all holes [m^2].
+    """
+    r0, diameter, photons = instrument.site.r0, instrument.telescope.diameter, instrument.equivalent_photons(area)
     instants = success_map().outlook(hole / r0, photons, instrument.frames)
     spread = phase_spread(instrument.band.relative_width, diameter / r0)
     exposure = instrument.exposure / instrument.seeing.tau0

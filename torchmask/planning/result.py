@@ -134,8 +134,9 @@ class ObservationPlan:
         between = self.best_width if len(self.axis("width")) > 1 else None
         width = "" if between is None else f"; best width: {1e9 * between:.4g} nm"
         lines = [
-            f"Least predicted error of a blind restoration: {best.blind_mse:.4g}, of which no mask of this diameter "
-            f"can avoid {best.relative_mse - best.above_floor:.4g}, with {_point(best)} "
+            f"Least predicted error of a blind restoration, from 0 for a perfect image to 1 for an empty one: "
+            f"{best.blind_mse:.4g}, of which no mask of this diameter can avoid "
+            f"{best.relative_mse - best.above_floor:.4g}, with {_point(best)} "
             f"({best.hole_diameter / told.site.r0:.2g} r0, {best.exposure / told.seeing.tau0:.2g} tau0){band} and "
             f"{best.photons:.4g} photons in each.",
             _blind_line(best.blind),
