@@ -56,7 +56,15 @@ def test_the_file_holds_the_observables_of_the_frames(n_stacks, seen, tmp_path, 
     ("options", "message"),
     [
         (["--oifits"], "give --bandwidth [m]"),
-        (["--oifits", "--bandwidth", "-1"], "--bandwidth is -1: it must be finite"),
+        (
+            ["--oifits", "--bandwidth", "-1"],
+            "--bandwidth is -1: it must be positive and less than twice the wavelength",
+        ),
+        (
+            ["--oifits", "--bandwidth", "20"],
+            "--bandwidth is 20: it must be positive and less than twice the wavelength",
+        ),
+        (["--wavelengths", "545", "555"], "--wavelengths is 545: it must be a wavelength of light in m"),
     ],
 )
 def test_an_unknown_band_is_refused_before_any_work(options, message, seen, tmp_path, capsys):

@@ -102,6 +102,13 @@ def test_what_is_given_wins_over_the_header():
     assert electrons(cards, gain=2.0, exposure_time=3.0) == pytest.approx(6.0)
 
 
+@pytest.mark.parametrize("unit", ["electron", "photon/s"])
+def test_a_gain_that_would_be_ignored_is_refused(unit):
+    with pytest.raises(ValueError, match=f"gain is 3, in electrons per adu, but the unit of a.fits is {unit}: leave"):
+        electrons_per_unit({"BUNIT": unit}, "a.fits", False, None, 3.0, 1.0)
+    assert electrons_per_unit({"BUNIT": unit, "GAIN": 3.0}, "a.fits", False, None, None, 1.0) == 1  # of the camera
+
+
 def test_pixels_without_a_unit_are_never_taken_for_electrons():
     for cards in ({}, {"GAIN": 0.0}):
         with pytest.raises(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from torchmask.cli.options import require_wavelength
 from torchmask.instrument.instrument import Instrument
 from torchmask.optics.band import Band
 from torchmask.optics.passband import Passband
@@ -52,9 +53,14 @@ class BandOptions(FilterOptions):
         return Band.of(self.wavelengths, self.weights or None).width or None if self.wavelengths else None
 
     def band(self, wavelength: float) -> dict[str, Any]:
-        """Return the band as `MyopicDeconvolution` takes it. Raises ValueError for two bands or another filter."""
+        """Return the band as `MyopicDeconvolution` takes it.
+
+        Raises ValueError for two bands, another filter, or wavelengths that are not of light in m.
+        """
         if self.weights and not self.wavelengths:
             raise ValueError("--weights are those of --wavelengths: give both")
+        for one in self.wavelengths:
+            require_wavelength(one, "--wavelengths")
         band = self.filter_band(wavelength)
         if band is None:
             if self.temperature is not None:

@@ -45,8 +45,11 @@ def measure_frames(observation: Observation, options: OIFITSOptions, sky: Tensor
         raise ValueError(
             "--oifits needs the width of the band, but the header has no known FILTER: give --bandwidth [m] or --filter"
         )
-    if width is not None and not (math.isfinite(width) and width > 0):
-        raise ValueError(f"--bandwidth is {width:g}: it must be finite and positive, in m")
+    if width is not None and not 0 < width < 2 * observation.grid.wavelength:
+        raise ValueError(
+            f"--bandwidth is {width:g}: it must be positive and less than twice the wavelength, "
+            f"{observation.grid.wavelength:.4g}, in m"
+        )
     readout = observation.readout_noise
     if readout is not None:
         readout = math.hypot(readout, math.sqrt(torch.as_tensor(sky).mean()))  # a subtracted sky leaves its noise

@@ -135,13 +135,14 @@ def electrons_per_unit(
     `unit`, or else BUNIT, may be electrons or photons; adu, DN or counts (times the gain); any of these per second
     (times the exposure time of a frame); or MJy/sr (by JWST's PHOTMJSR). Without either it is adu if a gain is known.
 
-    Raises ValueError if the unit is missing or unknown, or a number for its conversion is missing.
+    Raises ValueError if the unit is missing or unknown, a number for its conversion is missing, or a gain is given for
+    electrons or photons.
     """
     with extra("data"):
         from astropy import units
 
     text = unit or str(header.get("BUNIT", "")).strip()
-    gain = (number(header, ("EGAIN", "GAIN"), path) or None) if gain is None else gain
+    given, gain = gain, (number(header, ("EGAIN", "GAIN"), path) or None) if gain is None else gain
     if not text:
         if gain is not None:
             return gain
@@ -149,6 +150,11 @@ def electrons_per_unit(
 
     def electrons(counted: Any) -> float:
         if counted in (units.electron, units.photon):
+            if given is not None:
+                raise ValueError(
+                    f"gain is {given:g}, in electrons per adu, but the unit of {path} is {text}: leave it out, or give "
+                    "unit as adu"
+                )
             return 1.0
         if gain is None:
             raise missing(path, f"GAIN or EGAIN, which its unit {text} needs", "gain [electrons per adu]")
