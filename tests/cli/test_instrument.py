@@ -145,6 +145,17 @@ def test_a_restoration_is_not_told_the_turbulence_of_a_simulated_stack(folder):
     assert (told.known_r0, told.recipe.r0, told.recipe.outer_scale) == (True, 0.2, 7.0)
 
 
+@pytest.mark.parametrize(
+    "command", ["design", "rank golay6", "simulate --mask {folder}/mask.json", "table {folder}/table"]
+)
+def test_another_wavelength_than_that_of_r0_and_light_is_refused(command, folder, capsys):
+    words = [*command.format(folder=folder).split(), "--instrument", f"{folder}/instrument.json"]
+    assert main([*words, "--wavelength", "900e-9"]) == 1
+    told = capsys.readouterr().err
+    assert "--wavelength is 9e-07 m, but r0 and light of --instrument" in told
+    assert "are those at 7e-07 m: change the wavelength there" in told
+
+
 def test_a_mask_wider_than_the_telescope_is_refused():
     wide = MaskOptions(mask=Path("jwst_niriss_ami_7"))
     with pytest.raises(ValueError, match=r"for a pupil of 6.559 m, but the telescope has 1.2 m: .* --mask-diameter"):

@@ -44,6 +44,17 @@ def test_masks_of_catalogue_files_and_searches_are_ranked(tmp_path, capsys):
     assert "not ranked: keck_lws_pattern2a_9, as built: 3 pairs of holes overlap" in said
 
 
+def test_two_masks_of_one_name_are_refused_before_any_search(tmp_path, capsys):
+    for folder in ("one", "other"):
+        (tmp_path / folder).mkdir()
+        save_json(tmp_path / folder / "mask.json", SparseAperture.from_catalog("golay6", 2.0, 0.05))
+    files = [str(tmp_path / folder / "mask.json") for folder in ("one", "other")]
+    for words, name in (([*files, "--search", "6"], "mask"), (["golay6", "--search", "6", "6"], "torchmask_6")):
+        assert main(["rank", *words, *TINY, "--out", str(tmp_path / "run")]) == 1
+        assert f"two masks are named {name}: leave one out" in capsys.readouterr().err
+        assert not (tmp_path / "run").exists()
+
+
 def test_light_and_sky_are_in_proportion_to_the_area():
     seen = {"criterion": "turbulent", "r0": 0.2, "outer_scale": 20.0, "sky": 3.0, "n_photons": 1e6}
     whole = observed(Options(**seen, n_frequencies=32, readout_noise=2.0, n_pixels=64))

@@ -167,6 +167,7 @@ class ObservationOptions(CriterionOptions):
             raise ValueError(f"--fill-factor is {fill_factor:g}: it must be finite and positive")
         if self.n_pixels < 1:
             raise ValueError(f"--n-pixels is {self.n_pixels}: it must be at least 1")
+        self.require_its_wavelength(self.wavelength)
         area = math.pi / 4 * fill_factor * self.mask_diameter**2
         photons = self.n_photons
         if photons is None:

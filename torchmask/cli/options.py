@@ -20,6 +20,7 @@ from torchmask.record import Callback
 
 DEFAULT_PHOTONS = 1e7  # per frame, if neither an option nor an instrument says it
 FULL = "full"  # name of a full pupil
+_SAME = 0.01  # relative difference of wavelengths that changes nothing else
 MASK_SUFFIXES = (".json", ".dxf", ".fits")
 
 
@@ -49,6 +50,15 @@ class InstrumentOptions:
     def known_instrument(self) -> Instrument | None:
         """Return the instrument of the file, None without one."""
         return None if self.instrument is None else Instrument.load(self.instrument)
+
+    def require_its_wavelength(self, wavelength: float) -> None:
+        """Raise ValueError for another wavelength [m] than that of the instrument, for which it says r0 and light."""
+        known = self.known_instrument()
+        if known is not None and abs(wavelength / known.mean_wavelength - 1) > _SAME:
+            raise ValueError(
+                f"--wavelength is {wavelength:.4g} m, but r0 and light of --instrument {self.instrument} are those at "
+                f"{known.mean_wavelength:.4g} m: change the wavelength there, with r0 and magnitude"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)

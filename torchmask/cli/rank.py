@@ -63,11 +63,23 @@ class Options(ObservationOptions, MaskRules, RunOptions):
 
 
 def patterns(options: Options) -> list[Pattern]:
-    """Return the masks of the options. Raises ValueError for an unknown name or a file that is no mask."""
-    return [
+    """Return the masks of the options.
+
+    Raises ValueError for an unknown name, a file that is no mask, and two masks or searches of one name.
+    """
+    found = [
         Pattern.of(Path(name).stem, load_mask(name)) if is_mask_file(Path(name)) else Pattern.from_catalog(name)
         for name in options.masks or catalog.names()
     ]
+    names = [pattern.name for pattern in found] + [_searched_name(n) for n in options.search]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ValueError(f"two masks are named {twice[0]}: leave one out, or copy its file to another name")
+    return found
+
+
+def _searched_name(n: int) -> str:
+    return f"torchmask_{n}"
 
 
 def search_masks(options: Options, criterion: AsymptoticMSE, output: Run) -> dict[str, SparseAperture]:
@@ -84,7 +96,7 @@ def search_masks(options: Options, criterion: AsymptoticMSE, output: Run) -> dic
             constraints=options.constraints(),
             callback=_in_one_run(output.callback, n),
         )
-        name = f"torchmask_{n}"
+        name = _searched_name(n)
         masks[name] = result.aperture
         save_json(output.directory / f"{name}.json", result.aperture, options.wavelength)
     return masks

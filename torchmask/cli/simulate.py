@@ -225,6 +225,7 @@ def run(options: Options) -> None:
     true = options.true_mask.apply(told)
     aperture = true or told
     wavelength = observing_wavelength(options)
+    options.require_its_wavelength(wavelength)
     photons, sky = (DEFAULT_PHOTONS, 0.0) if known is None else (known.photons(told.area), known.sky(told.area))
     n_photons = photons if options.n_photons is None else options.n_photons
     conditions = options.conditions.make(options.turbulence.exposure_time, wavelength, sky)

@@ -55,6 +55,7 @@ class Options(ExposureOptions, DesignSpace, WorkerOptions, DebugOptions):
 def run(options: Options) -> None:
     """Fill the table, or go on with it."""
     require_wavelength(options.wavelength)
+    options.require_its_wavelength(options.wavelength)
     space = DesignSpace(**{item.name: getattr(options, item.name) for item in dataclasses.fields(DesignSpace)})
     area = math.pi / 4 * space.reference_fill_factor * space.mask_diameter**2
     conditions = options.conditions(space.wavelength, area)
