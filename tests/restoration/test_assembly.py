@@ -11,6 +11,7 @@ from torchmask.restoration.candidates import Candidates
 from torchmask.restoration.checkpoint import Progress, Status
 from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.objective import Free
+from torchmask.restoration.posterior import evenness
 
 UNIT, NOISE = 500.0, 0.03  # electrons, and the noise of `explained` in units of the mean
 
@@ -89,3 +90,14 @@ def test_deviations_are_of_what_is_free(ended):
     assert bool((stack.photon_share[stack.valid] == 1).all())
     torch.testing.assert_close(brighter.photon_share, stack.photon_share)
     torch.testing.assert_close(twice.object_std, 2 * of_object.object_std)
+
+
+def test_deviations_of_an_even_object_are_smaller_unless_light_was_faint(ended):
+    objective, stack, progress = ended
+    result = assemble_result(objective, stack, progress, r0=0.2)
+    bright, faint = (
+        add_deviations(result, objective, stack, replace(progress, integrated=integrated), 2).object_std
+        for integrated in (False, True)
+    )
+    assert evenness(progress.state.image) < 0.8
+    torch.testing.assert_close(bright, faint * evenness(progress.state.image))

@@ -21,6 +21,7 @@ from torchmask.restoration.posterior import (
     _gradient_prior,
     _prior_noise,
     _sample,
+    evenness,
     smooth,
 )
 from torchmask.restoration.priors import TotalVariation, divergence, gradient
@@ -56,6 +57,26 @@ def test_smooth_is_a_gaussian_of_that_width():
     y, x = torch.meshgrid(torch.arange(64.0) - 20, torch.arange(48.0) - 30, indexing="ij")
     expected = torch.exp(-(y**2 + x**2) / (2 * 3.0**2)) / (2 * math.pi * 3.0**2)
     torch.testing.assert_close(smooth(point, 3.0), expected.double(), rtol=0, atol=1e-8)  # float32 distances
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-12, 1e9])
+@pytest.mark.parametrize("side", [3, 12, 30])
+def test_deviations_of_even_objects_shrink_with_the_share_of_even_pixels(side, scale):
+    """Of a square, whose last row and column have gradients, towards the next pixel; a faint pedestal is none of it."""
+    image = torch.zeros(64, 48, dtype=torch.float64)
+    image[8 : 8 + side, 6 : 6 + side] = scale
+    share = (1 - 1 / side) ** 2
+    for pedestal in (0.0, 0.05 * scale):
+        assert evenness(image + pedestal) == pytest.approx((0.4 / share) ** 2, rel=1e-12)
+
+
+def test_deviations_of_other_objects_stay():
+    """Of one that is rough, of a square of 2 x 4 pixels with three even ones, of one pixel, and of none."""
+    rough = torch.rand(64, 48, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    square, point = torch.zeros(2, 64, 48, dtype=torch.float64)
+    square[8:10, 6:10], point[3, 4] = 1.0, 1.0
+    for image in (rough, square, point, 0 * point):
+        assert evenness(image) == 1.0
 
 
 def test_noise_of_the_prior_has_its_hessian_as_covariance():

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchmask.restoration.checkpoint import Progress, Status
 from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.objective import MyopicObjective
-from torchmask.restoration.posterior import place_deviations, standard_deviations
+from torchmask.restoration.posterior import evenness, place_deviations, standard_deviations
 from torchmask.restoration.result import RestorationResult
 from torchmask.restoration.state import State
 from torchmask.restoration.traits import Refinement
@@ -82,6 +82,8 @@ def add_deviations(
     """Return the result with standard deviations of the object, up to the cut-off, and of the coefficients."""
     model = objective.model
     image, z = standard_deviations(objective, progress.state, model.cutoff, stack.photon_share, n_samples)
+    if not progress.integrated:  # in faint light it is the prior that makes an object even
+        image = image * evenness(progress.state.image)
     spread = torch.stack([model.aberrations.coefficients(sample) for sample in z]).square().mean((0, 1)).sqrt()
     spread = spread[:, : result.coefficients.shape[-1]]
     return replace(result, object_std=model.window.crop(image) * stack.unit, coefficients_std=spread)
