@@ -11,6 +11,7 @@ from torch.func import functional_call, grad, jacrev, vmap
 
 from torchmask.design.criterion import AsymptoticMSE, wiener_mse
 from torchmask.design.overlap import baseline_mse
+from torchmask.design.turbulent import TurbulentMSE
 from torchmask.grid import Grid
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.otf import OTF, analytic_otf
@@ -20,6 +21,7 @@ from torchmask.spectra import NoisePSD, PowerLawPSD
 
 GRID = Grid.nyquist(1.0, 550e-9, 16)
 CRITERION = AsymptoticMSE(GRID, PowerLawPSD(1.5, 1e4), NoisePSD(1e4), n_frames=5)
+TURBULENT = TurbulentMSE(GRID, PowerLawPSD(1.5, 1e4), NoisePSD(1e4), n_frames=5, r0=0.2)
 SIZE = {"subaperture_diameter": 0.3, "mask_diameter": 1.0}
 
 
@@ -45,6 +47,7 @@ OF_CENTERS: dict[str, Callable[[Tensor], Tensor]] = {
     "MSE_a of discs": lambda c: CRITERION(SparseAperture(c, **SIZE)),
     "MSE_a of hexagons": lambda c: CRITERION(SparseAperture(c, **SIZE, shape="hexagon")),
     "MSE_a of squares": lambda c: CRITERION(SparseAperture(c, **SIZE, shape="square")),
+    "MSE under turbulence": lambda c: TURBULENT(SparseAperture(c, **SIZE)),
     "relative MSE_a of a population": lambda c: CRITERION.relative(SparseAperture(torch.stack([c, 2 * c]), **SIZE)),
     "Wiener error": lambda c: wiener_mse(
         analytic_otf(SparseAperture(c, **SIZE), GRID, PISTONS), CRITERION.object_psd, CRITERION.noise_psd

@@ -1,6 +1,7 @@
 import math
 import re
 
+import numpy as np
 import pytest
 import torch
 
@@ -43,11 +44,22 @@ def test_undersampling_is_refused_with_a_pixel_scale_that_is_accepted():
             Grid(64, accepted, 550e-9).require_sampling(diameter)
 
 
+def test_numbers_of_numpy_and_torch_become_plain_ones():
+    plain = Grid((64, 48), 2.75e-7, 550e-9)
+    frames = torch.zeros(3, 64, 48)
+    for n_pixels in (frames.shape[1:], [np.int64(64), np.int32(48)]):
+        grid = Grid(n_pixels, np.float64(2.75e-7), torch.tensor(550e-9, dtype=torch.float64))
+        assert (grid, hash(grid), repr(grid)) == (plain, hash(plain), repr(plain))
+    assert type(Grid(np.int64(64), np.float32(2.75e-7), 550e-9).period) is float
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ((1, 1e-7, 1e-6), "n_pixels"),
         ((12.5, 1e-7, 1e-6), "n_pixels"),
+        (((8, 8, 8), 1e-7, 1e-6), "n_pixels"),
+        (((), 1e-7, 1e-6), "n_pixels"),
         ((8, 0.0, 1e-6), "pixel_scale"),
         ((8, math.nan, 1e-6), "pixel_scale"),
         ((8, 1e-7, -1e-6), "wavelength"),

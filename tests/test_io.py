@@ -18,6 +18,7 @@ from hypothesis.extra import numpy as hnp
 
 from torchmask.io import (
     as_array,
+    as_tensor,
     atomic_write,
     free_name,
     load_npz,
@@ -140,6 +141,17 @@ def test_npz_round_trip(tmp_path_factory, array):
     for value in stored.values():
         assert value.dtype == array.dtype
         np.testing.assert_array_equal(value, array)
+
+
+def test_arrays_of_another_order_of_bytes_become_tensors(tmp_path):
+    values = np.arange(6.0).reshape(2, 3)
+    save_npz(tmp_path / "a.npz", {"fits": values.astype(">f4"), "number": np.array(2.0, ">f8")})
+    stored = load_npz(tmp_path / "a.npz")
+    assert torch.equal(torch.from_numpy(stored["fits"]), torch.arange(6.0).reshape(2, 3))
+    assert stored["number"].shape == as_tensor(stored["number"]).shape == ()
+    assert torch.equal(as_tensor(values.astype(">f8")[::-1]), torch.from_numpy(values).flip(0))
+    tensor = torch.ones(2, requires_grad=True)
+    assert as_tensor(tensor) is tensor
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.complex64, torch.int64, torch.bool])

@@ -296,7 +296,9 @@ def test_arrays_and_frames_with_a_gradient_are_frames_too():
     frames = frames_of(3)
     valid = frames > 0.1
     expected = check_frames(frames, valid, GRID)
-    for given in ((frames.numpy(), valid.numpy()), (frames.clone().requires_grad_(), valid)):
+    of_fits = frames.numpy().astype(">f8"), valid.numpy()  # the most significant byte comes first in FITS
+    flipped = (np.flip(np.flip(values.numpy()).copy()) for values in (frames, valid))  # with negative strides
+    for given in ((frames.numpy(), valid.numpy()), of_fits, flipped, (frames.clone().requires_grad_(), valid)):
         for one, other in zip(expected, check_frames(*given, GRID), strict=True):
             assert torch.equal(one, other)
             assert not other.requires_grad
@@ -312,6 +314,7 @@ def test_arrays_and_frames_with_a_gradient_are_frames_too():
         (lambda f: f.index_fill(0, torch.tensor([1]), math.nan), r"frames \[1\] hold values that are not finite"),
         (lambda f: f.index_fill(0, torch.tensor([2]), 0.0), r"frames \[2\] hold no light"),
         (lambda f: -f, r"frames \[0, 1, 2\] hold no light"),
+        (lambda f: f + 0j, "must be real"),
     ],
 )
 def test_what_is_no_stack_of_frames_is_refused(change, message):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from numbers import Integral
 
 import torch
 from torch import Tensor
@@ -48,12 +49,16 @@ class Grid:
     wavelength: float
 
     def __post_init__(self) -> None:
-        sides = self.n_pixels if isinstance(self.n_pixels, tuple) else (self.n_pixels,)
-        for side in sides:
-            if not isinstance(side, int) or side < 2 or len(sides) > 2:
-                raise ValueError(f"n_pixels is {self.n_pixels}: it must be one or two whole numbers of at least 2")
+        given = self.n_pixels
+        sides = tuple(given) if isinstance(given, tuple | list) else (given, given)
+        if len(sides) != 2 or not all(isinstance(side, Integral) and side >= 2 for side in sides):
+            raise ValueError(f"n_pixels is {given}: it must be one or two whole numbers of at least 2")
+        # Python's own numbers: those of NumPy and torch may be of low precision, and a tensor's hash is its identity
+        rows, columns = map(int, sides)
+        object.__setattr__(self, "n_pixels", (rows, columns) if isinstance(given, tuple | list) else rows)
         for name in ("pixel_scale", "wavelength"):
-            value = getattr(self, name)
+            value = float(getattr(self, name))
+            object.__setattr__(self, name, value)
             if not (math.isfinite(value) and value > 0):
                 unit = "rad per pixel" if name == "pixel_scale" else "m"
                 raise ValueError(f"{name} is {value}: it must be finite and positive, in {unit}")

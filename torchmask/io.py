@@ -30,6 +30,21 @@ def as_array(values: Any) -> np.ndarray:
     return values.numpy(force=True) if isinstance(values, Tensor) else np.asarray(values)
 
 
+def as_tensor(values: Any) -> Tensor:
+    """Convert an array, number or sequence to a tensor on the default device; a tensor stays as it is.
+
+    Arrays may have any strides, as flipped ones do, and any order of bytes, as those of FITS files do.
+    """
+    if isinstance(values, Tensor):
+        return values
+    return torch.as_tensor(_native(np.asarray(values)))
+
+
+def _native(array: np.ndarray) -> np.ndarray:
+    """Return the array in the order of bytes and with the strides that tensors have."""
+    return array.astype(array.dtype.newbyteorder("="), order="C", copy=False)
+
+
 @contextmanager
 def atomic_write(path: str | Path, *, replace: bool = False) -> Iterator[BinaryIO]:
     """Open a file that appears at `path` only if the block ends without an error; otherwise nothing is left behind.
@@ -124,7 +139,7 @@ def save_npz(path: str | Path, arrays: Mapping[str, Any], *, replace: bool = Fal
 
 
 def load_npz(path: str | Path, required: Sequence[str] = ()) -> dict[str, np.ndarray]:
-    """Read all arrays of an .npz file, without unpickling.
+    """Read all arrays of an .npz file, without unpickling, in this machine's order of bytes.
 
     Raises ValueError if the file is missing, damaged or not an .npz file, contains pickled objects, or lacks an array
     named in `required`.
@@ -148,7 +163,7 @@ def load_npz(path: str | Path, required: Sequence[str] = ()) -> dict[str, np.nda
     if missing:
         lacking, held = (", ".join(map(repr, names)) for names in (missing, arrays))
         raise ValueError(f"{path} has no {lacking}; it contains {held or 'nothing'}{need}")
-    return arrays
+    return {name: _native(array) for name, array in arrays.items()}
 
 
 def to_json(value: Any) -> Any:

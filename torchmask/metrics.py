@@ -15,7 +15,7 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
-from torchmask.io import extra
+from torchmask.io import as_tensor, extra
 
 _ROUNDING = 1e-9  # relative tolerance, so that frequencies exactly at the cut-off are kept
 _PEAK_PERCENTILE = 99.5  # glints above it would set the range of the structural similarity
@@ -31,7 +31,7 @@ def lowpass(image: Any, cutoff: float) -> Tensor:
         raise ValueError(
             f"cutoff is {cutoff}: it must be positive, in cycles/pixel (diameter * pixel_scale / wavelength)"
         )
-    image = image if isinstance(image, Tensor) else torch.as_tensor(image)  # which also moves to a default device
+    image = as_tensor(image)
     nu_y, nu_x = _frequencies(image.shape, torch.float64, image.device)
     kept = torch.hypot(nu_y, nu_x) <= cutoff * (1 + _ROUNDING)
     return torch.fft.irfft2(torch.fft.rfft2(image) * kept, s=image.shape[-2:])
@@ -154,7 +154,7 @@ def ssim(estimate: Any, truth: Any, cutoff: float) -> float:
 def _checked(estimate: Any, truth: Any) -> tuple[Tensor, Tensor]:
     images = []
     for name, values in (("estimate", estimate), ("truth", truth)):
-        image = torch.as_tensor(values, device="cpu").detach().double()
+        image = as_tensor(values).detach().cpu().double()
         if image.ndim != 2:
             raise ValueError(f"{name} has shape {tuple(image.shape)}: it must be one image, (rows, columns)")
         if not bool(torch.isfinite(image).all()):

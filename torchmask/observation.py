@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchmask.grid import Grid
-from torchmask.io import load_npz, save_npz
+from torchmask.io import as_tensor, load_npz, save_npz
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.bad_pixels import fill_bad_pixels
 from torchmask.optics.pixel import PixelResponse, pixel_record, read_pixel
@@ -226,10 +226,12 @@ def check_frames(
     Pixels that are not valid have no weight in later fits, but means and Fourier transforms need values for them, which
     `fill_bad_pixels` provides.
 
-    Raises ValueError if a shape is wrong, a valid pixel is not finite, or a frame has no light. The message names
-    frames by `numbers`, or from 0 if none are given.
+    Raises ValueError if the frames are complex, a shape is wrong, a valid pixel is not finite, or a frame has no light.
+    The message names frames by `numbers`, or from 0 if none are given.
     """
-    frames = frames if isinstance(frames, Tensor) else torch.as_tensor(frames)  # which also moves to a default device
+    frames = as_tensor(frames)
+    if frames.is_complex():
+        raise ValueError(f"frames are {frames.dtype}: they must be real, in electrons")
     if frames.ndim != 3 or tuple(frames.shape[1:]) != grid.shape or not len(frames):
         raise ValueError(
             f"frames has shape {tuple(frames.shape)}: the grid needs (n_frames, {grid.shape[0]}, {grid.shape[1]}), "
@@ -239,7 +241,7 @@ def check_frames(
     if valid is None:
         valid = torch.ones_like(frames, dtype=torch.bool)
     else:
-        valid = torch.as_tensor(valid, device=frames.device)
+        valid = as_tensor(valid).to(frames.device)
         if valid.dtype != torch.bool or tuple(valid.shape) not in (grid.shape, tuple(frames.shape)):
             raise ValueError(
                 f"valid is {valid.dtype} of shape {tuple(valid.shape)}: it must be bool, of shape {grid.shape} or "

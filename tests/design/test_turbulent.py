@@ -135,6 +135,8 @@ def test_a_band_of_one_wavelength_is_that_wavelength():
     assert (found - alone).abs().max() < 0.02 * float(alone[0, 4:].max())
     here = criterion_of(r0=0.2, wavelengths=[550e-9]).expected_power(mask)
     torch.testing.assert_close(here, criterion_of(r0=0.2).expected_power(mask), rtol=1e-12, atol=0)
+    thrice = criterion_of(r0=0.2, wavelengths=[550e-9] * 3).expected_power(mask)
+    assert torch.equal(thrice, here)
 
 
 def test_full_pupils_with_a_band_agree_with_the_general_integral():
@@ -324,6 +326,28 @@ def test_gradients_are_the_same_however_many_masks_are_in_work(monkeypatch):
         found.append(torch.autograd.grad(weight @ criterion.relative(SparseAperture(centers, 0.2, 1.0)), centers)[0])
     # sums over the same pixels in another order, at some thousand of them
     torch.testing.assert_close(*found, rtol=0, atol=1e-12 * float(found[0].abs().max()))
+
+
+def test_tables_made_in_inference_serve_a_training_too():
+    criterion = criterion_of(Grid.nyquist(1.0, 550e-9, 24), r0=0.25)
+    mask = SparseAperture(torch.nn.Parameter(mask_of(3).centers), 0.2, 1.0)
+    with torch.inference_mode():
+        value = float(criterion(mask))
+    trained = criterion(mask)
+    trained.backward()
+    assert float(trained.detach()) == value
+    assert float(mask.centers.grad.abs().max()) > 0
+
+
+@pytest.mark.parametrize("r0", [None, 0.25])
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_is_refused(r0, dtype):
+    """The square of photons overflows there: the relative error was 0, that of a perfect image."""
+    mask = mask_of(3)
+    with pytest.raises(ValueError, match="must be float32 or float64"):
+        criterion_of(n_photons=1e6, r0=r0).to(dtype).relative(mask)
+    with pytest.raises(ValueError, match="must be float32 or float64"):
+        criterion_of(n_photons=1e6, r0=r0)(mask.to(dtype))
 
 
 def test_a_second_derivative_is_refused():

@@ -16,6 +16,11 @@ def test_an_impossible_width_is_named(width):
         Band.top_hat(550e-9, width)
 
 
+def test_equal_wavelengths_are_one():
+    band = Band.of([5e-7, 6e-7, 5e-7], [1.0, 2.0, 5.0])
+    assert band == Band((5e-7, 6e-7), (0.75, 0.25))
+
+
 @pytest.mark.parametrize("n", [1, 3, 8])
 def test_a_top_hat_is_gauss_and_legendre(n):
     band = Band.top_hat(550e-9, 80e-9, n)

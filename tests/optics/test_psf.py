@@ -7,6 +7,7 @@ from torch import nn
 from torchmask.grid import Grid
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.psf import PSF, fold, psf_from_samples
+from torchmask.optics.zernike import ZernikePhase
 
 WAVELENGTH = 550e-9
 
@@ -102,3 +103,13 @@ def test_population_of_masks_and_frames_broadcast():
     assert images.shape == (2, 5, 32, 32)
     alone = PSF(SparseAperture(centers[1], 0.2, 1.0), grid)(phase[1, 3])
     assert torch.allclose(images[1, 3], alone, rtol=0, atol=1e-15)
+
+
+def test_a_phase_on_other_samples_and_half_precision_are_refused():
+    mask = SparseAperture([[0.0, 0.3], [0.2, -0.2]], 0.2, 1.0)
+    grid = Grid.nyquist(1.0, 550e-9, 32)
+    finer = ZernikePhase(mask, grid, 3, oversampling=2)(torch.zeros(4, 2, 3, dtype=torch.float64))
+    with pytest.raises(ValueError, match=r"samples\) = \(2, \d+\), on samples of the same aperture, grid and over"):
+        PSF(mask, grid)(finer)
+    with pytest.raises(TypeError, match=r"torch\.float16: float32 or float64 is needed"):
+        PSF(mask, grid).half()()

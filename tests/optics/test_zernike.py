@@ -289,6 +289,8 @@ def test_coefficients_must_fit_the_mask():
     module = ZernikePhase(mask_of_three(), Grid.nyquist(1.0, WAVELENGTH, 64), 6)
     with pytest.raises(ValueError, match=r"\(sub-apertures, modes\) = \(3, 6\)"):
         module(torch.zeros(6, 3, dtype=torch.float64))
+    with pytest.raises(TypeError, match=r"coefficients are torch\.float32 and the aperture is torch\.float64"):
+        module(torch.zeros(3, 6))
 
 
 def test_a_thin_ring_has_few_modes():

@@ -41,6 +41,15 @@ def test_beats_the_mean_frame_and_explains_the_data(observation, restored):
     )
 
 
+def test_a_restoration_in_inference_mode_is_the_same(restoring, observation):
+    """Its own prior needs autograd, which that mode turns off."""
+    method = restoring(prior=lambda image: image.square().sum(), max_iterations=3)
+    expected = method.restore(observation.frames).object
+    with torch.inference_mode():
+        found = method.restore(observation.frames).object
+    assert torch.equal(found, expected)
+
+
 def test_nothing_but_the_frames_is_needed(observe):
     """Over 16 seeds the error is 1.068 times that with turbulence and noise known, and r0 is 0.980 of the true one.
 

@@ -172,19 +172,24 @@ class AsymptoticMSE(nn.Module):
         """Return the same criterion with another grid and other PSDs."""
         return type(self)(grid, object_psd, noise_psd, self.n_frames)
 
-    def _geometry(self, aperture: Aperture) -> Geometry:
+    def _check(self, aperture: Aperture) -> None:
+        """Raise TypeError for anything but an aperture, and ValueError for devices that differ or half precision."""
         if not isinstance(aperture, Aperture):
             raise TypeError(f"aperture is a {type(aperture).__name__}: make a SparseAperture from the centres")
+        centers, psd = aperture.centers, self.object_psd
+        precise = (torch.float32, torch.float64)  # squares of photons overflow in others
+        if centers.dtype not in precise or psd.dtype not in precise or centers.device != psd.device:
+            raise ValueError(
+                f"the centres are {centers.dtype} on {centers.device}, the criterion {psd.dtype} on {psd.device}: both "
+                "must be float32 or float64, and on one device"
+            )
+
+    def _geometry(self, aperture: Aperture) -> Geometry:
+        self._check(aperture)
         if isinstance(aperture, FullAperture):
             raise ValueError(
                 "MSE_a is defined for masks (SparseAperture): a full pupil has aberrations that a piston per "
                 "sub-aperture does not describe; use TurbulentMSE with the r0 of the site, or wiener_mse of random OTFs"
-            )
-        centers = aperture.centers
-        if centers.dtype not in (torch.float32, torch.float64) or centers.device != self.object_psd.device:
-            raise ValueError(
-                f"the centres are {centers.dtype} on {centers.device}, the criterion is on {self.object_psd.device}: "
-                "both must be on one device, and the centres float32 or float64"
             )
         reach = aperture.outer_diameter
         if reach > 0.5 * self.grid.period * (1 + 1e-9):

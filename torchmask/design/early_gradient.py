@@ -46,6 +46,22 @@ class DifferentiatedOnce(torch.autograd.Function):
         raise RuntimeError("the criterion has a first derivative only: take differences of its gradient for a Hessian")
 
 
+def vmap_population(
+    function: type[EarlyGradient], in_dims: tuple[int | None, ...], centers: Tensor, *others: Any
+) -> tuple[tuple[Tensor, Tensor], tuple[int, int]]:
+    """Apply `function` under `torch.func.vmap`: the mapped axis is one more axis of the population.
+
+    The last of the other arguments says whether to differentiate. Raises ValueError unless only centres are mapped.
+    """
+    if in_dims[0] is None or in_dims[1:3] != (None, None):
+        raise ValueError("torch.func.vmap over a criterion runs over the centres: the PSDs must be the same for all")
+    rows = centers.movedim(in_dims[0], 0)
+    differentiate = others[-1] or (rows.requires_grad and torch.is_grad_enabled())
+    found = function.apply(rows.flatten(0, 1), *others[:-1], differentiate)
+    value, gradient = (part.reshape(len(rows), -1, *part.shape[1:]) for part in found)
+    return (value, gradient), (0, 0)
+
+
 def by_chunks(function: Callable[[Tensor], Tensor], centers: Tensor, size: int) -> Tensor:
     """Return `function` (B,) of masks with `centers` (B, N, 2), `size` of them at a time, differentiable once.
 
@@ -71,3 +87,7 @@ class _ByChunks(EarlyGradient):
                     gradients.extend(torch.autograd.grad(value.sum(), some))
             values.append(value.detach())
         return torch.cat(values), torch.cat(gradients)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *arguments: Any) -> Any:
+        return vmap_population(_ByChunks, in_dims, *arguments)

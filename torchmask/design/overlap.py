@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchmask.design.early_gradient import EarlyGradient
+from torchmask.design.early_gradient import EarlyGradient, vmap_population
 from torchmask.optics.shape_base import Patches, Shape
 
 # pixels of patches in work at a time: what a cache holds, and what amortises the launches of kernels
@@ -118,23 +118,8 @@ class _BaselineMSE(EarlyGradient):
         return torch.cat([value for value, _ in parts]), torch.cat([gradient for _, gradient in parts])
 
     @staticmethod
-    def vmap(
-        info: Any,
-        in_dims: tuple[int | None, ...],
-        centers: Tensor,
-        weight: Tensor,
-        ratio: Tensor,
-        geometry: Geometry,
-        differentiate: bool,
-    ) -> tuple[tuple[Tensor, Tensor], tuple[int, int]]:
-        """Treat the mapped axis as one more axis of the population."""
-        if in_dims[0] is None or in_dims[1:3] != (None, None):
-            raise ValueError("torch.func.vmap over MSE_a runs over the centres: the PSDs must be the same for all")
-        rows = centers.movedim(in_dims[0], 0)
-        differentiate = differentiate or (rows.requires_grad and torch.is_grad_enabled())
-        found = _BaselineMSE.apply(rows.flatten(0, 1), weight, ratio, geometry, differentiate)
-        value, gradient = (part.reshape(len(rows), -1, *part.shape[1:]) for part in found)
-        return (value, gradient), (0, 0)
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *arguments: Any) -> Any:
+        return vmap_population(_BaselineMSE, in_dims, *arguments)
 
 
 def _mse_and_gradient(

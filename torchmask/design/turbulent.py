@@ -152,7 +152,8 @@ class TurbulentMSE(AsymptoticMSE):
     def forward(self, aperture: Aperture) -> Tensor:
         if self.seeing is None:
             return super().forward(aperture)
-        if not isinstance(aperture, Aperture) or aperture.is_full:
+        self._check(aperture)
+        if aperture.is_full:
             return self._error(self._half_power(aperture))
         transfer, n, centers = self._table(aperture, self._mask_transfer), aperture.n_subapertures, aperture.centers
         flat = centers.reshape(math.prod(centers.shape[:-2]), n, 2)
@@ -189,8 +190,7 @@ class TurbulentMSE(AsymptoticMSE):
 
     def _half_power(self, aperture: Aperture) -> Tensor:
         """Return E|OTF|^2 (..., H // 2 + 1, W) at nu_y >= 0."""
-        if not isinstance(aperture, Aperture):
-            raise TypeError(f"aperture is a {type(aperture).__name__}: make a SparseAperture of the centres")
+        self._check(aperture)
         centers = aperture.centers
         if aperture.is_full:
             table = self._table(aperture, self._pupil_power)
@@ -206,7 +206,8 @@ class TurbulentMSE(AsymptoticMSE):
         if key not in self._tables:
             if len(self._tables) >= _KEPT:
                 self._tables.pop(next(iter(self._tables)))
-            with torch.device("cpu"):  # of whatever default device: tables are made in numpy and scipy
+            # whatever the default device: tables are made in numpy and scipy; a later call may need gradients
+            with torch.inference_mode(False), torch.device("cpu"):
                 self._tables[key] = make(aperture)
         return self._tables[key]
 

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from torchmask.io import as_tensor
 from torchmask.optics import catalog
 from torchmask.optics.packing import hole_diameter, random_packing
 from torchmask.optics.pupil import Aperture, can_be_read
@@ -76,7 +77,7 @@ class SparseAperture(Aperture):
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{name} is {value}: it must be finite and positive, in m")
         if not isinstance(centers, Tensor):
-            centers = torch.as_tensor(centers, dtype=torch.float64)
+            centers = as_tensor(centers).double()
         if centers.ndim < 2 or centers.shape[-1] != 2 or centers.shape[-2] < 1:
             raise ValueError(f"centers has shape {tuple(centers.shape)}: it must be (..., n_subapertures, 2), (x, y)")
         if not centers.is_floating_point():

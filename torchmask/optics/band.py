@@ -32,6 +32,8 @@ class Band:
     def of(cls, wavelengths: Sequence[float], weights: Sequence[float] | None = None) -> Band:
         """Return the band of these wavelengths [m], with light in proportion to `weights`, equal by default.
 
+        Equal wavelengths become one, with all their light.
+
         Raises ValueError if there is no wavelength, the numbers differ, or a value is not finite and positive.
         """
         shares = [1.0] * len(wavelengths) if weights is None else [float(weight) for weight in weights]
@@ -42,8 +44,10 @@ class Band:
         for name, values in (("wavelengths", wavelengths), ("weights", shares)):
             if not all(math.isfinite(value) and value > 0 for value in values):
                 raise ValueError(f"{name} are {list(values)}: they must be finite and positive")
-        total = sum(shares)
-        return cls(tuple(float(value) for value in wavelengths), tuple(share / total for share in shares))
+        total, light = sum(shares), dict.fromkeys(map(float, wavelengths), 0.0)
+        for wavelength, share in zip(wavelengths, shares, strict=True):
+            light[float(wavelength)] += share / total
+        return cls(tuple(light), tuple(light.values()))
 
     @classmethod
     def of_curve(cls, wavelengths: Sequence[float], transmission: Sequence[float], n_wavelengths: int = 5) -> Band:

@@ -43,6 +43,12 @@ def focal_intensity(samples: PupilSamples, phase: Tensor | None = None) -> Tenso
     phase changes. If all light lies within the raster, the sum is that of the squared open fractions.
     """
     weights, index = samples.weights, samples.index
+    needed = tuple(weights.shape[-2:])
+    if phase is not None and any(n not in (1, m) for n, m in zip(phase.shape[-2:], needed, strict=False)):
+        raise ValueError(
+            f"phase has shape {tuple(phase.shape)}: its last two axes must be (sub-apertures, samples) = {needed}, on "
+            "samples of the same aperture, grid and oversampling"
+        )
     if phase is not None and phase.ndim > weights.ndim:
         weights, index = weights.unsqueeze(-3), index.unsqueeze(-3)
     if phase is None:
@@ -86,7 +92,8 @@ class PSF(nn.Module):
     Raises
     ------
     ValueError
-        If the grid aliases the image or a sub-aperture is narrower than two pupil samples.
+        If the grid aliases the image or a sub-aperture is narrower than two pupil samples; in a call, if the phase lies
+        on other samples.
 
     Notes
     -----

@@ -99,6 +99,8 @@ class Aperture(nn.Module):
         ValueError
             If the image would be aliased, `oversampling` is not a positive whole number, or a sub-aperture is
             narrower than two samples.
+        TypeError
+            If the centres are in half precision.
         """
         self.require_sampling(grid)
         return sample_holes(self.centers, self.shape, self.subaperture_diameter, grid, oversampling)
@@ -115,6 +117,8 @@ def sample_holes(centers: Tensor, shape: Shape, diameter: float, grid: Grid, ove
 
     Aliasing of the image is not checked.
     """
+    if centers.dtype not in (torch.float32, torch.float64):
+        raise TypeError(f"the centres are {centers.dtype}: float32 or float64 is needed, as by aperture.float()")
     if oversampling != int(oversampling) or oversampling < 1:
         raise ValueError(f"oversampling is {oversampling}: it must be a whole number of at least 1")
     raster = (grid.shape[0] * oversampling, grid.shape[1] * oversampling)

@@ -118,7 +118,10 @@ class ZernikePhase(nn.Module):
     Raises
     ------
     ValueError
-        If `n_modes` is not a whole number of at least 1, or the aperture cannot be sampled on the grid.
+        If `n_modes` is not a whole number of at least 1, or the aperture cannot be sampled on the grid; in a call, if
+        coefficients have a wrong shape.
+    TypeError
+        If coefficients have another dtype than the aperture.
 
     Notes
     -----
@@ -162,6 +165,11 @@ class ZernikePhase(nn.Module):
         centers = self.aperture.centers
         moved = centers.requires_grad or not can_be_read(centers) or not torch.equal(centers, self.basis_centers)
         basis = self._evaluate() if moved else self.basis
+        if coefficients.dtype != basis.dtype:
+            raise TypeError(
+                f"coefficients are {coefficients.dtype} and the aperture is {basis.dtype}: convert one of them, for "
+                "example by aperture.to(torch.float32)"
+            )
         if coefficients.ndim >= basis.ndim:
             basis = basis.unsqueeze(-4)
         return torch.einsum("...npj,...nj->...np", basis, coefficients)

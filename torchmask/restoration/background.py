@@ -8,6 +8,8 @@ from enum import Enum
 import torch
 from torch import Tensor
 
+from torchmask.io import as_tensor
+
 _PRICE = 1.0  # relative to a weight of 1 of total variation, see docs/tried.md
 _BLOCKS = 8  # blocks along each side of the field, of which the darkest is sought
 _SEEN = 0.1  # of the mean light in the darkest part, where holes scatter up to 0.06, see docs/tried.md
@@ -114,7 +116,7 @@ def check_known_level(level: float | Tensor, frames: Tensor) -> Tensor:
         raise ValueError(
             f"background is {level!r}: electrons per pixel are needed, or an assumption such as Background.COMMON"
         )
-    given = torch.as_tensor(level, dtype=frames.dtype, device=frames.device)
+    given = as_tensor(level).to(frames)
     if not bool(torch.isfinite(given).all()):
         raise ValueError("background holds values that are not finite: electrons per pixel are needed")
     if bool((given < 0).any()):

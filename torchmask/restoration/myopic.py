@@ -265,7 +265,7 @@ class MyopicDeconvolution:
         (known := Known(coefficients, covariance, known_object)).check()
         model = (self.model if covariance is None else self.recipe.estimated_model(covariance)).beside(stack.free)
         stack = stack.to(model.dtype, model.device)
-        with each_on_a_core(model.device) as parallel:
+        with torch.inference_mode(False), each_on_a_core(model.device) as parallel:
             objective = MyopicObjective(
                 model, stack.frames, stack.precision, self.prior, free=known.free, parallel=parallel
             )

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchmask.grid import Grid
+from torchmask.io import as_tensor
 from torchmask.observation import number_frames
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.noise import noise_variance
@@ -86,7 +87,7 @@ def check_errors(errors: Tensor | np.ndarray, frames: Tensor, valid: Tensor, num
     Raises ValueError if they have another shape, or that of a valid pixel is not finite and positive; the message names
     the frame by `numbers`, or from 0 if none are given.
     """
-    given = torch.as_tensor(errors, dtype=frames.dtype, device=frames.device)
+    given = as_tensor(errors).to(frames)
     if tuple(given.shape) not in (tuple(frames.shape), tuple(frames.shape[1:])):
         raise ValueError(
             f"errors has shape {tuple(given.shape)}: it must be {tuple(frames.shape)}, or {tuple(frames.shape[1:])} "
