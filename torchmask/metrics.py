@@ -154,7 +154,7 @@ def ssim(estimate: Any, truth: Any, cutoff: float) -> float:
 def _checked(estimate: Any, truth: Any) -> tuple[Tensor, Tensor]:
     images = []
     for name, values in (("estimate", estimate), ("truth", truth)):
-        image = as_tensor(values).detach().cpu().double()
+        image = as_tensor(values, "cpu").detach().double()
         if image.ndim != 2:
             raise ValueError(f"{name} has shape {tuple(image.shape)}: it must be one image, (rows, columns)")
         if not bool(torch.isfinite(image).all()):

@@ -241,7 +241,7 @@ def check_frames(
     if valid is None:
         valid = torch.ones_like(frames, dtype=torch.bool)
     else:
-        valid = as_tensor(valid).to(frames.device)
+        valid = as_tensor(valid, frames.device)
         if valid.dtype != torch.bool or tuple(valid.shape) not in (grid.shape, tuple(frames.shape)):
             raise ValueError(
                 f"valid is {valid.dtype} of shape {tuple(valid.shape)}: it must be bool, of shape {grid.shape} or "

@@ -181,7 +181,7 @@ class AsymptoticMSE(nn.Module):
         if centers.dtype not in precise or psd.dtype not in precise or centers.device != psd.device:
             raise ValueError(
                 f"the centres are {centers.dtype} on {centers.device}, the criterion {psd.dtype} on {psd.device}: both "
-                "must be float32 or float64, and on one device"
+                "must be on one device, in float32 or float64"
             )
 
     def _geometry(self, aperture: Aperture) -> Geometry:
