@@ -53,7 +53,9 @@ def test_a_companion_is_found_beside_its_star_and_none_beside_another(write, tmp
         best = stored["offsets"][stored["significance"].argmax()] / GRID.pixel_scale
     assert np.abs(best - [-1.8, 1.2]).max() < 0.3
     assert (tmp_path / "found/companion.png").read_bytes().startswith(b"\x89PNG")
-    assert "a companion of 0.0" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "a companion of 0.0" in said
+    assert "taken as calibrated" not in said
     assert run(other, "--star", star, "--closures-only", "--out", tmp_path / "none") == 0
     assert not json.loads((tmp_path / "none/companion.json").read_text())["detected"]
     assert "no companion above 5 standard errors" in capsys.readouterr().out
@@ -75,10 +77,11 @@ def test_a_resolved_source_is_no_companion(write, tmp_path, capsys):
     assert "would be found" not in said
 
 
-def test_bounds_are_in_arcsec(write, tmp_path):
+def test_bounds_are_in_arcsec(write, tmp_path, capsys):
     star = write("star.oifits", ((0, 0, 1),), 2)
     wide = ("--least-arcsec", "0.1", "--most-arcsec", "0.3")
     assert run(star, *wide, "--out", tmp_path / "run") == 0
+    assert "without --star, |V|^2 are taken as calibrated" in capsys.readouterr().out
     with np.load(tmp_path / "run/companion.npz") as stored:
         away = np.linalg.norm(stored["offsets"], axis=1) / ARCSEC
     assert 0.1 < away.min() < 0.12

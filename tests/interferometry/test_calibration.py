@@ -8,7 +8,7 @@ import torch
 from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.grid import Grid
 from torchmask.interferometry.calibration import calibrate_mask
-from torchmask.interferometry.star_fit import start_frame
+from torchmask.interferometry.star_fit import require_all_holes, start_frame
 from torchmask.interferometry.star_model import Shared, StarModel
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.detector import Detector
@@ -182,6 +182,13 @@ def extended():
 def test_frames_without_a_star_are_refused(frames, message):
     with pytest.raises(ValueError, match=message):
         calibrate_mask(frames(), TOLD, GRID)
+
+
+def test_a_fit_with_its_light_through_one_hole_is_refused():
+    """As of a wide object, which the blob of one hole fits best; dust on a third of the holes is none."""
+    with pytest.raises(ValueError, match="has 95 % of the light through one of 7 holes: the object is no point"):
+        require_all_holes(torch.tensor([0.123, 0.043, 0.011, 6.636, 0.099, 0.021, 0.066]))
+    require_all_holes(torch.tensor([1.0, 0.0, 1.2, 0.0, 0.9, 1.0, 1.1]))
 
 
 @pytest.mark.parametrize(

@@ -78,6 +78,10 @@ def run(options: Options) -> int:
         save_npz(output.directory / "companion.npz", arrays)
         output.logger.figure("companion", companion_figure(found, limits))
         output.logger.conclude(explained=fit.explained, detected=fit.detected)
+        if not options.star and len(measured.vis2):
+            output.summary.append(
+                "without --star, |V|^2 are taken as calibrated: losses of contrast look like companions"
+            )
         output.summary.extend(summary(fit, limits, sides))
     return 0 if fit.explained else NOT_EXPLAINED
 

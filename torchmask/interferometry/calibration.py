@@ -21,6 +21,7 @@ from torchmask.interferometry.star_fit import (
     explained_variance,
     fit_frame,
     fit_together,
+    require_all_holes,
     start_frame,
 )
 from torchmask.interferometry.star_frames import StarFrames
@@ -207,6 +208,7 @@ def calibrate_mask(
     _require_star(data, counted, fit)
     fit, _ = fit_together(model, data, even, fit)
     fit, information = fit_together(model, data, counted / _variance(data, counted, fit, readout_noise), fit)
+    require_all_holes(fit.shared.log_transmission.exp())
     return MaskCalibration(
         geometry=(geometry := MaskGeometry.from_matrix(fit.shared.matrix)),
         aperture=geometry.apply(aperture),

@@ -15,6 +15,7 @@ _HALVINGS = 8  # maximum number of halvings of a step that makes the fit worse
 _DAMPING = (1e-3, 1e8)  # Levenberg-Marquardt damping: initial value, and value at which a frame's fit ends
 _LOOSE = (10.0, 3.0)  # [rad] prior rms of pistons and tilts, and of higher modes: loose, for what data do not constrain
 _EVEN = 1e-3  # prior rms of the mean log transmission, which is degenerate with the light of the frames
+_LEAST_MEDIAN = 0.5  # of the mean light through a hole: a wide object is fitted best by the blob of one hole
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,3 +183,12 @@ def explained_variance(data: Tensor, counted: Tensor, images: Tensor) -> Tensor:
     mean = (data * counted).sum(1, keepdim=True) / counted.sum(1, keepdim=True)
     left, all_of_it = ((counted * (data - level) ** 2).sum(1) for level in (images, mean))
     return 1 - left / all_of_it
+
+
+def require_all_holes(light: Tensor) -> None:
+    """Raise ValueError if a fit has most of the light through few holes, where `light` is that through each (N,)."""
+    if float((light / light.mean()).median()) < _LEAST_MEDIAN:
+        raise ValueError(
+            f"the best fit has {100 * float(light.max() / light.sum()):.0f} % of the light through one of "
+            f"{len(light)} holes: the object is no point, or another mask was in the beam; give frames of a star"
+        )
