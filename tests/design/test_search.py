@@ -169,3 +169,20 @@ def test_six_holes_find_the_golay_array(golay6):
     # Broken on purpose: a mask that is not the Golay array is told apart.
     other = SparseAperture.random(6, 1.0, 0.15, torch.Generator().manual_seed(0))
     assert congruence(other.centers.numpy(), golay6.centers.numpy()) > 0.03
+
+
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_a_caller_without_gradients_gets_the_same(mode):
+    criterion, rules = reference(32), [InsideDisc(), NoOverlap()]
+
+    def designs():
+        found = search_mask(criterion, 4, 1.0, 0.1, budget=60, seed=1).aperture
+        crowded = found.replace(centers=0.3 * found.centers)
+        return found, refine_mask(criterion, found, budget=20).aperture, project(crowded, rules)
+
+    expected = designs()
+    with mode():
+        again = designs()
+    for one, other in zip(expected, again, strict=True):
+        assert torch.equal(one.centers, other.centers)
+        assert not other.centers.requires_grad

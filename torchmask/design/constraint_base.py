@@ -144,6 +144,7 @@ def all_margins(aperture: SparseAperture, constraints: Sequence[Constraint]) -> 
     return torch.cat(margins, dim=-1) if margins else aperture.centers.flatten(-2)[..., :0]
 
 
+@torch.inference_mode(False)  # it differentiates, whatever the caller does
 def project(aperture: SparseAperture, constraints: Sequence[Constraint]) -> SparseAperture:
     """Return the mask nearest to `aperture` that satisfies all `constraints`, to rounding.
 

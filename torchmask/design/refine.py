@@ -107,6 +107,7 @@ class Monitor:
             return float(criterion.relative(mask))
 
 
+@torch.inference_mode(False)  # it differentiates, whatever the caller does
 def refine_mask(
     criterion: Criterion,
     aperture: SparseAperture,

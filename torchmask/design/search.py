@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import torch
 
 from torchmask.design.cma import evolve
 from torchmask.design.constraint_base import Constraint
@@ -19,6 +20,7 @@ METHODS = tuple(DEFAULT_BUDGETS)
 POLISH = 120  # evaluations of the gradient stage for each of its starting masks
 
 
+@torch.inference_mode(False)  # it differentiates, whatever the caller does
 def search_mask(
     criterion: Criterion,
     n_subapertures: int,
