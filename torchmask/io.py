@@ -100,14 +100,18 @@ def new_folder(path: str | Path) -> Path:
 
     Raises ValueError if it exists (the message suggests a free name) or cannot be created.
     """
-    path = Path(path)
+    require_new(path := Path(path))
     try:
         path.mkdir(parents=True)
-    except FileExistsError:
-        raise ValueError(f"{path} exists and is not overwritten: choose another, such as {free_name(path)}") from None
     except OSError as error:
         raise ValueError(f"{path} cannot be created: {error}") from error
     return path
+
+
+def require_new(path: Path) -> None:
+    """Raise ValueError if a folder exists; the message suggests a free name."""
+    if path.exists():
+        raise ValueError(f"{path} exists and is not overwritten: choose another, such as {free_name(path)}")
 
 
 def free_name(path: str | Path) -> Path:

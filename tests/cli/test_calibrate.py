@@ -48,6 +48,12 @@ def test_the_mask_where_it_lies_is_written(star, tmp_path, capsys):
     assert f"{math.degrees(numbers['rotation']):.4f}" in capsys.readouterr().out
 
 
+def test_a_folder_that_exists_is_said_before_the_star_is_measured(tmp_path, capsys):
+    files = [str(tmp_path / "stack.npz"), "--star", str(tmp_path / "star.npz")]  # which are not there
+    assert main(["restore", *files, "--out", str(tmp_path)]) == 1
+    assert f"{tmp_path} exists and is not overwritten" in capsys.readouterr().err
+
+
 def test_without_a_star_or_a_mask_nothing_is_written(tmp_path, capsys):
     frames = torch.ones(1, 64, 64)
     Observation(frames, TOLD, GRID, 1.0).save(tmp_path / "sky.npz")

@@ -26,7 +26,7 @@ from torchmask.cli.stacks import StackOptions, group_files, read_stack
 from torchmask.instrument.instrument import Instrument
 from torchmask.interferometry.calibration import MaskCalibration
 from torchmask.interferometry.observables import Observables
-from torchmask.io import new_folder, write_json
+from torchmask.io import new_folder, require_new, write_json
 from torchmask.observation import Observation
 from torchmask.restoration.background import Background
 from torchmask.restoration.many import restore_in_turn
@@ -114,6 +114,8 @@ def run(options: Options) -> int:
     stacks = group_files(options.stacks, options.join)
     if not stacks:
         raise ValueError("there is no stack to restore: give .npz or FITS files")
+    if options.out is not None:
+        require_new(options.out)  # said before the star is measured
     if options.resume is not None and len(stacks) > 1:
         raise ValueError(f"--resume continues one stack, but {len(stacks)} are given")
     if options.oifits and options.bandwidth is None:
