@@ -64,6 +64,7 @@ def test_the_file_holds_the_observables_of_the_frames(n_stacks, seen, tmp_path, 
             ["--oifits", "--bandwidth", "20"],
             "--bandwidth is 20: it must be positive and less than twice the wavelength",
         ),
+        (["--bandwidth", "1e-8"], "--bandwidth is for the OIFITS file alone: give --oifits"),
         (["--wavelengths", "545", "555"], "--wavelengths is 545: it must be a wavelength of light in m"),
     ],
 )

@@ -36,11 +36,16 @@ def measure_frames(observation: Observation, options: OIFITSOptions, sky: Tensor
     """Return the frames' observables; None if --oifits was not given.
 
     A sky [electrons per pixel] is subtracted, a number or one that broadcasts to the frames. Raises ValueError if the
-    width of the band is unknown or invalid, or the mask's fringes overlap too much.
+    width of the band is unknown, invalid or given without --oifits, or the mask's fringes overlap too much.
     """
+    width = options.bandwidth
+    if not options.oifits and width is not None:
+        raise ValueError(
+            "--bandwidth is for the OIFITS file alone: give --oifits, or tell the restoration its band by --filter, "
+            "--wavelengths or --instrument"
+        )
     if not options.oifits:
         return None
-    width = options.bandwidth
     if width is None and filter_of_header(observation.header) is None:
         raise ValueError(
             "--oifits needs the width of the band, but the header has no known FILTER: give --bandwidth [m] or --filter"
