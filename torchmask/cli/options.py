@@ -132,7 +132,8 @@ class SearchOptions:
     refine: bool = True
     """Refine the result by gradient descent on the same criterion."""
     budget: int | None = None
-    """Evaluations of the criterion; None: 20000 for cma, 100000 for hybrid (minutes), fewer above 11 holes."""
+    """Evaluations of the search, to which the refinement adds its own; None: 20000 for cma, 100000 for hybrid
+    (minutes), fewer above 11 holes."""
     n_frequencies: int = 256
     """Frequencies per side of the criterion's grid."""
     exponent: float = 1.5
