@@ -87,7 +87,7 @@ def uv_coverage_figure(aperture: Aperture, grid: Grid | None = None, title: str 
     baselines in metres or millimetres. With a `grid` they are also frequencies in cycles/pixel, and a square shows what
     the grid samples, beyond which frequencies wrap around. Raises ValueError for a population of masks.
     """
-    from matplotlib.patches import Circle, Rectangle
+    from matplotlib.patches import Rectangle
 
     centers, unit, scale = drawing.one_mask(aperture), *drawing.length_unit(aperture.mask_diameter)
     baselines = (centers[:, None] - centers[None]).reshape(-1, 2)
@@ -101,10 +101,9 @@ def uv_coverage_figure(aperture: Aperture, grid: Grid | None = None, title: str 
     if len(pairs):
         dots: dict[str, Any] = {"color": drawing.INK, "markersize": 2.5, "linestyle": "none"}
         ax.plot(*(pairs.T * scale), ".", label="pair of holes, in either order", **dots)
-    reach = aperture.mask_diameter * scale
-    ax.add_patch(
-        Circle((0, 0), reach, fill=False, color=drawing.FAINT, linewidth=0.9, label="cut-off of the whole disc")
-    )
+    reach, turn = aperture.mask_diameter * scale, np.linspace(0, 2 * np.pi, 361)
+    circle = reach * np.cos(turn), reach * np.sin(turn)  # a line, as the legend shows any patch as a rectangle
+    ax.plot(*circle, color=drawing.FAINT, linewidth=0.9, label="cut-off of the whole disc")
     half = max(reach, 2 * aperture.reach * scale)
     if grid is not None:
         nyquist = grid.period / 2 * scale
