@@ -30,14 +30,14 @@ def as_array(values: Any) -> np.ndarray:
     return values.numpy(force=True) if isinstance(values, Tensor) else np.asarray(values)
 
 
-def as_tensor(values: Any, device: torch.device | str | None = None) -> Tensor:
-    """Convert an array, number or sequence to a tensor on `device`, by default torch's own; a tensor is moved at most.
+def as_tensor(values: Any, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Tensor:
+    """Convert an array, number or sequence to a tensor, by default on torch's device; a tensor stays where it is.
 
     Arrays may have any strides, as flipped ones do, and any order of bytes, as those of FITS files do.
     """
     if isinstance(values, Tensor):
-        return values if device is None else values.to(device)
-    return torch.as_tensor(_native(np.asarray(values)), device=device)
+        return values.to(device=device, dtype=dtype)
+    return torch.as_tensor(_native(np.asarray(values)), dtype=dtype, device=device)
 
 
 def _native(array: np.ndarray) -> np.ndarray:

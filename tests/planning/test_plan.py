@@ -250,12 +250,13 @@ def test_less_light_than_was_tried_loses_the_share_that_the_linear_estimate_lose
     floor = tried.relative_mse - tried.above_floor
     assert tried.blind_mse == pytest.approx(floor + tried.above_floor / 4, rel=1e-12)
     with warnings.catch_warnings(action="ignore"):  # of photons beyond those tried
-        faint, dark = plan(20.0), plan(1e-3)
+        faint, dark, darkest = plan(20.0), plan(1e-3), plan(1e-20)
         drowned = plan(2e5, camera=Camera(n_pixels=64, readout_noise=1e3))
     kept = (1 - faint.relative_mse) / (1 - tried.relative_mse)
     assert kept < 0.9
     assert 1 - faint.blind_mse == pytest.approx(kept * (1 - tried.blind_mse), rel=1e-9)
     gained = (1 - tried.blind_mse) / (1 - tried.relative_mse)
+    assert darkest.blind_mse == pytest.approx(1, abs=1e-12)
     assert 0 <= 1 - dark.blind_mse <= 0.01 * gained  # a hundredth of a photon in all tells that share of an image
     assert drowned.relative_mse > 0.5
     assert drowned.blind_mse > 0.4  # a quarter of the prediction would be as good as bright light

@@ -243,7 +243,7 @@ def _predict_instants(
     """Return the error predicted for instants in narrow light with the photons of each exposure, for each mask.
 
     What is known of the turbulence then depends on the holes alone. The second error is that in the least light in
-    which restorations were tried, if there is less: it is that of as many more frames.
+    which restorations were tried, if there is less: it is that of as much less noise.
     """
     errors, criterion = {}, None
     for (n, hole), mask in sorted(masks.items(), key=lambda item: item[0][1]):
@@ -252,9 +252,8 @@ def _predict_instants(
             criterion = criterion or instant_criterion(instrument, area, n_frequencies)
             change_light(criterion, instrument, area)
             error = tried = float(criterion.relative(mask))
-            if (lacking := smearing_map().n_photons[0] / instrument.equivalent_photons(area)) > 1:
-                more = replace(instrument, observing_time=None, n_frames=round(lacking * instrument.frames))
-                change_light(criterion, more, area)
+            if (share := instrument.equivalent_photons(area) / smearing_map().n_photons[0]) < 1:
+                criterion.load_state_dict(criterion.state_dict() | {"noise_psd": share * criterion.noise_psd})
                 tried = float(criterion.relative(mask))
             errors[n, hole, place] = error, tried
     return errors

@@ -116,7 +116,7 @@ def check_known_level(level: float | Tensor, frames: Tensor) -> Tensor:
         raise ValueError(
             f"background is {level!r}: electrons per pixel are needed, or an assumption such as Background.COMMON"
         )
-    given = as_tensor(level, frames.device).to(frames.dtype)
+    given = as_tensor(level, frames.device, frames.dtype)
     if not bool(torch.isfinite(given).all()):
         raise ValueError("background holds values that are not finite: electrons per pixel are needed")
     if bool((given < 0).any()):

@@ -87,7 +87,7 @@ def check_errors(errors: Tensor | np.ndarray, frames: Tensor, valid: Tensor, num
     Raises ValueError if they have another shape, or that of a valid pixel is not finite and positive; the message names
     the frame by `numbers`, or from 0 if none are given.
     """
-    given = as_tensor(errors, frames.device).to(frames.dtype)
+    given = as_tensor(errors, frames.device, frames.dtype)
     if tuple(given.shape) not in (tuple(frames.shape), tuple(frames.shape[1:])):
         raise ValueError(
             f"errors has shape {tuple(given.shape)}: it must be {tuple(frames.shape)}, or {tuple(frames.shape[1:])} "

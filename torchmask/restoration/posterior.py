@@ -61,7 +61,7 @@ def standard_deviations(
 
 
 def evenness(image: Tensor) -> float:
-    """Return the factor, at most 1, by which `standard_deviations` are too large for an object as even as `image`.
+    """Return the factor, at most 1, by which to multiply `standard_deviations` of an object as even as `image`.
 
     Where a share q > 0.4 of the light of all pixels above a tenth of the peak is in pixels whose gradient is below a
     tenth of its root mean square, by light, the factor is (0.4 / q)^2. The rule was found by trial (docs/tried.md). It
