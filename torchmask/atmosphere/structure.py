@@ -67,12 +67,12 @@ class StructureFunction:
 
     def at(self, x: Tensor, y: Tensor) -> Tensor:
         """Return the structure function (...) at displacements (x, y) (...) [m]."""
-        squared = (x * x).addcmul_(y, y)  # in place where autograd permits it: arrays that stay in the cache
-        # The offset, a billionth of r0 squared, keeps the derivative finite at 0.
+        # The offset, a billionth of r0 squared, keeps the derivative finite at 0. As few passes over arrays as can be.
+        squared = torch.addcmul(x.new_tensor(1e-18 * self.r0**2), x, x).addcmul_(y, y)
         if math.isinf(self.outer_scale):
-            unit = squared.mul_(STRUCTURE_CONSTANT**1.2 / self.r0**2).add_(1e-18)
-            return unit.log().mul_(5 / 6).exp_()  # a power takes twice as long
-        unit = squared.mul_(1 / self.r0**2).add_(1e-18)
+            scale = x.new_tensor(math.log(STRUCTURE_CONSTANT) - 5 / 3 * math.log(self.r0))
+            return torch.add(scale, squared.log(), alpha=5 / 6).exp_()  # a power takes twice as long
+        unit = squared.mul_(1 / self.r0**2)
         longest = min(self.reach, _SATURATED * self.outer_scale)
         root = torch.exp(unit.clamp(max=(longest / self.r0) ** 2).log() / 6)  # (r / r0)^(1/3)
         series = _series(longest / self.outer_scale)
