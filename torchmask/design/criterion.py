@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torchmask.design.fluctuation import mean_inverse, piston_powers
 from torchmask.design.overlap import Geometry, baseline_mse
 from torchmask.grid import Grid
+from torchmask.memory import keep_freed_memory
 from torchmask.optics.aperture import FullAperture
 from torchmask.optics.pupil import Aperture
 from torchmask.spectra import PSD, evaluate_psd, resample_psd
@@ -86,6 +87,7 @@ class AsymptoticMSE(nn.Module):
         if not bool((self.object_psd > 0).any()):
             raise ValueError("object_psd is 0 everywhere: there is nothing to restore")
         self._pack()
+        keep_freed_memory()  # values of populations take and free the same arrays over and over
         self.register_load_state_dict_post_hook(_pack_again)
 
     def _pack(self) -> None:

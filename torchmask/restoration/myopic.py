@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchmask.grid import Grid
 from torchmask.interferometry.which_mask import look_at_mask
+from torchmask.memory import keep_freed_memory
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.band import Band
 from torchmask.optics.pixel import PixelResponse
@@ -22,7 +23,6 @@ from torchmask.restoration.checkpoint import Checkpoint
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.frames import Array, FrameStack
 from torchmask.restoration.given_prior import as_prior, check_prior
-from torchmask.restoration.memory import keep_freed_memory
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.parallel import each_on_a_core
 from torchmask.restoration.priors import ObjectPrior, TotalVariation

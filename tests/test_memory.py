@@ -11,7 +11,7 @@ import pytest
 
 _COUNT_FAULTS = """
 import resource, sys, numpy
-from torchmask.restoration.memory import keep_freed_memory
+from torchmask.memory import keep_freed_memory
 if sys.argv[1] == "keep":
     keep_freed_memory()
 def evaluate():

@@ -12,7 +12,7 @@ def keep_freed_memory() -> None:
 
     Free memory at the end of the heap is returned when it is more than twice the largest block that was ever freed
     (M_TRIM_THRESHOLD in mallopt(3)). The arrays of one evaluation exceed that, so each would request its pages anew,
-    which takes up to 40 % of the time at 10 x 64 x 64. Freeing one large block raises the threshold; its pages are
-    never touched. Other allocators are not affected.
+    which takes up to 40 % of the time of a restoration at 10 x 64 x 64, and some 10 % of that of a criterion. Freeing
+    one large block raises the threshold; its pages are never touched. Other allocators are not affected.
     """
     torch.empty(_LARGEST, dtype=torch.uint8, device="cpu")
