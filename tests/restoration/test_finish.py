@@ -197,3 +197,34 @@ def test_an_interrupted_last_descent_goes_on(observe, five_holes, tmp_path):
         assert torch.equal(resumed.coefficients, whole.coefficients)
         assert resumed.n_evaluations == whole.n_evaluations
         records.clear()
+
+
+def test_a_search_that_is_cut_short_has_an_end_once_a_start_was_whole(observe, five_holes, tmp_path):
+    """And leaves a file from which the search goes on if it may have more iterations."""
+    seen = observe(n_frames=2, shape=(32, 32))
+    missed = {"chance": -1e9, "starts": 3, "doubtful_starts": 3, "faint": 0.0, "glance": 10**6, "escapes": 0}
+    schedule = Schedule(start_iterations=20, segment=10, sharp_after=15, last_segments=1, last_modes=8, **missed)
+
+    def restore(max_iterations, checkpoint=None):
+        stages = []
+        method = MyopicDeconvolution(
+            five_holes, seen.grid, readout_noise=1.5, max_iterations=max_iterations, schedule=schedule
+        )
+        result = method.restore(seen.frames, checkpoint=checkpoint, callback=lambda record: stages.append(record.stage))
+        return result, stages
+
+    result, stages = restore(10)
+    assert stages == 10 * ["restoration"]  # what is asked for, and no more
+    assert "max_iterations = 10" in result.message
+    path = tmp_path / "state.npz"
+    result, stages = restore(30, path)
+    assert stages == 30 * ["restoration"] + 10 * ["last descent"]
+    assert "best of 2 starts" in result.message
+    again, stages = restore(30, path)
+    assert stages == 10 * ["last descent"]
+    assert torch.equal(again.object, result.object)
+    longer, stages = restore(60, path)
+    assert stages == 30 * ["restoration"] + 10 * ["last descent"]
+    assert torch.equal(longer.cost[:30], result.cost)
+    start = longer.cost[20:40]  # the second, cut in two
+    assert float(start[10]) < float(start[9])

@@ -199,6 +199,10 @@ class Checkpoint:
         )
 
 
+def save_nothing(progress: Progress) -> None:
+    """Stand in for `Checkpoint.save` where no file is to be written."""
+
+
 def fingerprint_of(objective: MyopicObjective, settings: Sequence[object], known: Sequence[Tensor | None]) -> str:
     """Return a hash of the frames, priors, settings and further known tensors, to recognise their checkpoint."""
     prior, model = objective.prior, objective.model

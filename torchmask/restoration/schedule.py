@@ -102,8 +102,8 @@ class Schedule:
     settling: int = 30
     last_settling: int = 80
     last_modes: int = 28
-    last_segments: int = 8
-    last_gain: float = 0.01
+    last_segments: int = 20
+    last_gain: float = 0.003
 
     def __post_init__(self) -> None:
         stages = [number for number, _ in self.candidates] + [1]

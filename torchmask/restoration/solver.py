@@ -20,7 +20,7 @@ from torchmask.record import Callback, Record
 from torchmask.restoration.aberrations import AberrationBasis, MakesBasis
 from torchmask.restoration.calibration import recalibrate
 from torchmask.restoration.candidates import Candidates, play_stage
-from torchmask.restoration.checkpoint import Checkpoint, Ending, Progress, Status
+from torchmask.restoration.checkpoint import Checkpoint, Ending, Progress, Status, save_nothing
 from torchmask.restoration.consensus import average_starts
 from torchmask.restoration.descent import Variables, descend
 from torchmask.restoration.escapes import escape
@@ -109,10 +109,10 @@ class Solver:
         blind = known.nothing and start is None
         # Without a prior on the aberrations a poor fit is to be expected, and more starts would not help.
         may_start_again = blind and self.traits.prior_on_aberrations and len(self.objective.frames) > 1
-        save = file.save if file is not None else lambda progress: None
-        ended = self.run(begun, may_start_again, save)
-        if self.is_open and ended.status is not Status.ITERATION_LIMIT:
-            how = (self.schedule, self.minimizer, self.callback, self.traits, save)
+        ended = self.run(begun, may_start_again, save := save_nothing if file is None else file.save)
+        cut_short = ended.status is Status.ITERATION_LIMIT  # it may go on from its file, which the end leaves as it is
+        if self.is_open and (ended.starts > 1 or not cut_short):
+            how = (self.schedule, self.minimizer, self.callback, self.traits, save_nothing if cut_short else save)
             self.objective = finish(self.objective, self.setting, ended, *how, is_faint=self.is_faint)
         if len(ended.explained) > 1:
             average_starts(self.objective, ended, self.schedule, self.minimizer, self.callback)
