@@ -212,6 +212,7 @@ def test_selection_keeps_the_best_frames(write_fits, mask, cube):
         ({"target": (900, 3)}, r"target is \(900, 3\).*give crop \[pixels\] too"),
         ({"keep": 1.5}, r"keep is 1.5"),
         ({"keep_by": "luck"}, r"keep_by is 'luck'"),
+        ({"keep_by": "flux"}, r"keep_by is 'flux', but all frames are kept: give keep, the fraction of the best, too"),
         ({"crop": 1}, r"crop is 1"),
         ({"wavelength": -1.0}, r"wavelength is -1.0"),
         ({"gain": math.nan}, r"gain is nan"),

@@ -212,6 +212,8 @@ def _check_options(
         raise ValueError(f"keep is {keep}: it must be a fraction of the frames, above 0 and at most 1")
     if keep_by not in SELECTIONS:
         raise ValueError(f"keep_by is {keep_by!r}: it must be {' or '.join(SELECTIONS)}")
+    if keep is None and keep_by != SELECTIONS[0]:
+        raise ValueError(f"keep_by is {keep_by!r}, but all frames are kept: give keep, the fraction of the best, too")
 
 
 def _check_alike(files: Sequence[FITSImages], wavelengths: Sequence[float], scales: Sequence[float]) -> None:
