@@ -196,7 +196,13 @@ def test_the_best_point_and_the_edges_of_the_map(plan):
     assert (best.n_subapertures, best.hole_diameter) == (3, 0.35)  # pistons alone: the most light wins
     assert plan.at_edge("hole_diameter")
     text = str(plan)
-    assert "The best hole diameter is at the edge of the map" in text
+    wider = "is the last that was tried: a larger one may be better, so give"
+    assert f"The best hole diameter, 0.35 m, {wider} hole_diameters above it too." in text
+    assert f"The best exposure, 6 ms, {wider} exposures above it too." in text
+    assert "The best number of holes" not in text  # of 0.35 m no more were tried than can be built
+    least = dataclasses.replace(plan, choices=tuple(dataclasses.replace(c, blind_mse=c.exposure) for c in plan.choices))
+    smaller = "is the first that was tried: a smaller one may be better, so give"
+    assert f"The best exposure, 2 ms, {smaller} exposures below it too." in str(least)
     assert text.count("\n| 3 |") == 6
     assert "do not fit" in text
 
@@ -383,6 +389,7 @@ def test_the_command_writes_plan_mask_and_instrument(quick, tmp_path, capsys):
     assert (tmp_path / "plan/plan.png").stat().st_size > 10_000
     told = capsys.readouterr().out
     assert "Least predicted error" in told
+    assert "a larger one may be better, so give --exposures above it too." in " ".join(told.split())
     fill_factor = 3 * 0.15**2
     command = f"--instrument {tmp_path}/plan/instrument.json --n-subapertures 3 --fill-factor {fill_factor:.4g}"
     assert f"design the final mask with: torchmask design {command}" in told
