@@ -146,7 +146,14 @@ def test_a_restoration_is_not_told_the_turbulence_of_a_simulated_stack(folder):
 
 
 @pytest.mark.parametrize(
-    "command", ["design", "rank golay6", "simulate --mask {folder}/mask.json", "table {folder}/table"]
+    "command",
+    [
+        "design",
+        "rank golay6",
+        "restore {folder}/stack.npz --star {folder}/no.npz",
+        "simulate --mask {folder}/mask.json",
+        "table {folder}/table",
+    ],
 )
 def test_another_wavelength_than_that_of_r0_and_light_is_refused(command, folder, capsys):
     words = [*command.format(folder=folder).split(), "--instrument", f"{folder}/instrument.json"]

@@ -1,6 +1,7 @@
 """Observations from FITS files: units, pixels, calibration, crops, selection, lists, and the real exposures."""
 
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -159,6 +160,22 @@ def test_calibration_files_and_arrays_are_applied(write_fits, mask, cube):
     assert (~observation.valid).nonzero().tolist() == [[0, 3, 4], [1, 3, 4], [2, 3, 4]]
 
 
+def test_a_dark_of_another_exposure_time_warns(write_fits, mask, cube):
+    frames = write_fits("a.fits", cube, EXPTIME=0.02)
+    darks = [write_fits(f"dark{time}.fits", cube[0] / 50, EXPTIME=time) for time in (0.05, 0.0201, 0.0, None)]
+    for dark, seconds in ((darks[0], "0.05"), (darks[2], "0")):
+        said = rf"the dark .*{dark.name} was exposed for {seconds} s and the frames of .*a\.fits for 0\.02 s"
+        with pytest.warns(UserWarning, match=said) as warned:
+            read_observation([frames, frames], mask, dark=dark, flat=darks[0])
+        assert len(warned) == 1
+    with warnings.catch_warnings(action="error"):
+        for alike in (darks[1], darks[3]):
+            read_observation(frames, mask, dark=alike)
+        read_observation(frames, mask, dark=darks[0], exposure_time=0.05)
+        read_observation(write_fits("bare.fits", cube), mask, dark=darks[0])
+        read_observation(write_fits("rate.fits", cube, EXPTIME=0.02, BUNIT="electron/s"), mask, dark=darks[0])
+
+
 def test_a_dark_of_another_shape_is_refused(write_fits, mask, cube):
     with pytest.raises(ValueError, match=r"a\.fits: dark has shape \(16, 16\): it must be.*\(16, 20\)"):
         read_observation(write_fits("a.fits", cube), mask, dark=np.zeros((16, 16)))
@@ -212,6 +229,7 @@ def test_selection_keeps_the_best_frames(write_fits, mask, cube):
         ({"target": (900, 3)}, r"target is \(900, 3\).*give crop \[pixels\] too"),
         ({"keep": 1.5}, r"keep is 1.5"),
         ({"keep_by": "luck"}, r"keep_by is 'luck'"),
+        ({"keep_by": "flux"}, r"keep_by is 'flux', but all frames are kept: give keep, the fraction of the best, too"),
         ({"crop": 1}, r"crop is 1"),
         ({"wavelength": -1.0}, r"wavelength is -1.0"),
         ({"gain": math.nan}, r"gain is nan"),

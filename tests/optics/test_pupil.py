@@ -176,8 +176,14 @@ def test_dtype_is_that_of_the_centers(dtype):
 
 def test_impossible_sampling_is_refused():
     aperture = SparseAperture(TRIANGLE, 0.05, 1.0)
-    with pytest.raises(ValueError, match="oversampling of at least 2"):
+    with pytest.raises(
+        ValueError, match=r"take an image at least (\d\.\d+) times as wide or oversampling of at least 2$"
+    ) as told:
         aperture.samples(GRID)
+    wider = float(str(told.value).split("image at least ")[1].split()[0])
+    aperture.samples(Grid(math.ceil(wider * 64), GRID.pixel_scale, WAVELENGTH))
+    with pytest.raises(ValueError, match="at least 2 are needed"):
+        aperture.samples(Grid(math.floor((wider - 0.01) * 64), GRID.pixel_scale, WAVELENGTH))
     aperture.samples(GRID, 2)
     for oversampling in (0, 1.5):
         with pytest.raises(ValueError, match="oversampling"):

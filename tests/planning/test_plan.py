@@ -29,6 +29,7 @@ from torchmask.spectra import NoisePSD, PowerLawPSD
 from torchmask.viz.planning import plan_figure
 
 MASK = SparseAperture.from_catalog("golay6", 1.0, 0.05)
+WIDE = SparseAperture([[-0.45, 0.0], [0.45, 0.0], [0.1, 0.2]], 0.1, 1.0)
 TINY = {"n_frequencies": 32, "budget": 64}
 AXES = {"n_subapertures": (3, 7), "hole_diameters": (0.09, 0.15, 0.35), "exposures": (2e-3, 6e-3)}
 EVERYWHERE = {"n_frames": (1, 1e6), "n_photons": (1, 1e12), "d_over_r0": (0.1, 10)}
@@ -196,7 +197,13 @@ def test_the_best_point_and_the_edges_of_the_map(plan):
     assert (best.n_subapertures, best.hole_diameter) == (3, 0.35)  # pistons alone: the most light wins
     assert plan.at_edge("hole_diameter")
     text = str(plan)
-    assert "The best hole diameter is at the edge of the map" in text
+    wider = "is the last that was tried: a larger one may be better, so give"
+    assert f"The best hole diameter, 0.35 m, {wider} hole_diameters above it too." in text
+    assert f"The best exposure, 6 ms, {wider} exposures above it too." in text
+    assert "The best number of holes" not in text  # of 0.35 m no more were tried than can be built
+    least = dataclasses.replace(plan, choices=tuple(dataclasses.replace(c, blind_mse=c.exposure) for c in plan.choices))
+    smaller = "is the first that was tried: a smaller one may be better, so give"
+    assert f"The best exposure, 2 ms, {smaller} exposures below it too." in str(least)
     assert text.count("\n| 3 |") == 6
     assert "do not fit" in text
 
@@ -266,8 +273,18 @@ def test_pixels_that_undersample_are_refused_before_any_search(quick):
     coarse = make(camera=Camera(pixel_scale=0.3))
     with pytest.raises(ValueError, match=r"\(0.3 arcsec\) undersamples an aperture of 1 m"):
         plan_observation(coarse, **AXES, **TINY)
-    with pytest.raises(ValueError, match="undersamples an aperture"):  # at the shortest wavelength of the widest band
-        plan_observation(make(camera=Camera(pixel_scale=0.0565)), widths=(10e-9, 100e-9), **AXES, **TINY)
+
+
+def test_bands_that_the_pixels_of_the_camera_undersample_are_left_out(quick):
+    """0.0565 arcsec sample 1 m from 548 nm on: a band of 2 nm around 550 nm, but none of 10 or 100 nm."""
+    known, settings = make(camera=Camera(pixel_scale=0.0565)), {"aperture": WIDE, "exposures": (4e-3,)}
+    found = plan_observation(known, widths=(10e-9, 2e-9, 100e-9), n_frequencies=24, **settings)
+    assert [choice.width for choice in found.choices] == [2e-9]
+    assert [reason.split(" undersamples")[0] for reason in found.left_out] == [
+        f"a band of {width} nm is left out: pixel_scale 2.739e-07 rad (0.0565 arcsec)" for width in (10, 100)
+    ]
+    with pytest.raises(ValueError, match="undersamples an aperture"):
+        plan_observation(known, widths=(10e-9, 100e-9), **settings)
 
 
 def test_exposure_and_width_are_best_where_light_balances_what_their_smearing_costs(monkeypatch, quick):
@@ -368,7 +385,7 @@ def test_the_picture_shows_the_map_and_the_exposures(plan):
 
 def test_the_command_writes_plan_mask_and_instrument(quick, tmp_path, capsys):
     known = "--telescope.diameter 1 --source.photon-rate 3e8 --site.r0 0.15 --site.wind 10 --wavelength 550e-9"
-    known += " --width 2e-8 --exposure 4e-3 --n-frames 20 --n-subapertures 3 --hole-diameters 0.15"
+    known += " --width 2e-8 --exposure 4e-3 --n-frames 20 --n-subapertures 3 --hole-diameters 0.15 0.6"
     known += " --exposures 0.002 0.004 --n-frequencies 32 --budget 64"
     assert main(["plan", *known.split(), "--out", str(tmp_path / "plan")]) == 0
     numbers = json.loads((tmp_path / "plan/plan.json").read_text())
@@ -383,6 +400,8 @@ def test_the_command_writes_plan_mask_and_instrument(quick, tmp_path, capsys):
     assert (tmp_path / "plan/plan.png").stat().st_size > 10_000
     told = capsys.readouterr().out
     assert "Least predicted error" in told
+    assert "3 holes of 0.6 m do not fit" in told
+    assert "a larger one may be better, so give --exposures above it too." in " ".join(told.split())
     fill_factor = 3 * 0.15**2
     command = f"--instrument {tmp_path}/plan/instrument.json --n-subapertures 3 --fill-factor {fill_factor:.4g}"
     assert f"design the final mask with: torchmask design {command}" in told

@@ -1,5 +1,6 @@
 """What restorations attain in long exposures and wide bands: measured at the points, between them, a warning beyond."""
 
+import dataclasses
 import math
 import warnings
 
@@ -65,6 +66,14 @@ def test_beyond_it_warns_and_takes_the_edge(point, edge, name, said):
     assert outlook.outside == (name,)
     assert outlook.restored == ratio(*edge)
     assert (outlook.cost, outlook.success) == (INSTANTS.cost, INSTANTS.success)
+
+
+def test_what_instants_lie_outside_of_is_not_said_again():
+    faint = dataclasses.replace(INSTANTS, outside=("n_photons",))
+    with pytest.warns(UserWarning, match="exposures over tau0") as said:
+        outlook = MAP.outlook(faint, n_photons=1e4, exposure=9.0, spread=0.4)
+    assert len(said) == 1
+    assert outlook.outside == ("n_photons", "exposure")
 
 
 def test_the_error_grows_by_the_square_of_cost_and_ratio():

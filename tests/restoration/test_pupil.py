@@ -150,3 +150,11 @@ def test_a_pupil_too_coarse_or_aliased_is_refused():
         ExposureModel(mask(), Grid.nyquist(1.0, 550e-9, 8), 3)
     with pytest.raises(ValueError, match="undersamples an aperture"):
         ExposureModel(mask(), GRID, 3, Band.of((300e-9, 550e-9)))
+
+
+def test_a_restoration_is_not_advised_to_oversample_which_it_cannot():
+    """Its samples are those of a field somewhat wider than the frames: more of them come from wider frames alone."""
+    thin = mask().replace(subaperture_diameter=0.07)
+    with pytest.raises(ValueError, match=r"at least 2 are needed, so take an image at least 1\.72 times as wide$"):
+        ExposureModel(thin, GRID, 3)
+    ExposureModel(thin, Grid(math.ceil(1.72 * 32), GRID.pixel_scale, GRID.wavelength), 3)

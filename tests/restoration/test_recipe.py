@@ -7,8 +7,9 @@ import torch
 from torch import nn
 
 from torchmask.grid import Grid
-from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.band import Band
+from torchmask.optics.zernike import zernike_basis
 from torchmask.restoration.aberrations import turbulent_basis
 from torchmask.restoration.recipe import ModelRecipe
 
@@ -76,3 +77,20 @@ def test_a_model_stands_still_unless_it_follows(trains):
 def test_refuses_numbers_out_of_range(changes, words):
     with pytest.raises(ValueError, match=words):
         recipe(**changes)
+
+
+@pytest.mark.parametrize("name", ["frame_modes", "static_modes"])
+def test_no_more_modes_than_samples_of_a_hole(name):
+    """On P samples no more than P modes are independent; the covariance of hundreds would take minutes."""
+    pupil = recipe().turbulent_model().pupil
+    weights = mask().samples(pupil.grid).weights
+    most = int((weights > 0).sum(-1).max())
+    modes = zernike_basis(mask().samples(pupil.grid), mask(), most + 30)[0]
+    assert torch.linalg.matrix_rank(modes[weights[0] > 0]) <= most
+    assert getattr(recipe(**{name: most}), name) == most
+    said = name.replace("frame", "n")
+    with pytest.raises(
+        ValueError, match=f"{said} is {most + 1}: a hole has {most} pupil samples, .* at most {most}, or a"
+    ):
+        recipe(**{name: most + 1})
+    assert recipe(FullAperture(1.0), frame_modes=2000).frame_modes == 2000  # of one opening they are quick to make

@@ -12,6 +12,7 @@ import tyro
 
 from torchmask.cli.options import CatalogOptions, InstrumentOptions, MaskOptions, RunOptions, load_aperture
 from torchmask.cli.run import new_run
+from torchmask.cli.wording import in_options
 from torchmask.design.manufacture import save_json
 from torchmask.instrument.instrument import Instrument
 from torchmask.optics.aperture import SparseAperture
@@ -98,7 +99,9 @@ def run(options: Options) -> None:
         if isinstance(plan.mask, SparseAperture):
             save_json(output.directory / "mask.json", plan.mask, best.mean_wavelength)
             output.logger.figure("plan_mask", mask_figure(plan.mask))
-        output.summary.extend([*str(plan).split("\n\n", 1)[0].splitlines(), table])
+        told = str(plan).split("\n\n", 1)[0].splitlines()
+        output.summary.extend(in_options(line, options) for line in (*told, *plan.left_out))
+        output.summary.append(table)
         if options.mask is None:
             output.summary.append(f"design the final mask with: {_design_command(plan.mask, output.directory)}")
 

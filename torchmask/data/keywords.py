@@ -173,12 +173,28 @@ def electrons_per_unit(
         if not per_dn:
             raise missing(path, f"PHOTMJSR, which its unit {text} needs", "unit, such as '250 electron'")
         return measured.to(radiance) / per_dn * seconds() * electrons(units.DN)
-    for counted in (units.electron, units.photon, units.adu, units.DN, units.count):
+    for counted in _counted_units():
         if measured.is_equivalent(counted):
             return measured.to(counted) * electrons(counted)
         if measured.is_equivalent(counted / units.s):
             return measured.to(counted / units.s) * seconds() * electrons(counted)
     raise _unknown_unit(text, path)
+
+
+def counts_time(header: Any, path: Any, unit: str | None) -> bool:
+    """Return whether pixels grow with the exposure time: `unit`, or else BUNIT, is not per second, or there is none.
+
+    Raises ValueError if the unit is unknown.
+    """
+    text = unit or str(header.get("BUNIT", "")).strip()
+    return not text or any(_parse_unit(text, path).is_equivalent(counted) for counted in _counted_units())
+
+
+def _counted_units() -> tuple[Any, ...]:
+    with extra("data"):
+        from astropy import units
+
+    return units.electron, units.photon, units.adu, units.DN, units.count
 
 
 def _parse_unit(text: str, path: Any) -> Any:

@@ -16,6 +16,7 @@ from torchmask.data import keywords
 from torchmask.data.calibration import SELECTIONS, best_frames, calibrate, crop_corner, find_target
 from torchmask.data.fits import FITSImages, read_fits
 from torchmask.data.light import opened_files, usable_frames
+from torchmask.data.reference import reference_image
 from torchmask.grid import ARCSEC, Grid
 from torchmask.observation import Observation
 from torchmask.optics.aperture import Aperture
@@ -81,7 +82,8 @@ def read_observation(
         Value in the file, in its unit, at and above which a pixel is saturated and not valid. Header: SATURATE, or
         FULLWELL [electrons].
     dark : path or (H, W) array, optional
-        Dark image in the units of the file. Of a cube the median is used, as for `flat` and `bad_pixels`.
+        Dark image in the units of the file, of the same exposure time. Of a cube the median is used, as for `flat` and
+        `bad_pixels`.
     flat : path or (H, W) array, optional
         Flat field, of any scale.
     bad_pixels : path or (H, W) array, optional
@@ -105,6 +107,11 @@ def read_observation(
         If a file is missing or damaged; a keyword that is needed is missing (the message names it and the option to
         give instead); the files mix filters, wavelengths, pixel scales, shapes or orientations; or an option is out of
         range.
+
+    Warns
+    -----
+    UserWarning
+        If files or frames are left out, pixels are saturated, frames are clouded, or a dark has another exposure time.
 
     Examples
     --------
@@ -133,7 +140,12 @@ def read_observation(
     factors = [keywords.electrons_per_unit(f.header, f.path, f.is_cube, *options) for f in files]
     times = [keywords.exposure_seconds(file.header, file.path, file.is_cube, exposure_time) for file in files]
     noises = [keywords.number(file.header, ("RDNOISE", "READNOIS"), file.path) for file in files]
-    images = [_image(source, name) for source, name in ((dark, "dark"), (flat, "flat"), (bad_pixels, "bad_pixels"))]
+    counted = [keywords.counts_time(file.header, file.path, unit) for file in files]
+    exposures = {file.path: time for file, time, grows in zip(files, times, counted, strict=True) if grows and time}
+    images = [
+        reference_image(dark, "dark", exposures),
+        *map(reference_image, (flat, bad_pixels), ("flat", "bad_pixels")),
+    ]
 
     blur = max(1.0, lengths[0] / aperture.extent / scales[0] / 2)
     stacks, headers = [], []
@@ -212,6 +224,8 @@ def _check_options(
         raise ValueError(f"keep is {keep}: it must be a fraction of the frames, above 0 and at most 1")
     if keep_by not in SELECTIONS:
         raise ValueError(f"keep_by is {keep_by!r}: it must be {' or '.join(SELECTIONS)}")
+    if keep is None and keep_by != SELECTIONS[0]:
+        raise ValueError(f"keep_by is {keep_by!r}, but all frames are kept: give keep, the fraction of the best, too")
 
 
 def _check_alike(files: Sequence[FITSImages], wavelengths: Sequence[float], scales: Sequence[float]) -> None:
@@ -245,21 +259,6 @@ def _check_rotation(files: Sequence[FITSImages], size: int) -> None:
                 f"the files mix orientations: the corner of {file.path} lies {moved:.1f} pixels from that of "
                 f"{files[0].path} on the sky; read files of different orientations separately"
             )
-
-
-def _image(source: Any, name: str) -> np.ndarray | None:
-    """Return a calibration image (H, W) from an array, a tensor or a FITS file; the median of a cube."""
-    if source is None:
-        return None
-    if isinstance(source, str | Path):
-        file = read_fits(source)
-        values = np.where(file.valid, file.values, np.nan) if name != "bad_pixels" else file.values
-    else:
-        values = np.asarray(source, dtype=float)
-        values = values[None] if values.ndim == 2 else values
-    if values.ndim != 3:
-        raise ValueError(f"{name} has shape {values.shape}: it must be (H, W) or (T, H, W)")
-    return values[0] if len(values) == 1 else np.median(values, axis=0)
 
 
 def _stack(

@@ -112,23 +112,27 @@ class Aperture(nn.Module):
             grid.require_sampling(self.extent)
 
 
-def sample_holes(centers: Tensor, shape: Shape, diameter: float, grid: Grid, oversampling: int) -> PupilSamples:
+def sample_holes(
+    centers: Tensor, shape: Shape, diameter: float, grid: Grid, oversampling: int | None = None
+) -> PupilSamples:
     """Sample sub-apertures of one shape and diameter [m] at `centers` (..., N, 2) [m] as `Aperture.samples` does.
 
-    Aliasing of the image is not checked.
+    Aliasing of the image is not checked. Without `oversampling` it is 1, and errors do not advise to raise it.
     """
     if centers.dtype not in (torch.float32, torch.float64):
         raise TypeError(f"the centres are {centers.dtype}: float32 or float64 is needed, as by aperture.float()")
-    if oversampling != int(oversampling) or oversampling < 1:
+    finer = 1 if oversampling is None else oversampling
+    if finer != int(finer) or finer < 1:
         raise ValueError(f"oversampling is {oversampling}: it must be a whole number of at least 1")
-    raster = (grid.shape[0] * oversampling, grid.shape[1] * oversampling)
+    raster = (grid.shape[0] * finer, grid.shape[1] * finer)
     step = (grid.period / raster[0], grid.period / raster[1])
     if diameter < 2 * max(step):
-        needed = math.ceil(2 * grid.period / (diameter * min(grid.shape)))
+        wider = 2 * max(step) / diameter
+        or_finer = "" if oversampling is None else f" or oversampling of at least {math.ceil(finer * wider)}"
         raise ValueError(
             f"a sub-aperture of {diameter:.4g} m spans {diameter / max(step):.2f} pupil samples of "
-            f"{max(step):.4g} m: at least 2 are needed, so take oversampling of at least {needed} or an image of more "
-            "pixels"
+            f"{max(step):.4g} m: at least 2 are needed, so take an image at least {math.ceil(100 * wider) / 100:g} "
+            f"times as wide{or_finer}"
         )
     cell = centers.new_tensor([step[1], step[0]])
     half = [math.ceil(shape.outer_diameter(diameter) / (2 * s)) + 1 for s in (step[1], step[0])]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,19 +64,23 @@ class Axis:
         return self.values[0] * (1 - _ROUNDING) <= value <= self.values[-1] * (1 + _ROUNDING)
 
 
-def locate(axes: Sequence[Axis], point: Sequence[float]) -> tuple[list[float], tuple[str, ...]]:
+def locate(
+    axes: Sequence[Axis], point: Sequence[float], told: Collection[str] = ()
+) -> tuple[list[float], tuple[str, ...]]:
     """Return the fractional indices of a point, and the names of the axes that do not hold it.
+
+    `told` names those of which a warning said so before.
 
     Raises ValueError for a value that cannot be.
 
     Warns
     -----
     UserWarning
-        For each of those axes, whose nearest end is taken.
+        For each of those axes that was not told before; its nearest end is taken.
     """
     places = [axis.place(value) for axis, value in zip(axes, point, strict=True)]
     outside = [axis for axis, value in zip(axes, point, strict=True) if not axis.holds(value)]
-    for axis in outside:
+    for axis in (axis for axis in outside if axis.name not in told):
         warnings.warn(
             f"blind restorations were tried for {axis.words} from {axis.values[0]:g} to {axis.values[-1]:g}: beyond, "
             "what they lose is taken to be that of the nearest tried",

@@ -59,7 +59,8 @@ def plan_observation(
     exposures : sequence of float, optional
         [s]; None: 0.25, 0.5, 1, 2, 4 and 8 tau0.
     widths : sequence of float, optional
-        Widths of the even band [m], all of them on the pixels that the widest needs; None: the instrument's band.
+        Widths of the even band [m], all of them on the pixels that the widest needs, or on those of the camera, without
+        bands that they undersample; None: the instrument's band.
     aperture : Aperture, optional
         A mask that exists, or a full pupil, in place of the searches: only exposure and width are planned then.
     constraints : sequence of Constraint
@@ -76,8 +77,8 @@ def plan_observation(
     Raises
     ------
     ValueError
-        For an axis that is empty or holds what cannot be, pixels that undersample the image at the shortest wavelength,
-        and if no point can be built: says why.
+        For an axis that is empty or holds what cannot be, pixels that undersample the image at the shortest wavelength
+        of every band, and if no point can be built: says why.
 
     Warns
     -----
@@ -106,10 +107,10 @@ def plan_observation(
     lengths = _positive("exposures", _default(exposures, _EXPOSURES, instrument.seeing.tau0), "s")
     left_out: list[str] = []
     bands = [instrument] if widths is None else _bands(instrument, _positive("widths", tuple(widths), "m"))
+    bands = _sampled(bands, aperture, left_out)
     exposed = [one for band in bands for one in _exposed(band, lengths, left_out)]
     if not exposed:
-        raise ValueError(f"no exposure is short enough: {left_out[0]}")
-    _check_sampling(exposed, aperture)
+        raise ValueError(f"no exposure is short enough: {left_out[-1]}")
     if aperture is None:
         masks = _search(
             instrument,
@@ -166,12 +167,23 @@ def _exposed(instrument: Instrument, lengths: Sequence[float], left_out: list[st
     return found
 
 
-def _check_sampling(exposed: Sequence[Instrument], aperture: Aperture | None) -> None:
-    """Raise ValueError if pixels undersample the image of the aperture, or of the telescope where it is None."""
-    for instrument in exposed:
+def _sampled(bands: Sequence[Instrument], aperture: Aperture | None, left_out: list[str]) -> list[Instrument]:
+    """Return the bands, from narrow to wide, in which pixels sample the image of the aperture, or of the telescope;
+    ValueError if there is none."""
+    found: list[Instrument] = []
+    for instrument in bands:
         diameter = instrument.telescope.diameter  # which some real masks reach beyond
         extent = diameter if aperture is None else min(diameter, float(aperture.extent))
-        replace(instrument.grid(), wavelength=instrument.band.shortest).require_sampling(extent)
+        try:
+            replace(instrument.grid(), wavelength=instrument.band.shortest).require_sampling(extent)
+        except ValueError as error:
+            if not found:  # wider ones are undersampled even more
+                raise
+            assert instrument.width is not None  # a filter has no others beside it
+            left_out.append(f"a band of {1e9 * instrument.width:.4g} nm is left out: {error}")
+        else:
+            found.append(instrument)
+    return found
 
 
 def _rules(instrument: Instrument, constraints: Sequence[Constraint]) -> tuple[Constraint, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -128,6 +129,16 @@ class ObservationPlan:
         curvature, slope, _ = np.polyfit(x - x[1], y, 2)
         return best * math.exp(-slope / (2 * curvature))
 
+    def _edge(self, name: str) -> str:
+        """Return a sentence on an axis along which the best point is the first or last."""
+        axis, best = _WORDS[name], getattr(self.best, name)
+        first = self.best is self.axis(name)[0]
+        place, beyond, side = ("first", "a smaller", "below") if first else ("last", "a larger", "above")
+        return (
+            f"The best {axis.words}, {axis.scale * best:.4g}{axis.unit}, is the {place} that was tried: {beyond} one "
+            f"may be better, so give {axis.parameter} {side} it too."
+        )
+
     def __str__(self) -> str:
         best, told = self.best, self.best_instrument
         band = "" if best.width is None else f", a band of {1e9 * best.width:.4g} nm"
@@ -143,11 +154,7 @@ class ObservationPlan:
             f"Predicted for a linear estimate that knows the PSFs: {best.relative_mse:.4g}; the least would be "
             f"{self.best_known.relative_mse:.4g}, with {_point(self.best_known)}.",
             f"Best exposure between those of the map: {1e3 * self.best_exposure:.4g} ms{width}.",
-            *(
-                f"The best {_WORDS[name]} is at the edge of the map: beyond may be better."
-                for name in AXES
-                if self.at_edge(name)
-            ),
+            *(self._edge(name) for name in AXES if self.at_edge(name)),
             "",
             "| " + " | ".join(_HEADINGS) + " |",
             "|" + "---|" * len(_HEADINGS),
@@ -174,11 +181,20 @@ def _blind_line(blind: BlindOutlook | None) -> str:
     )
 
 
+class _Words(NamedTuple):
+    """How to write of an axis: its name, its unit, 1 in that unit, and the parameter of `plan_observation`."""
+
+    words: str
+    unit: str
+    scale: float
+    parameter: str
+
+
 _WORDS = {
-    "n_subapertures": "number of holes",
-    "hole_diameter": "hole diameter",
-    "exposure": "exposure",
-    "width": "width of the band",
+    "n_subapertures": _Words("number of holes", "", 1, "n_subapertures"),
+    "hole_diameter": _Words("hole diameter", " m", 1, "hole_diameters"),
+    "exposure": _Words("exposure", " ms", 1e3, "exposures"),
+    "width": _Words("width of the band", " nm", 1e9, "widths"),
 }
 _HEADINGS = (
     "N",

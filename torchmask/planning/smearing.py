@@ -100,13 +100,13 @@ class SmearingMap:
         Warns
         -----
         UserWarning
-            If the point lies outside the tables, whose nearest edge is taken.
+            If the point lies outside the tables in what `instants` does not; the nearest edge is taken.
         """
         if exposure >= 0:
             exposure = max(exposure, self.exposures[0])
         if spread >= 0:
             spread = max(spread, self.spreads[0])
-        (light, long, wide), outside = locate(self._axes, (n_photons, exposure, spread))
+        (light, long, wide), outside = locate(self._axes, (n_photons, exposure, spread), instants.outside)
         logarithm = 0.0
         for ratio, place in ((self.exposure_ratio, long), (self.band_ratio, wide)):
             logarithm += interpolate(np.log(ratio), (light, place)) - interpolate(np.log(ratio), (light, 0)) / 2

@@ -144,7 +144,7 @@ class SampledPupil(nn.Module):
 
     def _sample_at(self, centers: Tensor, wavelength: float, instant: float) -> OpenSamples:
         aperture, grid = self.aperture, replace(self.grid, wavelength=wavelength)
-        samples = sample_holes(centers, aperture.shape, aperture.subaperture_diameter, grid, 1)
+        samples = sample_holes(centers, aperture.shape, aperture.subaperture_diameter, grid)
         modes = zernike_basis(samples, aperture, self.aberrations.n_modes)  # (N, P, J)
         is_open = samples.weights > 0
         mixing = self.aberrations.mixing_at(instant).to(modes).unflatten(0, (len(modes), self.aberrations.n_modes))

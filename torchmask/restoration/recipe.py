@@ -13,6 +13,7 @@ from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.band import Band
 from torchmask.optics.pixel import PixelResponse
+from torchmask.optics.pupil import sample_holes
 from torchmask.restoration.aberrations import (
     AberrationBasis,
     MakesBasis,
@@ -20,7 +21,7 @@ from torchmask.restoration.aberrations import (
     moving_basis,
     turbulent_basis,
 )
-from torchmask.restoration.forward import ExposureModel
+from torchmask.restoration.forward import ExposureModel, Window
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class ModelRecipe:
     Raises
     ------
     ValueError
-        If several apertures are given, or a number is out of range.
+        If several apertures are given, a number is out of range, or holes have more modes than samples.
     """
 
     aperture: Aperture
@@ -72,6 +73,19 @@ class ModelRecipe:
             if count < least:
                 raise ValueError(f"{name} is {count}: it must be a whole number of at least {least}")
         self._check_exposure()
+        if not self.aperture.is_full:  # whose usual modes are many, and quick to make
+            self._check_modes()
+
+    def _check_modes(self) -> None:
+        aperture, field = self.aperture, Window.around(self.grid).field
+        samples = sample_holes(aperture.centers.detach(), aperture.shape, aperture.subaperture_diameter, field)
+        most = int((samples.weights > 0).sum(-1).max())
+        for name, count in (("n_modes", self.frame_modes), ("static_modes", self.static_modes)):
+            if count > most:
+                raise ValueError(
+                    f"{name} is {count}: a hole has {most} pupil samples, on which no more modes can be told apart, so "
+                    f"take at most {most}, or a wider image"
+                )
 
     def _check_exposure(self) -> None:
         if not (math.isfinite(self.exposure_tau0) and self.exposure_tau0 >= 0):
