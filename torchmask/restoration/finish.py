@@ -1,7 +1,7 @@
 """The end of a restoration through a mask: faint frames are integrated over, others get a finer model.
 
 A descent from far away takes few modes per sub-aperture. Close to the solution, more of them take away much of what the
-model leaves unexplained. So once all has come to rest, the aberrations gain modes, and the object a smoother prior
+model leaves unexplained. So once the search has ended, the aberrations gain modes, and the object a smoother prior
 (`ObjectPrior.smoother`), and that descent goes on while it gains.
 """
 
@@ -34,7 +34,7 @@ def finish(
     *,
     is_faint: bool,
 ) -> MyopicObjective:
-    """Finish a restoration that has come to rest: update `ended`, and return the objective of its state.
+    """Finish a restoration whose search has ended: update `ended`, and return the objective of its state.
 
     `save` is called after every segment of the last descent, which goes on where an interrupted one was.
     """
