@@ -192,7 +192,7 @@ def test_a_scene_counts_by_its_content(tmp_path):
         (["--d-over-r0", "7", "0"], "--d-over-r0 is 0.0"),
         (["--outer-scale", "-1"], "--outer-scale is -1.0"),
         (["--readout-noise", "-1"], "--readout-noise is -1.0"),
-        (["--n-pixels", "4"], "an image of more pixels"),
+        (["--n-pixels", "4"], "take an image at least"),
         (["--fill-factor", "3"], "--fill-factor is 3.0"),
         (["--seeds", "1", "1"], "none twice"),
         (["--views", "0"], "--views is 0"),

@@ -94,3 +94,4 @@ def test_no_more_modes_than_samples_of_a_hole(name):
     ):
         recipe(**{name: most + 1})
     assert recipe(FullAperture(1.0), frame_modes=2000).frame_modes == 2000  # of one opening they are quick to make
+    assert getattr(recipe(**{name: most + 1}, whitened=False), name) == most + 1  # no covariance; they may be known

@@ -83,15 +83,13 @@ def lens_sum(factors: Iterable[Tensor], root: Tensor, x: Tensor, y: Tensor, scal
     """Return c, of the shape of the arguments, by the factors of `lens_coherence`.
 
     `root` is the square root of T; x and y are u over the holes' outer diameter. In a band, `scale` is that of the
-    phases, which c falls with, and two factors more are for it. Factors are taken one by one, so that a generator need
-    not hold them all in memory.
+    phases, which c falls with, and two factors more are for it.
     """
-    factor = iter(factors)
-    constant = next(factor)
-    slope = torch.addcmul(next(factor), root, next(factor))
-    slope.addcmul_(x * x - y * y, next(factor)).addcmul_(2 * x * y, next(factor))
+    constant, linear, square, along, skew, *by_scale = factors
+    slope = torch.addcmul(linear, root, square)
+    slope.addcmul_(x * x - y * y, along).addcmul_(2 * x * y, skew)
     if scale is not None:
-        slope.addcmul_(scale - 1, torch.addcmul(next(factor), root, next(factor)))
+        slope.addcmul_(scale - 1, torch.addcmul(by_scale[0], root, by_scale[1]))
     return torch.addcmul(constant, root, slope)
 
 

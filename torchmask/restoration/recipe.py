@@ -45,7 +45,7 @@ class ModelRecipe:
     Raises
     ------
     ValueError
-        If several apertures are given, a number is out of range, or holes have more modes than samples.
+        If several apertures are given, a number is out of range, or holes have more whitened modes than samples.
     """
 
     aperture: Aperture
@@ -73,7 +73,7 @@ class ModelRecipe:
             if count < least:
                 raise ValueError(f"{name} is {count}: it must be a whole number of at least {least}")
         self._check_exposure()
-        if not self.aperture.is_full:  # whose usual modes are many, and quick to make
+        if self.whitened and not self.aperture.is_full:  # whose usual modes are many, and quick to make
             self._check_modes()
 
     def _check_modes(self) -> None:
