@@ -228,3 +228,18 @@ def test_a_search_that_is_cut_short_has_an_end_once_a_start_was_whole(observe, f
     assert torch.equal(longer.cost[:30], result.cost)
     start = longer.cost[20:40]  # the second, cut in two
     assert float(start[10]) < float(start[9])
+
+
+def test_a_search_need_not_come_to_rest_if_a_last_descent_follows(observe, five_holes):
+    """If it explains the frames; without a last descent, or with the limit at 0, it goes on."""
+    seen = observe(n_frames=2, shape=(32, 32))
+    options = {"start_iterations": 40, "segment": 10, "sharp_after": 10, "escapes": 0, "last_modes": 8, "faint": 0.0}
+
+    def iterations(**changes):
+        schedule = Schedule(**options, **changes, chance=math.inf)
+        method = MyopicDeconvolution(five_holes, seen.grid, readout_noise=1.5, tolerance=0.0, schedule=schedule)
+        return len(method.restore(seen.frames).cost)
+
+    assert iterations(nearly_at_rest=math.inf, last_segments=1) == 10
+    assert iterations(nearly_at_rest=0.0, last_segments=1) > 10
+    assert iterations(nearly_at_rest=math.inf, last_segments=0) > 10

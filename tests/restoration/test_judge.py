@@ -140,3 +140,24 @@ def test_faint_frames_get_several_starts_though_they_are_explained(explain):
         progress = Progress(Candidates(replace(state, z=0 * state.z), 1), schedule.glance * [1.0], rival=ending)
         assert judge.gives_up(objective, progress) is not is_faint
     assert starts == [1, 4]
+
+
+def test_a_start_that_explains_the_frames_ends_when_nearly_at_rest(explain):
+    """The last descent goes on from there; a wrong object, faint frames or a start that is the end must be at rest."""
+    objective, state = explain(noise=0.003)
+    schedule = Schedule(nearly_at_rest=0.01)
+    known, wrong = (Progress(Candidates(found, 1)) for found in (state, replace(state, z=0 * state.z)))
+
+    def ends(progress, decrease, tolerance=0.001, **options):
+        traits = replace(TRAITS, tolerance=tolerance)
+        judge = Judge(Setting.of(objective), stack_of(objective), traits, schedule, **options)
+        return judge.is_at_rest(objective, progress, decrease)
+
+    assert ends(known, 0.009, goes_on=True)
+    assert not ends(known, 0.011, goes_on=True)
+    assert not ends(wrong, 0.009, goes_on=True)
+    assert not ends(known, 0.009)
+    assert not ends(known, 0.009, goes_on=True, is_faint=True)
+    assert ends(known, 0.011, tolerance=0.02, goes_on=True)
+    for progress in (known, wrong):
+        assert ends(progress, 0.001)

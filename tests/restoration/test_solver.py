@@ -178,7 +178,8 @@ def test_the_better_of_two_starts_is_kept(rival_is_better, explained):
     objective, truth = explained
     poor = replace(truth, z=0 * truth.z)
     now, before = (poor, truth) if rival_is_better else (truth, poor)
-    solver = solver_of(objective, schedule=Schedule(start_iterations=1, **BRISK | {"sharp_after": 0}))
+    schedule = Schedule(start_iterations=1, nearly_at_rest=-math.inf, **BRISK | {"sharp_after": 0})
+    solver = solver_of(objective, schedule=schedule)
     rival = Ending(before, Status.CONVERGED, 1e-9)
     begun = Progress(Candidates(now, 1), [1.0], starts=solver.schedule.starts, began=1, rival=rival)
     progress = solver.run(begun, True, lambda _: None)
@@ -361,7 +362,7 @@ def test_frames_of_a_full_pupil_are_weighed_by_the_square_of_their_fit(many_mini
     """With no escapes to wait for, from the first recalibration on; a decrease of 0 to rounding does not end it."""
     objective, truth = explained
     poor = replace(truth, z=truth.z * torch.tensor([1.0, 0.9, 0.7, 0.5]).double()[:, None])
-    schedule = Schedule(segment=2, escapes=0, **NONE_MISSED)
+    schedule = Schedule(segment=2, escapes=0, nearly_at_rest=-math.inf, **NONE_MISSED)
     traits = {"many_minima": many_minima, "max_iterations": 3, "tolerance": -math.inf}
     solver = solver_of(objective, minimizer=idle, schedule=schedule, **traits)
     seen = []

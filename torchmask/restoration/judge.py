@@ -29,16 +29,27 @@ class Comparison(NamedTuple):
 
 
 class Judge:
-    """Judges the endings of a stack's starts, each with the mask geometry and motion that it found."""
+    """Judges the endings of a stack's starts, each with the mask geometry and motion that it found.
+
+    `is_faint`: the aberrations are integrated out at the end. `goes_on`: a last descent goes on from the best start.
+    """
 
     def __init__(
-        self, setting: Setting, stack: FrameStack, traits: Traits, schedule: Schedule, *, is_faint: bool = False
+        self,
+        setting: Setting,
+        stack: FrameStack,
+        traits: Traits,
+        schedule: Schedule,
+        *,
+        is_faint: bool = False,
+        goes_on: bool = False,
     ) -> None:
         least = schedule.missed * stack.change if traits.many_minima else 0.0  # allows for its usual minima
         self.setting: Setting = setting
         self.traits: Traits = traits
         self.schedule: Schedule = schedule
         self.is_faint: bool = is_faint
+        self.goes_on: bool = goes_on
         self.contrast: float = stack.contrast
         self.noise: FrameNoise = stack.noise_of_frames
         self.tolerance: Tolerance = Tolerance(schedule.model_errors, schedule.chance, least)
@@ -98,6 +109,18 @@ class Judge:
         noise = verdict.limit - 1 - self.schedule.model_errors * verdict.model_error
         is_doubtful = verdict.excess - noise > self.schedule.doubtful * verdict.model_error
         return self.schedule.doubtful_starts if is_doubtful else 1
+
+    def is_at_rest(self, objective: MyopicObjective, progress: Progress, decrease: float) -> bool:
+        """Return whether the present start is at rest, its last segment having lowered the cost by the part `decrease`.
+
+        If it explains the frames beyond doubt and a last descent goes on from it, it need not quite be.
+        """
+        if decrease <= self.traits.tolerance:
+            return True
+        if not self.goes_on or decrease > self.schedule.nearly_at_rest:
+            return False
+        verdict = self.verdict(objective, progress.ending)
+        return verdict.explained and self.most_starts(verdict) == 1
 
     def gives_up(self, objective: MyopicObjective, progress: Progress) -> bool:
         """Return whether it is time to see that the present start is not well ahead of the best earlier one."""

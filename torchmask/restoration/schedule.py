@@ -16,6 +16,8 @@ class Schedule:
     segment : number of iterations between two recalibrations of scales, transmissions, noise and turbulence
     recalibrates : whether to recalibrate transmissions, noise and turbulence; the scales of the variables always are
     start_iterations : maximum number of iterations of one start
+    nearly_at_rest : a start of a mask that explains the frames, unless they are faint, ends as soon as a segment lowers
+        the cost by less than this fraction, as the last descent goes on from there
     sharp_after : number of iterations after which the object is sharp enough to escape from local minima
     escapes : maximum number of escapes in one start, each of which restarts outlying frames and shifts the object
     first_inflation : the initial noise variance is the residual variance of the mean frame divided by this
@@ -64,6 +66,7 @@ class Schedule:
     segment: int = 100
     recalibrates: bool = True
     start_iterations: int = 1000
+    nearly_at_rest: float = 0.003
     sharp_after: int = 300
     escapes: int = 7
     first_inflation: float = 30.0

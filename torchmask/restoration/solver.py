@@ -4,10 +4,10 @@ The first start is from zero aberrations for a mask, and a tournament of random 
 proceeds in segments. Between two of them, the scales of the variables, the transmissions, the strength of the
 turbulence and the noise are updated; the assumed noise falls from the residual of the mean frame to the true noise, or
 to the residual of the model, if that is larger. Once the object is sharp, frames and object escape from local minima;
-when nothing changes any more, each frame is weighted by how well it fits. A start ends when a segment gains nothing or
-its iterations are used up. If its verdict is that it missed the object, or in faint frames, others start, from random
-aberrations or, for a mask, from twins of the object, and the best is kept. At the end, the aberrations of faint frames
-are integrated out, those of others gain modes. For a full pupil the objects of several good starts are averaged.
+when nothing changes any more, each frame is weighted by how well it fits. A start ends when a segment gains nothing, or
+little if it explains the frames, or its iterations are used up. If its verdict is that it missed the object, or in
+faint frames, others start, from random aberrations or, for a mask, from twins of the object, and the best is kept. Then
+aberrations of faint frames are integrated out, those of others gain modes; objects of full pupils are averaged.
 """
 
 from __future__ import annotations
@@ -83,9 +83,7 @@ class Solver:
     ) -> None:
         self.objective: MyopicObjective = objective
         self.setting: Setting = Setting.of(objective, moving, finer)
-        self.unit: float = stack.unit
-        self.traits: Traits = traits
-        self.schedule: Schedule = schedule
+        self.unit, self.traits, self.schedule = stack.unit, traits, schedule
         self.minimizer: Minimizer = minimizer
         self.callback: Callback | None = callback
         change = stack.change
@@ -97,7 +95,8 @@ class Solver:
         self.prior_r0: float | None = traits.r0 if turbulent else None  # of the aberrations' prior, at first [m]
         many_ends = turbulent and traits.many_minima and Free.OBJECT in objective.free
         self.averages: bool = many_ends and schedule.averaged > 1
-        self.judge: Judge = Judge(self.setting, stack, traits, schedule, is_faint=self.is_faint)
+        goes_on = self.is_open and not self.is_faint and schedule.last_segments > 0
+        self.judge: Judge = Judge(self.setting, stack, traits, schedule, is_faint=self.is_faint, goes_on=goes_on)
 
     def solve(self, known: Known, start: RestorationResult | None = None, file: Checkpoint | None = None) -> Progress:
         """Run a restoration to its end, from scratch, from an earlier result or from a checkpoint."""
@@ -196,7 +195,8 @@ class Solver:
         objective = self._place(state)
         after = float(objective.evaluator(state.calibration)(state.image, state.z).value)
         progress.state, decrease = state, (before - after) / abs(after)
-        at_rest = decrease <= self.traits.tolerance and distance(place, state.geometry) < schedule.still
+        is_still = distance(place, state.geometry) < schedule.still
+        at_rest = is_still and self.judge.is_at_rest(objective, progress, decrease)
         self._look_at_place(progress)
         if self._is_twin(progress) and self.judge.gives_up(objective, progress):
             progress.status = Status.GIVEN_UP
