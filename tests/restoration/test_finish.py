@@ -20,7 +20,7 @@ from torchmask.restoration.priors import EdgePreserving, SmoothVariation, TotalV
 from torchmask.restoration.projected_lbfgs import Minimum, ProjectedLBFGS
 from torchmask.restoration.recipe import ModelRecipe
 from torchmask.restoration.schedule import Schedule
-from torchmask.restoration.traits import Refinement, Traits
+from torchmask.restoration.traits import End, Refinement, Traits
 
 R0, OUTER_SCALE = 0.25, 20.0
 GRID = Grid.nyquist(1.0, 550e-9, 32, oversampling=1.2)
@@ -83,12 +83,12 @@ def ended(objective, state, setting, schedule, records=None, minimizer=None):
         objective,
         setting,
         progress,
+        End.LAST_DESCENT,
         schedule,
         minimizer or ProjectedLBFGS(),
         listen,
         TRAITS,
         lambda progress: None,
-        is_faint=False,
     )
     return found, progress
 
@@ -141,12 +141,15 @@ def test_the_last_descent_ends_when_half_a_segment_gains_little(explained):
     assert len(gains) == 1
 
 
-def test_a_schedule_without_last_segments_leaves_all_as_it_is(explained):
-    objective, state = explained
-    found, progress = ended(objective, state, Setting.of(objective), Schedule.plain())
-    assert found is objective
-    assert progress.state is state
-    assert progress.n_evaluations == 0
+def test_nothing_follows_the_search_of_a_schedule_without_last_segments(observe, five_holes):
+    assert End.of(math.inf, Schedule()) is End.LAST_DESCENT
+    assert End.of(math.inf, Schedule.plain()) is End.NONE
+    seen, stages = observe(n_frames=2, shape=(32, 32)), []
+    schedule = Schedule(start_iterations=10, segment=10, last_segments=0, chance=math.inf, faint=0.0)
+    method = MyopicDeconvolution(five_holes, seen.grid, readout_noise=1.5, schedule=schedule)
+    result = method.restore(seen.frames, callback=lambda record: stages.append(record.stage))
+    assert stages == 10 * ["restoration"]
+    assert "TotalVariation" in result.prior
 
 
 def test_the_prior_of_the_last_descent_is_smoother():

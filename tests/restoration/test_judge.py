@@ -17,7 +17,7 @@ from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.placed import moved_centers
 from torchmask.restoration.placement import moved
 from torchmask.restoration.schedule import Schedule
-from torchmask.restoration.traits import Refinement, Traits
+from torchmask.restoration.traits import End, Refinement, Traits
 from torchmask.restoration.verdict import Finding
 
 TURN = torch.tensor([0.02, 0.0], dtype=torch.float64)
@@ -110,7 +110,7 @@ def test_the_likelier_of_two_starts_is_kept(explain):
     For z of n numbers the weight n / ||z||^2 is the likeliest, and the noise that a start assumed last does not count.
     """
     objective, state = explain(noise=0.003)
-    judge = Judge(Setting.of(objective), stack_of(objective), TRAITS, Schedule(likelier=0.0), is_faint=True)
+    judge = Judge(Setting.of(objective), stack_of(objective), TRAITS, Schedule(likelier=0.0), End.INTEGRATION)
     found = state.z.numel() / float(state.z.square().sum())
 
     def ending(weight, inflation=1.0):
@@ -121,7 +121,7 @@ def test_the_likelier_of_two_starts_is_kept(explain):
         best, rival = ending(found), ending(other * found, inflation=5.0)
         for pair in ((best, rival), (rival, best)):
             assert judge.compare(objective, *pair).best is best
-    careful = Judge(Setting.of(objective), stack_of(objective), TRAITS, Schedule(likelier=1e3), is_faint=True)
+    careful = Judge(Setting.of(objective), stack_of(objective), TRAITS, Schedule(likelier=1e3), End.INTEGRATION)
     assert careful.compare(objective, best, rival).best is rival  # the earlier one, as the costs are close
     worse = Ending(replace(state, z=0.9 * state.z), Status.CONVERGED)
     assert judge.compare(objective, worse, ending(0.5 * found)).best is not worse
@@ -132,13 +132,13 @@ def test_faint_frames_get_several_starts_though_they_are_explained(explain):
     objective, state = explain(noise=0.003)
     ending, schedule = Ending(state, Status.CONVERGED), Schedule(faint_starts=4)
     starts = []
-    for is_faint in (False, True):
-        judge = Judge(Setting.of(objective), stack_of(objective), TRAITS, schedule, is_faint=is_faint)
+    for end in (End.LAST_DESCENT, End.INTEGRATION):
+        judge = Judge(Setting.of(objective), stack_of(objective), TRAITS, schedule, end)
         verdict = judge.verdict(objective, ending)
         assert verdict.explained
         starts.append(judge.most_starts(verdict))
         progress = Progress(Candidates(replace(state, z=0 * state.z), 1), schedule.glance * [1.0], rival=ending)
-        assert judge.gives_up(objective, progress) is not is_faint
+        assert judge.gives_up(objective, progress) is (end is End.LAST_DESCENT)
     assert starts == [1, 4]
 
 
@@ -148,16 +148,16 @@ def test_a_start_that_explains_the_frames_ends_when_nearly_at_rest(explain):
     schedule = Schedule(nearly_at_rest=0.01)
     known, wrong = (Progress(Candidates(found, 1)) for found in (state, replace(state, z=0 * state.z)))
 
-    def ends(progress, decrease, tolerance=0.001, **options):
+    def rests(progress, decrease, end=End.LAST_DESCENT, tolerance=0.001):
         traits = replace(TRAITS, tolerance=tolerance)
-        judge = Judge(Setting.of(objective), stack_of(objective), traits, schedule, **options)
+        judge = Judge(Setting.of(objective), stack_of(objective), traits, schedule, end)
         return judge.is_at_rest(objective, progress, decrease)
 
-    assert ends(known, 0.009, goes_on=True)
-    assert not ends(known, 0.011, goes_on=True)
-    assert not ends(wrong, 0.009, goes_on=True)
-    assert not ends(known, 0.009)
-    assert not ends(known, 0.009, goes_on=True, is_faint=True)
-    assert ends(known, 0.011, tolerance=0.02, goes_on=True)
+    assert rests(known, 0.009)
+    assert not rests(known, 0.011)
+    assert not rests(wrong, 0.009)
+    assert not rests(known, 0.009, End.NONE)
+    assert not rests(known, 0.009, End.INTEGRATION)
+    assert rests(known, 0.011, tolerance=0.02)
     for progress in (known, wrong):
-        assert ends(progress, 0.001)
+        assert rests(progress, 0.001)

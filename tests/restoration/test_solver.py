@@ -23,7 +23,7 @@ from torchmask.restoration.projected_lbfgs import Minimum, ProjectedLBFGS
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.solver import Solver
 from torchmask.restoration.starts import Known
-from torchmask.restoration.traits import Refinement, Traits
+from torchmask.restoration.traits import End, Refinement, Traits
 from torchmask.restoration.verdict import Finding
 
 ALL_MISSED = {"chance": -1e9}  # no fit is good enough
@@ -446,14 +446,14 @@ def test_faint_frames_get_whole_starts_from_twins(max_iterations, n_starts, expl
 def test_frames_are_faint_by_how_they_change(explained):
     objective, _ = explained
     change = FrameStack(objective.frames, torch.ones_like(objective.frames, dtype=torch.bool), 1.0, 0.03**2).change
-    for faint, is_faint in ((0.99 * change, False), (1.01 * change, True)):
-        assert solver_of(objective, schedule=Schedule(faint=faint)).is_faint is is_faint
+    for faint, end in ((0.99 * change, End.LAST_DESCENT), (1.01 * change, End.INTEGRATION)):
+        assert solver_of(objective, schedule=Schedule(faint=faint)).end is end
 
 
 def test_nothing_is_integrated_over_what_is_known(explained):
     objective, _ = explained
     for free in (Free.OBJECT, Free.ABERRATIONS | Free.COMMON):
-        assert not solver_of(objective.with_changes(free=free), schedule=Schedule(faint=math.inf)).is_faint
+        assert solver_of(objective.with_changes(free=free), schedule=Schedule(faint=math.inf)).end is End.NONE
 
 
 # --- whole restorations

@@ -19,32 +19,29 @@ from torchmask.restoration.motion import Setting
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.schedule import Schedule
-from torchmask.restoration.traits import Traits
+from torchmask.restoration.traits import End, Traits
 
 
 def finish(
     objective: MyopicObjective,
     setting: Setting,
     ended: Progress,
+    end: End,
     schedule: Schedule,
     minimizer: Minimizer,
     callback: Callback | None,
     traits: Traits,
     save: Callable[[Progress], None],
-    *,
-    is_faint: bool,
 ) -> MyopicObjective:
     """Finish a restoration whose search has ended: update `ended`, and return the objective of its state.
 
     `save` is called after every segment of the last descent, which goes on where an interrupted one was.
     """
-    if is_faint:
+    if end is End.INTEGRATION:
         how = {"seed": traits.seed, "follow_r0": traits.r0_is_open}
         ended.state, spent = integrate_aberrations(objective, ended.state, schedule, minimizer, callback, **how)
         ended.n_evaluations += spent
         ended.integrated = True
-        return objective
-    if not schedule.last_segments:
         return objective
     state = setting.in_finer_modes(ended.state) if ended.finer is None else ended.finer
     objective = setting.objective_at(objective, state).with_changes(prior=objective.prior.smoother())

@@ -15,7 +15,7 @@ from torchmask.restoration.noise import FrameNoise
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.state import State
-from torchmask.restoration.traits import Traits
+from torchmask.restoration.traits import End, Traits
 from torchmask.restoration.verdict import Finding, FrameFits, Tolerance, Verdict, judge
 
 
@@ -29,27 +29,16 @@ class Comparison(NamedTuple):
 
 
 class Judge:
-    """Judges the endings of a stack's starts, each with the mask geometry and motion that it found.
-
-    `is_faint`: the aberrations are integrated out at the end. `goes_on`: a last descent goes on from the best start.
-    """
+    """Judges the endings of a stack's starts, each with the mask geometry and motion that it found."""
 
     def __init__(
-        self,
-        setting: Setting,
-        stack: FrameStack,
-        traits: Traits,
-        schedule: Schedule,
-        *,
-        is_faint: bool = False,
-        goes_on: bool = False,
+        self, setting: Setting, stack: FrameStack, traits: Traits, schedule: Schedule, end: End = End.NONE
     ) -> None:
         least = schedule.missed * stack.change if traits.many_minima else 0.0  # allows for its usual minima
         self.setting: Setting = setting
         self.traits: Traits = traits
         self.schedule: Schedule = schedule
-        self.is_faint: bool = is_faint
-        self.goes_on: bool = goes_on
+        self.end: End = end
         self.contrast: float = stack.contrast
         self.noise: FrameNoise = stack.noise_of_frames
         self.tolerance: Tolerance = Tolerance(schedule.model_errors, schedule.chance, least)
@@ -88,7 +77,7 @@ class Judge:
         if now.status is Status.GIVEN_UP:
             return Comparison(rival, before, after, alike=False)
         stays = before.excess < after.excess
-        if self.is_faint:  # the residual does not tell, nor do costs that are close
+        if self.end is End.INTEGRATION:  # the residual does not tell, nor do costs that are close
             lower = self._cost(objective, rival.state) - self._cost(objective, now.state)
             alone = before.explained is not after.explained
             stays = before.explained if alone else lower <= self.schedule.likelier
@@ -104,7 +93,7 @@ class Judge:
             return self.schedule.starts
         if not verdict.explained or self.traits.many_minima:
             return 1
-        if self.is_faint:
+        if self.end is End.INTEGRATION:
             return self.schedule.faint_starts
         noise = verdict.limit - 1 - self.schedule.model_errors * verdict.model_error
         is_doubtful = verdict.excess - noise > self.schedule.doubtful * verdict.model_error
@@ -117,14 +106,14 @@ class Judge:
         """
         if decrease <= self.traits.tolerance:
             return True
-        if not self.goes_on or decrease > self.schedule.nearly_at_rest:
+        if self.end is not End.LAST_DESCENT or decrease > self.schedule.nearly_at_rest:
             return False
         verdict = self.verdict(objective, progress.ending)
         return verdict.explained and self.most_starts(verdict) == 1
 
     def gives_up(self, objective: MyopicObjective, progress: Progress) -> bool:
         """Return whether it is time to see that the present start is not well ahead of the best earlier one."""
-        if self.is_faint or progress.rival is None or progress.iterations != self.schedule.glance:
+        if self.end is End.INTEGRATION or progress.rival is None or progress.iterations != self.schedule.glance:
             return False
         left, least = (self.verdict(objective, ending).excess for ending in (progress.ending, progress.rival))
         return left >= self.schedule.promising * least

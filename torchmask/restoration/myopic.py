@@ -44,8 +44,8 @@ class MyopicDeconvolution:
         1/2 sum_t || (g_t window(h_t(a_t) * o) + b_t - y_t) / sigma ||^2  +  prior(o)  +  1/2 ||z||^2
 
     starting from the clipped mean frame, with the best-fitting background b_t. `torchmask.restoration.solver` describes
-    the algorithm: how it updates the noise sigma and the transmissions g_t, and how it escapes from local minima;
-    `torchmask.restoration.finish` its end for a mask, which depends on how faint the frames are.
+    the algorithm: how it updates the noise sigma and the transmissions g_t, and how it escapes from local minima.
+    `torchmask.restoration.finish` describes the end for a mask, which depends on how faint the frames are.
 
     Parameters
     ----------
@@ -80,19 +80,19 @@ class MyopicDeconvolution:
         Exposure time of a frame in units of tau0 = 0.314 r0 / wind. Piston, tip and tilt of every hole then change
         linearly during a frame; coefficients are those at mid-exposure. 0: frames are snapshots.
     refine_geometry : bool, optional
-        Whether to estimate a rotation and magnification of the mask too. None: only if the frames clearly show them.
-        Frames of a star give both more precisely (`calibrate_mask`).
+        Whether to estimate a rotation and magnification of the mask too. None: only if the frames clearly show that it
+        is misplaced. Frames of a star give both more precisely (`calibrate_mask`).
     prior : callable
-        Prior on the object, such as `TotalVariation` (the default): maps an image (H', W'), somewhat wider than the
-        frames, in units of the mean pixel, to a differentiable scalar. It may have `gradient` and `curvature`.
+        Prior on the object: a function or module that maps an image (H', W'), in units of the stack's mean pixel and on
+        a field somewhat wider than the frames, to a differentiable scalar, such as `TotalVariation` (the default) or
+        `EdgePreserving`. Methods `gradient(image)` and `curvature(image)` are used if it has them.
     aberration_prior : bool
         False: leave out 1/2 ||z||^2; z are then the Zernike coefficients themselves.
     max_iterations : int
-        Maximum over all starts, each of at most 1000. A full pupil and faint frames through a mask get three starts, a
-        mask up to nine while none explains the frames.
+        Maximum number over all starts, each of at most 1000; the object behind a full pupil is the mean of three. Faint
+        frames through a mask get three too, and up to nine are made while none explains the frames; the best is kept.
     tolerance : float
-        A start has converged when 100 iterations lower the cost by less than this fraction, or
-        `Schedule.nearly_at_rest` if a last descent follows and the frames are explained.
+        A start has converged when 100 iterations gain less than this part of the cost (see `Schedule.nearly_at_rest`).
     minimizer : Minimizer
         `ProjectedLBFGS` (the default), or an optimiser of PyTorch in a `TorchMinimizer`.
     schedule : Schedule

@@ -44,7 +44,7 @@ from torchmask.restoration.starts import (
     start_rms,
 )
 from torchmask.restoration.state import Modes, State
-from torchmask.restoration.traits import Refinement, Traits
+from torchmask.restoration.traits import End, Refinement, Traits
 from torchmask.restoration.twins import twin_of
 from torchmask.restoration.verdict import Verdict
 
@@ -83,20 +83,20 @@ class Solver:
     ) -> None:
         self.objective: MyopicObjective = objective
         self.setting: Setting = Setting.of(objective, moving, finer)
-        self.unit, self.traits, self.schedule = stack.unit, traits, schedule
+        self.unit: float = stack.unit
+        self.traits: Traits = traits
+        self.schedule: Schedule = schedule
         self.minimizer: Minimizer = minimizer
         self.callback: Callback | None = callback
-        change = stack.change
-        self.first_inflation: float = max(1.0, change / schedule.first_inflation)
+        self.first_inflation: float = max(1.0, stack.change / schedule.first_inflation)
         held = traits.prior_on_aberrations and not traits.many_minima  # not tried for a full pupil
-        self.is_open: bool = held and Free.OBJECT | Free.ABERRATIONS in objective.free
-        self.is_faint: bool = self.is_open and change < schedule.faint
+        is_open = held and Free.OBJECT | Free.ABERRATIONS in objective.free
+        self.end: End = End.of(stack.change, schedule) if is_open else End.NONE
         turbulent = Free.ABERRATIONS in objective.free and traits.prior_on_aberrations and not traits.estimated
         self.prior_r0: float | None = traits.r0 if turbulent else None  # of the aberrations' prior, at first [m]
         many_ends = turbulent and traits.many_minima and Free.OBJECT in objective.free
         self.averages: bool = many_ends and schedule.averaged > 1
-        goes_on = self.is_open and not self.is_faint and schedule.last_segments > 0
-        self.judge: Judge = Judge(self.setting, stack, traits, schedule, is_faint=self.is_faint, goes_on=goes_on)
+        self.judge: Judge = Judge(self.setting, stack, traits, schedule, self.end)
 
     def solve(self, known: Known, start: RestorationResult | None = None, file: Checkpoint | None = None) -> Progress:
         """Run a restoration to its end, from scratch, from an earlier result or from a checkpoint."""
@@ -110,9 +110,9 @@ class Solver:
         may_start_again = blind and self.traits.prior_on_aberrations and len(self.objective.frames) > 1
         ended = self.run(begun, may_start_again, save := save_nothing if file is None else file.save)
         cut_short = ended.status is Status.ITERATION_LIMIT  # it may go on from its file, which the end leaves as it is
-        if self.is_open and (ended.starts > 1 or not cut_short):
+        if self.end is not End.NONE and (ended.starts > 1 or not cut_short):
             how = (self.schedule, self.minimizer, self.callback, self.traits, save_nothing if cut_short else save)
-            self.objective = finish(self.objective, self.setting, ended, *how, is_faint=self.is_faint)
+            self.objective = finish(self.objective, self.setting, ended, self.end, *how)
         if len(ended.explained) > 1:
             average_starts(self.objective, ended, self.schedule, self.minimizer, self.callback)
         return ended
@@ -159,7 +159,7 @@ class Solver:
     def _look_at_place(self, progress: Progress) -> None:
         """Decide whether to refine the mask's geometry, once the object is sharp enough to show an error in it."""
         if progress.refinement is Refinement.IF_SEEN and progress.iterations >= self.schedule.sharp_after:
-            asked = not self.is_faint and is_misplaced(self.objective, progress.state, self.schedule)
+            asked = self.end is not End.INTEGRATION and is_misplaced(self.objective, progress.state, self.schedule)
             progress.refinement = Refinement.ON if asked else Refinement.OFF
 
     def _first_state(self, known: Known) -> State:

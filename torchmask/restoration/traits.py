@@ -7,6 +7,22 @@ from dataclasses import dataclass
 from enum import Enum
 
 from torchmask.optics.aperture import Aperture, SparseAperture
+from torchmask.restoration.schedule import Schedule
+
+
+class End(Enum):
+    """What follows the search of a restoration."""
+
+    NONE = "the search is the end"
+    INTEGRATION = "the aberrations of faint frames are integrated out"
+    LAST_DESCENT = "object and aberrations descend once more, with more modes"
+
+    @classmethod
+    def of(cls, change: float, schedule: Schedule) -> End:
+        """Return the end for a mask whose frames change from one to the next by so many noise variances."""
+        if change < schedule.faint:
+            return cls.INTEGRATION
+        return cls.LAST_DESCENT if schedule.last_segments else cls.NONE
 
 
 class Refinement(Enum):
