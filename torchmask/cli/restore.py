@@ -86,7 +86,7 @@ class Options(BandOptions, StackOptions, OIFITSOptions, WorkerOptions, RunOption
     max_iterations: int = 4000
     """Maximum number of iterations over all starts, each of at most 1000; a full pupil averages three starts."""
     tolerance: float = 1e-4
-    """Converged when 100 iterations lower the cost by less than this fraction; behind a mask, 0.003 is enough where
+    """Converged when 100 iterations lower the cost by less than this fraction; behind a mask, 0.001 is enough where
     bright frames are explained, as another descent follows."""
     n_samples: int = 0
     """Number of posterior samples for the standard deviations of the image (ERR in restored.fits): 8 suffice; 0:

@@ -66,7 +66,7 @@ class Schedule:
     segment: int = 100
     recalibrates: bool = True
     start_iterations: int = 1000
-    nearly_at_rest: float = 0.003
+    nearly_at_rest: float = 0.001
     sharp_after: int = 300
     escapes: int = 7
     first_inflation: float = 30.0
