@@ -1,12 +1,12 @@
 """Where a blind restoration succeeds, over the size of the holes, the light and the number of frames.
 
-    python experiments/success_map.py                    # 204 restorations: an hour and a half of one core
+    python experiments/success_map.py                    # 204 restorations: up to an hour and a half of one core
     python experiments/success_map.py --draws 2 2 1      # fewer of each
     python experiments/success_map.py --smoke            # everything, tiny, in seconds
 
 Each draw is another mask, scene, turbulence and noise, and goes through every combination of d/r0, photons and frames.
-The frames are made end to end with the full von Karman phase. They are restored by the library's defaults with one
-start, told the read-out noise alone. The reference is the better of two that know more: the positive object of least
+The frames are made end to end with the full von Karman phase. They are restored by the library's defaults, told
+the read-out noise alone. The reference is the better of two that know more: the positive object of least
 total variation for the true PSFs, and, for bright frames, the library's for the true aberrations. A restoration
 succeeds where its score is within 1.3 of that. The Cramer-Rao bound of the first draw stands beside.
 
@@ -76,9 +76,8 @@ class Options(SweepOptions):
     """Draws of mask, scene, turbulence and noise for each of the numbers of frames."""
     n_pixels: int = 64
     """Number of pixels per side of the image."""
-    iterations: int = 1000
-    """Maximum number of iterations of a restoration: one start. The library makes up to three more, at several times
-    the cost, where frames are not explained."""
+    iterations: int = 4000
+    """Maximum number of iterations of a restoration."""
 
 
 def of_mask(mask: SparseAperture) -> dict[str, Any]:
