@@ -1,6 +1,6 @@
 """What restorations that have to find the aberrations attain in long exposures and wide bands, over what is predicted.
 
-    python experiments/smearing_map.py                    # 240 restorations: an hour and a half of one core
+    python experiments/smearing_map.py                    # 320 restorations: an hour and a half of one core
     python experiments/smearing_map.py --draws 2          # fewer of each
     python experiments/smearing_map.py --smoke            # everything, tiny, in seconds
 
@@ -70,7 +70,7 @@ class Options(SweepOptions):
     """Exposure times of a frame, T / tau0, of which the first is an instant."""
     widths: tuple[float, ...] = (0.02, 0.1, 0.2, 0.4)
     """Widths of the band over the wavelength, of which the first is narrow."""
-    photons: tuple[float, ...] = (1e5, 1e6, 1e7)
+    photons: tuple[float, ...] = (1e4, 1e5, 1e6, 1e7)
     """Electrons per frame through the mask, the same at all exposures and widths."""
     draws: int = 8
     """Draws of mask, scene, turbulence and noise."""

@@ -1,6 +1,6 @@
 """Where a blind restoration succeeds, over the size of the holes, the light and the number of frames.
 
-    python experiments/success_map.py                    # 204 restorations: up to an hour and a half of one core
+    python experiments/success_map.py                    # 272 restorations: up to an hour and a half of one core
     python experiments/success_map.py --draws 2 2 1      # fewer of each
     python experiments/success_map.py --smoke            # everything, tiny, in seconds
 
@@ -68,7 +68,7 @@ class Options(SweepOptions):
 
     d_over_r0: tuple[float, ...] = (0.5, 0.8, 1.1, 1.5)
     """Diameter of a hole over r0."""
-    photons: tuple[float, ...] = (1e5, 1e6, 1e7)
+    photons: tuple[float, ...] = (1e4, 1e5, 1e6, 1e7)
     """Electrons per frame through the mask."""
     frames: tuple[int, ...] = (5, 10, 1)
     """Numbers of short exposures."""
