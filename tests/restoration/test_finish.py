@@ -7,23 +7,29 @@ import pytest
 import torch
 
 from torchmask.grid import Grid
+from torchmask.optics.aperture import FullAperture
 from torchmask.optics.band import Band
 from torchmask.restoration.aberrations import moving_basis, turbulent_basis
+from torchmask.restoration.background import Background
 from torchmask.restoration.calibration import fit_of_frames
 from torchmask.restoration.candidates import Candidates
 from torchmask.restoration.checkpoint import Progress
 from torchmask.restoration.finish import finish
 from torchmask.restoration.forward import ExposureModel
+from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.motion import Setting
 from torchmask.restoration.myopic import MyopicDeconvolution
+from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.priors import EdgePreserving, SmoothVariation, TotalVariation
 from torchmask.restoration.projected_lbfgs import Minimum, ProjectedLBFGS
 from torchmask.restoration.recipe import ModelRecipe
 from torchmask.restoration.schedule import Schedule
+from torchmask.restoration.solver import Solver
 from torchmask.restoration.traits import End, Refinement, Traits
 
 R0, OUTER_SCALE = 0.25, 20.0
 GRID = Grid.nyquist(1.0, 550e-9, 32, oversampling=1.2)
+FULL_PUPIL = Traits(True, False, True, False, R0, OUTER_SCALE, 1000, 0.0, 0, Refinement.OFF)
 TRAITS = Traits(False, False, True, False, R0, OUTER_SCALE, 1000, 0.0, 0, Refinement.OFF)
 
 
@@ -246,3 +252,33 @@ def test_a_search_need_not_come_to_rest_if_a_last_descent_follows(observe, five_
     assert iterations(nearly_at_rest=math.inf, last_segments=1) == 10
     assert iterations(nearly_at_rest=0.0, last_segments=1) > 10
     assert iterations(nearly_at_rest=math.inf, last_segments=0) > 10
+
+
+# --- what follows the search of a full pupil
+
+
+@pytest.mark.parametrize(
+    ("change", "end"),
+    [
+        ({}, End.RETRIEVAL),
+        ({"schedule": Schedule(retrievals=0)}, End.NONE),
+        ({"schedule": Schedule.plain()}, End.NONE),
+        ({"free": Free.OBJECT}, End.NONE),
+        ({"free": Free.ABERRATIONS}, End.NONE),
+        ({"band": Band.of([500e-9, 600e-9])}, End.NONE),
+        ({"prior_on_aberrations": False}, End.NONE),
+        ({"estimated": True}, End.NONE),
+    ],
+)
+def test_phases_of_a_full_pupil_are_retrieved_where_its_aberrations_are_sought(change, end):
+    """In the light of one wavelength, with the prior of turbulence."""
+    grid = Grid.nyquist(1.0, 500e-9, 16)
+    model = ExposureModel(FullAperture(1.0), grid, 3, change.get("band"))
+    frames = torch.randn(2, 16, 16, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    frames[:, 6:10, 6:10] += 1000
+    free = change.get("free", Free.OBJECT | Free.ABERRATIONS)
+    stack = FrameStack.of(frames, None, grid, FullAperture(1.0), None, Background.NONE)
+    objective = MyopicObjective(model, stack.frames, stack.precision, TotalVariation(), free=free)
+    said = {name: change[name] for name in ("prior_on_aberrations", "estimated") if name in change}
+    traits = replace(FULL_PUPIL, **said)
+    assert Solver(objective, stack, traits, change.get("schedule", Schedule()), ProjectedLBFGS()).end is end

@@ -68,6 +68,7 @@ class Progress:
     last_segments : number of segments of the last descent that are done; all there may be, once it gains no more
     integrated : whether the aberrations have been integrated out, which is done at the end and not stored
     averaged : number of starts whose objects have been averaged, likewise
+    retrieved : whether phases have been retrieved, likewise
     """
 
     candidates: Candidates
@@ -86,6 +87,7 @@ class Progress:
     last_segments: int = 0
     integrated: bool = False
     averaged: int = 1
+    retrieved: bool = False
 
     @property
     def state(self) -> State:

@@ -1,8 +1,8 @@
-"""The end of a restoration through a mask: faint frames are integrated over, others get a finer model.
+"""The end of a restoration: through a mask faint frames are integrated over, others get a finer model.
 
 A descent from far away takes few modes per sub-aperture. Close to the solution, more of them take away much of what the
 model leaves unexplained. So once the search has ended, the aberrations gain modes, and the object a smoother prior
-(`ObjectPrior.smoother`), and that descent goes on while it gains.
+(`ObjectPrior.smoother`), and that descent goes on while it gains. For a full pupil phases are retrieved.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from torchmask.restoration.marginal import integrate_aberrations
 from torchmask.restoration.motion import Setting
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.projected_lbfgs import Minimizer
+from torchmask.restoration.retrieval import retrieve_phases
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.traits import End, Traits
 
@@ -42,6 +43,9 @@ def finish(
         ended.state, spent = integrate_aberrations(objective, ended.state, schedule, minimizer, callback, **how)
         ended.n_evaluations += spent
         ended.integrated = True
+        return objective
+    if end is End.RETRIEVAL:
+        retrieve_phases(objective, ended, schedule, minimizer, callback, follow_r0=traits.r0_is_open)
         return objective
     state = setting.in_finer_modes(ended.state) if ended.finer is None else ended.finer
     objective = setting.objective_at(objective, state).with_changes(prior=objective.prior.smoother())

@@ -61,6 +61,12 @@ class Schedule:
     last_modes : number of modes of each sub-aperture of a mask in the last descent of frames that are not faint
     last_segments : maximum number of segments of that descent; 0: there is none
     last_gain : it ends when the second half of a segment lowers the cost by less than this fraction
+    retrievals : for a full pupil, maximum number of rounds of phase retrieval at the end; 0: there is none
+    retrieved_from : a round is made while the mean chi-square is above that of noise by more than this
+    reflections : number of reflections of a round
+    retrieved_iterations : maximum number of iterations that fit the modes of the phases retrieved
+    retrieved_segments : number of segments in which object and aberrations then descend
+    retrieved_gain : what the rounds have found is kept if the excess chi-square falls below this fraction
     """
 
     segment: int = 100
@@ -107,6 +113,12 @@ class Schedule:
     last_modes: int = 28
     last_segments: int = 20
     last_gain: float = 0.003
+    retrievals: int = 3
+    retrieved_from: float = 0.5
+    reflections: int = 100
+    retrieved_iterations: int = 60
+    retrieved_segments: int = 2
+    retrieved_gain: float = 0.7
 
     def __post_init__(self) -> None:
         stages = [number for number, _ in self.candidates] + [1]
@@ -139,6 +151,7 @@ class Schedule:
             faint=0.0,
             last_modes=0,
             last_segments=0,
+            retrievals=0,
             misplaced_gain=math.inf,
         )
 

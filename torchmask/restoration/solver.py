@@ -7,7 +7,7 @@ to the residual of the model, if that is larger. Once the object is sharp, frame
 when nothing changes any more, each frame is weighted by how well it fits. A start ends when a segment gains nothing, or
 little if it explains the frames, or its iterations are used up. If its verdict is that it missed the object, or in
 faint frames, others start, from random aberrations or, for a mask, from twins of the object, and the best is kept. Then
-aberrations of faint frames are integrated out, those of others gain modes; objects of full pupils are averaged.
+aberrations of faint frames are integrated out, those of others gain modes; full pupils average and retrieve phases.
 """
 
 from __future__ import annotations
@@ -89,13 +89,14 @@ class Solver:
         self.minimizer: Minimizer = minimizer
         self.callback: Callback | None = callback
         self.first_inflation: float = max(1.0, stack.change / schedule.first_inflation)
-        held = traits.prior_on_aberrations and not traits.many_minima  # not tried for a full pupil
-        is_open = held and Free.OBJECT | Free.ABERRATIONS in objective.free
-        self.end: End = End.of(stack.change, schedule) if is_open else End.NONE
         turbulent = Free.ABERRATIONS in objective.free and traits.prior_on_aberrations and not traits.estimated
         self.prior_r0: float | None = traits.r0 if turbulent else None  # of the aberrations' prior, at first [m]
-        many_ends = turbulent and traits.many_minima and Free.OBJECT in objective.free
+        is_open = traits.prior_on_aberrations and Free.OBJECT | Free.ABERRATIONS in objective.free
+        many_ends = is_open and traits.many_minima and not traits.estimated
         self.averages: bool = many_ends and schedule.averaged > 1
+        retrieves = many_ends and schedule.retrievals > 0 and objective.model.pupil.n_rasters == 1
+        of_mask = End.of(stack.change, schedule) if is_open and not traits.many_minima else End.NONE
+        self.end: End = End.RETRIEVAL if retrieves else of_mask
         self.judge: Judge = Judge(self.setting, stack, traits, schedule, self.end)
 
     def solve(self, known: Known, start: RestorationResult | None = None, file: Checkpoint | None = None) -> Progress:
@@ -105,16 +106,16 @@ class Solver:
             begun = saved
             if begun.status is Status.ITERATION_LIMIT and len(begun.costs) < self.traits.max_iterations:
                 begun.status = Status.RUNNING  # the limit has been raised since
-        blind = known.nothing and start is None
         # Without a prior on the aberrations a poor fit is to be expected, and more starts would not help.
+        blind = known.nothing and start is None
         may_start_again = blind and self.traits.prior_on_aberrations and len(self.objective.frames) > 1
         ended = self.run(begun, may_start_again, save := save_nothing if file is None else file.save)
         cut_short = ended.status is Status.ITERATION_LIMIT  # it may go on from its file, which the end leaves as it is
+        if len(ended.explained) > 1:
+            average_starts(self.objective, ended, self.schedule, self.minimizer, self.callback)
         if self.end is not End.NONE and (ended.starts > 1 or not cut_short):
             how = (self.schedule, self.minimizer, self.callback, self.traits, save_nothing if cut_short else save)
             self.objective = finish(self.objective, self.setting, ended, self.end, *how)
-        if len(ended.explained) > 1:
-            average_starts(self.objective, ended, self.schedule, self.minimizer, self.callback)
         return ended
 
     def begin(self, known: Known, start: RestorationResult | None) -> Progress:
@@ -201,8 +202,7 @@ class Solver:
         if self._is_twin(progress) and self.judge.gives_up(objective, progress):
             progress.status = Status.GIVEN_UP
             return
-        limit = self._limit(progress)
-        goes_on = limit is Status.RUNNING
+        goes_on = (limit := self._limit(progress)) is Status.RUNNING
         if goes_on and Free.ABERRATIONS in objective.free and progress.escapes < schedule.escapes:
             moved_nothing = progress.iterations == done
             if moved_nothing or Free.OBJECT not in objective.free or progress.iterations >= schedule.sharp_after:

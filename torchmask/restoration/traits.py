@@ -16,6 +16,7 @@ class End(Enum):
     NONE = "the search is the end"
     INTEGRATION = "the aberrations of faint frames are integrated out"
     LAST_DESCENT = "object and aberrations descend once more, with more modes"
+    RETRIEVAL = "the phases of frames of a full pupil are retrieved for the sharp object"
 
     @classmethod
     def of(cls, change: float, schedule: Schedule) -> End:

@@ -1,0 +1,193 @@
+"""Phases of a full pupil's frames, retrieved for a sharp object where descents end in poor minima."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchmask.grid import Grid
+from torchmask.optics.aperture import FullAperture
+from torchmask.restoration import retrieval
+from torchmask.restoration.aberrations import AberrationBasis
+from torchmask.restoration.background import Background
+from torchmask.restoration.candidates import Candidates
+from torchmask.restoration.checkpoint import Progress
+from torchmask.restoration.descent import descend
+from torchmask.restoration.forward import ExposureModel
+from torchmask.restoration.objective import Free, MyopicObjective
+from torchmask.restoration.priors import TotalVariation
+from torchmask.restoration.projected_lbfgs import ProjectedLBFGS
+from torchmask.restoration.reflections import STEPS, _conjugate_gradients, retrieve_fields
+from torchmask.restoration.retrieval import parameters_of_fields, retrieve_phases
+from torchmask.restoration.schedule import Schedule
+from torchmask.restoration.state import Calibration, State
+
+PUPIL, GRID, MODES, NOISE = FullAperture(1.0), Grid.nyquist(1.0, 550e-9, 32), 21, 0.01
+
+
+def problem(n_frames, rms=0.4, seed=0, background=Background.NONE, noise=NOISE):
+    """An objective without a prior on the aberrations, and the state that made its frames of a resolved object."""
+    generator = torch.Generator().manual_seed(seed)
+    model = ExposureModel(PUPIL, GRID, MODES, background=background)
+    image = torch.zeros(model.window.field.shape, dtype=torch.float64)
+    image[12:20, 10:14], image[8:11, 18:22] = 1, 2
+    image *= 1024 / image.sum()
+    z = rms * torch.randn(n_frames, MODES, generator=generator, dtype=torch.float64)
+    z[:, 0] = 0
+    frames = model(image, z)
+    frames = frames + noise * torch.randn(frames.shape, generator=generator, dtype=torch.float64)
+    precision = torch.full((1, 1, 1), noise**-2, dtype=torch.float64)
+    ones = torch.ones(n_frames, dtype=torch.float64)
+    return MyopicObjective(model, frames, precision, TotalVariation()), State(image, z, Calibration(ones, ones, 0.0))
+
+
+def fit_modes(objective, state, n_iterations):
+    """The aberrations alone descend."""
+    known_object = objective.with_changes(free=Free.ABERRATIONS)
+    return descend(known_object, state, n_iterations, ProjectedLBFGS(), lambda *said: None)
+
+
+def chi_squares(objective, state):
+    return 2 * objective.frame_costs(state.image, state.z, state.calibration) / objective.frames[0].numel()
+
+
+def test_reflections_find_most_frames_where_descents_stop():
+    """From the same random aberrations. A frame that is found has the chi-square of noise, 1 +- 0.05.
+
+    Over other seeds more than half were found, and a quarter by descents. Of 48 frames, the difference of two numbers
+    of equal chance has a standard deviation of at most sqrt(2 * 48 / 4) = 4.9, so twice that tells the two apart.
+    """
+    objective, truth = problem(48)
+    generator = torch.Generator().manual_seed(7)
+    start = replace(truth, z=0.4 * torch.randn(truth.z.shape, generator=generator, dtype=torch.float64))
+    found = parameters_of_fields(objective, retrieve_fields(objective, start, 100), start.z)
+    reflected = fit_modes(objective, replace(start, z=found), 100)
+    descended = fit_modes(objective, start, 400)
+    number, number_before = (int((chi_squares(objective, state) < 1.25).sum()) for state in (reflected, descended))
+    assert number > number_before + 2 * 4.9
+
+
+@pytest.mark.parametrize("background", [Background.NONE, Background.PER_FRAME])
+def test_the_true_field_stays(background):
+    """Up to what noise does to a phase: a frame of 32^2 pixels with 1e4 of its deviations fixes 20 modes to 1e-2."""
+    objective, truth = problem(3, rms=0.15, background=background)
+    sky = 0.7 if background is Background.PER_FRAME else 0.0
+    objective = MyopicObjective(objective.model, objective.frames + sky, objective.precision, TotalVariation())
+    found = parameters_of_fields(objective, retrieve_fields(objective, truth, 5), truth.z)
+    fitted = fit_modes(objective, replace(truth, z=found), 20)
+    torch.testing.assert_close(found[:, 1:], truth.z[:, 1:], rtol=0, atol=0.1)
+    torch.testing.assert_close(chi_squares(objective, fitted), torch.ones(3).double(), rtol=0, atol=0.2)
+
+
+def test_phases_of_several_waves_are_unwrapped_exactly():
+    objective, state = problem(6, rms=0.12)
+    samples = objective.model.pupil.samples()
+    phase = samples.phase(state.z)
+    assert float(phase.abs().max()) > 3.5  # wrapped: beyond pi
+    found = parameters_of_fields(objective, samples.field(phase), torch.zeros_like(state.z))
+    torch.testing.assert_close(found[:, 1:], state.z[:, 1:], rtol=0, atol=1e-10)
+
+
+def test_common_aberrations_stay_and_are_taken_off():
+    objective, state = problem(4, rms=0.12)
+    own = torch.eye(MODES, dtype=torch.float64)
+    basis = AberrationBasis(torch.cat([own[:, 1:], own[:, 3:6]], dim=1), MODES, n_common=3)
+    model = ExposureModel(PUPIL, GRID, basis)
+    shared = torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)
+    z = torch.cat([state.z[:, 1:], shared.expand(4, -1)], dim=1)
+    objective = MyopicObjective(model, objective.frames, objective.precision, TotalVariation())
+    samples = model.pupil.samples()
+    start = torch.cat([torch.zeros_like(z[:, :20]), z[:, 20:]], dim=1)
+    found = parameters_of_fields(objective, samples.field(samples.phase(z)), start)
+    torch.testing.assert_close(found, z, rtol=0, atol=1e-10)
+
+
+def test_conjugate_gradients_solve_a_linear_problem_frame_by_frame():
+    generator = torch.Generator().manual_seed(1)
+    root = torch.randn(2, 6, 6, generator=generator, dtype=torch.float64)
+    matrix = torch.eye(6).double() + root @ root.mT
+    pull = torch.randn(2, 6, 1, generator=generator, dtype=torch.float64)
+    pull[1] = 0  # nothing to do, and nothing to divide by
+    found = _conjugate_gradients(lambda x: matrix @ x, pull, 6)
+    torch.testing.assert_close(found, torch.linalg.solve(matrix, pull), rtol=0, atol=1e-8)
+
+
+# --- rounds at the end of a restoration
+
+BRISK = {"reflections": 60, "retrieved_segments": 1, "segment": 40}
+
+
+def finish(objective, state, **numbers):
+    ended = Progress(Candidates(state, 1))
+    retrieve_phases(objective, ended, Schedule(**BRISK | numbers), ProjectedLBFGS(), None, follow_r0=False)
+    return ended
+
+
+def lost(truth):
+    """The state with two frames whose aberrations are those of others."""
+    z = truth.z.clone()
+    z[[0, 1]] = z[[1, 0]]
+    return replace(truth, z=z)
+
+
+def test_lost_frames_are_found_and_the_others_stay():
+    objective, truth = problem(5, rms=0.2, noise=0.1)
+    before = chi_squares(objective, lost(truth)) - 1
+    ended = finish(objective, lost(truth))
+    after = chi_squares(objective, replace(ended.state, calibration=truth.calibration)) - 1
+    assert ended.retrieved
+    assert bool((after[:2] < 0.25 * before[:2]).all())
+    assert float(after[2:].max()) < 0.2  # four deviations of 32^2 pixels
+    assert ended.n_evaluations >= 60 * STEPS / 2  # those of the reflections count
+
+
+def test_what_does_not_gain_enough_is_not_kept():
+    """The least fraction that is asked for cannot be reached."""
+    objective, truth = problem(5, rms=0.2)
+    start = lost(truth)
+    ended = finish(objective, start, retrieved_gain=0.0)
+    assert not ended.retrieved
+    assert ended.state is start
+
+
+def test_frames_that_are_explained_are_left_alone(monkeypatch):
+    objective, truth = problem(5, rms=0.2)
+    monkeypatch.setattr(retrieval, "retrieve_fields", lambda *given: pytest.fail("it was called"))
+    ended = finish(objective, truth)
+    assert not ended.retrieved
+    assert ended.n_evaluations == 0
+
+
+def test_rounds_end_when_little_is_gained_in_the_first(monkeypatch):
+    """One that leaves the excess where it was, though a frame has gained; and three that lower it."""
+    objective, truth = problem(5, rms=0.2)
+
+    def rounds(lower):
+        calls = []
+
+        def descend_a_little(objective, state, *given, follow_r0):
+            calls.append(state)
+            inflation = state.calibration.noise_inflation
+            return state.calibrated(noise_inflation=1 + lower * (inflation - 1)), 1
+
+        monkeypatch.setattr(retrieval, "_retrieve_once", descend_a_little)
+        finish(objective, lost(truth))
+        return len(calls)
+
+    assert rounds(0.95) == 1
+    assert rounds(0.85) == 3
+
+
+def test_rounds_end_when_no_frame_gains(monkeypatch):
+    """The fields of the present aberrations are no better than those."""
+    objective, truth = problem(5, rms=0.2)
+    calls = []
+
+    def present_fields(objective, state, n_reflections):
+        calls.append(n_reflections)
+        samples = objective.model.pupil.samples()
+        return samples.field(samples.phase(state.z))
+
+    monkeypatch.setattr(retrieval, "retrieve_fields", present_fields)
+    finish(objective, lost(truth), retrieved_iterations=0)
+    assert calls == [60]

@@ -1,0 +1,126 @@
+"""The pupil's field in each frame of a known object, by relaxed averaged alternating reflections.
+
+A descent in the modes of a phase stops at walls of one wave, or with a part of the pupil turned into its twin. The
+field has no walls: on the way it may have any amplitude. So it goes back and forth between two sets, the fields with
+the amplitude of the pupil and those whose PSF gives the frame, and reflections at both lead it out of places where
+mere projections stop (Luke, Inverse Problems 21, 37, 2005). Where the object hides frequencies of the PSF from the
+frame, or noise does, the second projection leaves them as they are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchmask.restoration.candidates import with_candidates
+from torchmask.restoration.forward import ExposureModel, intensity
+from torchmask.restoration.objective import MyopicObjective
+from torchmask.restoration.pupil import OpenSamples
+from torchmask.restoration.state import State
+
+STEPS = 60  # conjugate-gradient steps of a projection onto the frames
+_RELAXATION = 0.9  # of the reflections; 1 has no attraction to the present field
+_STIFFNESS = 3e3  # holds focal amplitudes, of unit norm, where they are while their PSF is fitted to a frame
+_DARK = 1e-6  # intensity below which a PSF of unit sum is free to change as if it had so much
+_LAST = 10  # projections at the end, without reflections
+
+
+@torch.no_grad()
+def retrieve_fields(objective: MyopicObjective, state: State, n_reflections: int) -> Tensor:
+    """Return the fields (T, P) at the open samples, of any amplitude, to which `state` leads.
+
+    The light must have one wavelength and frames be snapshots: there is one raster of the pupil.
+    """
+    single = with_candidates(objective, 1)
+    frames, precision, unit = single.scaled_data(state.calibration)
+    away = frames - single.model(state.image, state.z)
+    frames = frames - single.model.background.level(away, precision, unit)
+    spectrum, samples = single.model.spectrum(state.image), single.model.pupil.samples()
+
+    @torch.no_grad()  # needed here too, as no_grad applies to one thread only
+    def of_part(part: slice) -> Tensor:
+        chunk = _Frames(single.model, samples, spectrum, frames[part], precision[part])
+        return chunk.reflect(samples.field(samples.phase(state.z[part])), n_reflections)
+
+    return torch.cat(list(single.parallel(of_part, single.model.chunks(len(state.z)))))
+
+
+@dataclass(frozen=True)
+class _Frames:
+    """A few frames (t, H, W) with their precision, and the spectrum of the object behind them."""
+
+    model: ExposureModel
+    samples: OpenSamples
+    spectrum: Tensor
+    frames: Tensor
+    precision: Tensor
+
+    def reflect(self, field: Tensor, n_reflections: int) -> Tensor:
+        """Return the field (t, P) to which reflections lead from `field` (t, P)."""
+        now = self._raster(field)
+        for _ in range(n_reflections):
+            fitted = self._fit_frames(now)
+            mirrored = 2 * fitted - now
+            reflected = 2 * self._fit_pupil(mirrored) - mirrored
+            now = _RELAXATION * (reflected + now) / 2 + (1 - _RELAXATION) * fitted
+        for _ in range(_LAST):
+            now = self._fit_frames(self._fit_pupil(now))
+        return now.flatten(1)[:, self.samples.index]
+
+    def _fit_pupil(self, raster: Tensor) -> Tensor:
+        """Return the nearest rasters (t, H', W') with the amplitude of the pupil."""
+        return self._raster(self.samples.weights * torch.sgn(raster.flatten(1)[:, self.samples.index]))
+
+    def _fit_frames(self, raster: Tensor) -> Tensor:
+        """Return rasters (t, H', W') nearby whose PSFs give the frames.
+
+        The focal amplitude keeps its phase. Its distance from where it was, times `_STIFFNESS`, and the misfit have the
+        least sum: a linear problem for the change of the intensity, as long as that is small.
+        """
+        focal = torch.fft.fft2(raster)
+        power = intensity(focal[:, None])
+        scale = ((power + _DARK) * (2 / _STIFFNESS)).sqrt()
+
+        def curved(x: Tensor) -> Tensor:
+            return x + scale * self._back(self.precision * self._imaged(scale * x))
+
+        pull = scale * self._back(self.precision * (self.frames - self._imaged(power)))
+        fitted = (power + scale * _conjugate_gradients(curved, pull, STEPS)).clamp(min=0)
+        return torch.fft.ifft2(fitted.sqrt() * torch.sgn(focal))
+
+    def _raster(self, field: Tensor) -> Tensor:
+        shape = self.model.window.field.shape
+        empty = field.new_zeros(len(field), math.prod(shape))
+        return empty.index_add_(1, self.samples.index, field).unflatten(1, shape)
+
+    def _imaged(self, psf: Tensor) -> Tensor:
+        """Return the frames (t, H, W) of PSFs (t, H', W')."""
+        spectrum = torch.fft.rfft2(psf) * self.spectrum
+        return self.model.window.crop(torch.fft.irfft2(spectrum, s=psf.shape[-2:]))
+
+    def _back(self, frames: Tensor) -> Tensor:
+        """Apply the adjoint of `_imaged`."""
+        spectrum = torch.fft.rfft2(self.model.window.embed(frames)) * self.spectrum.conj()
+        return torch.fft.irfft2(spectrum, s=self.model.window.field.shape)
+
+
+def _conjugate_gradients(curved: Callable[[Tensor], Tensor], pull: Tensor, n_steps: int) -> Tensor:
+    """Solve `curved`(x) = `pull` (t, H', W'), frame by frame, in so many steps from zero."""
+    x, left, step = torch.zeros_like(pull), pull.clone(), pull
+    square = _dot(left, left)
+    for _ in range(n_steps):
+        bent = curved(step)
+        length = square / _dot(step, bent)
+        x, left = x + length * step, left - length * bent
+        square, before = _dot(left, left), square
+        step = left + square / before * step
+    return x
+
+
+def _dot(x: Tensor, y: Tensor) -> Tensor:
+    """Return the scalar products (t, 1, 1), at least the least positive number, as a frame that fits has none left."""
+    return (x * y).sum((-2, -1), keepdim=True).clamp(min=torch.finfo(x.dtype).tiny)
