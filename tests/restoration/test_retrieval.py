@@ -7,7 +7,7 @@ import torch
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture
-from torchmask.restoration import retrieval
+from torchmask.restoration import reflections, retrieval
 from torchmask.restoration.aberrations import AberrationBasis
 from torchmask.restoration.background import Background
 from torchmask.restoration.candidates import Candidates
@@ -110,6 +110,37 @@ def test_conjugate_gradients_solve_a_linear_problem_frame_by_frame():
     pull[1] = 0  # nothing to do, and nothing to divide by
     found = _conjugate_gradients(lambda x: matrix @ x, pull, 6)
     torch.testing.assert_close(found, torch.linalg.solve(matrix, pull), rtol=0, atol=1e-8)
+
+
+def test_the_intensity_fits_the_frame_and_stays_where_the_object_hides_it(monkeypatch):
+    """Equation eq-intensity by dense linear algebra, in float64, for a field that is not the true one."""
+    grid = Grid.nyquist(1.0, 550e-9, 12)
+    model = ExposureModel(PUPIL, grid, 6)
+    side, shape = model.window.field.shape[0], model.window.field.shape
+    generator = torch.Generator().manual_seed(2)
+    image = torch.rand(shape, generator=generator, dtype=torch.float64) * 144 / side**2
+    frames = torch.rand(1, 12, 12, generator=generator, dtype=torch.float64) / 144
+    precision = 1e4 * (1 + torch.rand(1, 12, 12, generator=generator, dtype=torch.float64))
+    samples = model.pupil.samples()
+    chunk = reflections._Frames(model, samples, model.spectrum(image), frames, precision)
+    raster = chunk._raster(samples.field(samples.phase(torch.randn(1, 6, generator=generator, dtype=torch.float64))))
+    monkeypatch.setattr(reflections, "STEPS", 2 * side**2)
+    found = torch.fft.fft2(chunk._fit_frames(raster)).abs().square().flatten()
+
+    focal = torch.fft.fft2(raster)
+    q = focal.abs().square().flatten()
+    shifts = torch.eye(side**2, dtype=torch.float64).unflatten(1, shape)
+    imaged = chunk._imaged(shifts).flatten(1).T  # (pixels, samples of the PSF)
+    weight = precision.flatten()[:, None]
+    held = reflections._STIFFNESS / (2 * (q + reflections._DARK))
+    pull = imaged.T @ (weight[:, 0] * (frames.flatten() - imaged @ q))
+    change = torch.linalg.solve(imaged.T @ (weight * imaged) + held.diag(), pull)
+    expected = (q + change).clamp(min=0)
+    assert float((expected - q).norm()) > 0.01 * float(q.norm())  # it moves
+    torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-9)
+    angle = torch.fft.fft2(chunk._fit_frames(raster)) / focal
+    bright = expected.view_as(angle) > 1e-6
+    torch.testing.assert_close(angle[bright].imag, torch.zeros_like(angle[bright].imag), rtol=0, atol=1e-9)
 
 
 # --- rounds at the end of a restoration
