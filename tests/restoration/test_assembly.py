@@ -62,6 +62,11 @@ def test_a_result_is_in_electrons_and_rad(ended):
         ({"status": Status.START_LIMIT, "began": 1}, "stopped at the limit of iterations for a start"),
         ({"status": Status.ITERATION_LIMIT, "starts": 3}, "stopped at max_iterations = 2; the best of 3 starts"),
         (
+            {"status": Status.START_LIMIT, "starts": 4, "averaged": 3, "retrieved": True},
+            "stopped at the limit of iterations for a start; the mean object of 3 starts, of 4 made; then phases were "
+            "retrieved for its object",
+        ),
+        (
             {"decrease": 0.0, "starts": 2, "alike": True},
             "converged: the last segment lowered the cost by a fraction 0.0e+00; the best of 2 starts, two of which "
             "ended alike",
