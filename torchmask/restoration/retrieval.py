@@ -1,24 +1,24 @@
 """The frames of a full pupil that the search leaves in poor minima, once the object is sharp.
 
 In bright light most of a full pupil's residual comes from minima of its many modes. Once there is an object to hold the
-frames against, phase retrieval finds the field of each frame from anywhere (`reflections`). Its phase is unwrapped and
-becomes the start of a descent in the modes; frames that end lower there than before keep it, and object and aberrations
+frames against, phase retrieval finds the field of each frame from anywhere (`reflections`). The modes closest to its
+phase are the start of a descent; frames that end lower there than before keep it, and object and aberrations
 descend together. Better aberrations sharpen the object, so this is done a few times.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
-import numpy as np
 import torch
-from skimage.restoration import unwrap_phase
 from torch import Tensor
 
 from torchmask.record import Callback
 from torchmask.restoration.calibration import calibrate, recalibrate, share_noise_inflation
 from torchmask.restoration.checkpoint import Progress
 from torchmask.restoration.descent import Listener, descend
+from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.reflections import STEPS, retrieve_fields
@@ -89,23 +89,26 @@ def _retrieve_once(
 def parameters_of_fields(objective: MyopicObjective, fields: Tensor, z: Tensor) -> Tensor:
     """Return the parameters (T, K) whose phase is closest to that of `fields` (T, P); those in common are as in `z`.
 
-    Phases are unwrapped by the method of Herraez et al., Appl. Opt. 41, 7437 (2002).
+    Differences of the phase between neighbouring samples are fitted, in the least-squares sense, since they are known
+    where the phase itself is so but for whole waves (Hudgin, J. Opt. Soc. Am. 67, 375, 1977).
     """
     samples, basis = objective.model.pupil.samples(), objective.model.aberrations
-    shape, index = objective.model.window.field.shape, samples.index.cpu().numpy()
-    closed = np.ones(shape, bool)
-    closed.flat[index] = False
-    closed = np.fft.fftshift(closed)
-    phases = []
-    for wrapped in fields.angle().cpu().numpy():
-        raster = np.zeros(shape)
-        raster.flat[index] = wrapped
-        smooth = unwrap_phase(np.ma.array(np.fft.fftshift(raster), mask=closed), rng=0)
-        phases.append(np.fft.ifftshift(np.asarray(smooth)).flat[index])
-    modes = samples.basis.to(z)
-    known = modes[:, basis.n_own :] @ z[:1, basis.n_own :].T
-    columns = torch.cat([modes[:, : basis.n_own], torch.ones_like(known)], dim=1)  # a piston, which no frame shows
-    phase = torch.as_tensor(np.stack(phases, axis=1)).to(z) - known
-    weights = samples.weights.to(z)[:, None]
-    found = torch.linalg.lstsq((weights * columns).cpu(), (weights * phase).cpu(), driver="gelsd").solution
-    return basis.with_common_of(torch.cat([found[:-1].T.to(z), z[:, basis.n_own :]], dim=1), z)
+    first, second = _neighbours(objective.model, samples.index)
+    differences = (fields[:, second] * fields[:, first].conj()).angle().T.to(z)
+    weights = (samples.weights[first] * samples.weights[second]).sqrt().to(z)[:, None]
+    slopes = (samples.basis[second] - samples.basis[first]).to(z)
+    differences = differences - slopes[:, basis.n_own :] @ z[:1, basis.n_own :].T
+    matrix, pulls = (weights * slopes[:, : basis.n_own]).cpu(), (weights * differences).cpu()
+    own = torch.linalg.lstsq(matrix, pulls, driver="gelsd").solution.T
+    return torch.cat([own.to(z), z[:, basis.n_own :]], dim=1)
+
+
+def _neighbours(model: ExposureModel, index: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the numbers (M,), (M,) of samples that lie beside or above each other; `index` (P,) is their raster's."""
+    shape = model.window.field.shape
+    number = index.new_full((math.prod(shape),), -1)
+    number[index] = torch.arange(len(index), device=index.device)
+    raster = number.unflatten(0, shape)
+    pairs = torch.cat([torch.stack([raster, raster.roll(-1, axis)]).flatten(1) for axis in (0, 1)], dim=1)
+    first, second = pairs[:, (pairs >= 0).all(0)]
+    return first, second
