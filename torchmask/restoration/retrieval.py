@@ -27,6 +27,7 @@ from torchmask.restoration.state import State
 
 _LOWER = 0.99  # of its cost before: a frame that comes back to where it was is no gain
 _PROMISING = 0.9  # of the excess chi-square before all rounds: with more left after one, others bring little
+_CORRECTIONS = 3  # of the modes by the phase that is left
 _EVALUATIONS = STEPS / 2  # whose FFTs a reflection makes
 
 
@@ -100,7 +101,15 @@ def parameters_of_fields(objective: MyopicObjective, fields: Tensor, z: Tensor) 
     differences = differences - slopes[:, basis.n_own :] @ z[:1, basis.n_own :].T
     matrix, pulls = (weights * slopes[:, : basis.n_own]).cpu(), (weights * differences).cpu()
     own = torch.linalg.lstsq(matrix, pulls, driver="gelsd").solution.T
-    return torch.cat([own.to(z), z[:, basis.n_own :]], dim=1)
+    found = torch.cat([own.to(z), z[:, basis.n_own :]], dim=1)
+    modes, weights = samples.basis.to(z), samples.weights.to(z)[:, None]
+    matrix = (weights * torch.cat([modes[:, : basis.n_own], torch.ones_like(weights)], dim=1)).cpu()
+    for _ in range(_CORRECTIONS):  # what is left is below half a wave nearly everywhere, and errs less than differences
+        left = fields.T.to(torch.complex128) * torch.polar(torch.ones_like(weights), -(modes @ found.T))
+        left = (left * (weights * left).sum(0).sgn().conj()).angle()
+        change = torch.linalg.lstsq(matrix, (weights * left).cpu(), driver="gelsd").solution[:-1].T
+        found[:, : basis.n_own] += change.to(z)
+    return found
 
 
 def _neighbours(model: ExposureModel, index: Tensor) -> tuple[Tensor, Tensor]:
