@@ -175,9 +175,13 @@ class ExposureModel(nn.Module):
 
     def amplitude(self, samples: OpenSamples, field: Tensor) -> Tensor:
         """Return the focal amplitude (T, wavelength, H', W') of a pupil field (T, P)."""
+        return torch.fft.fft2(self.raster(samples, field))
+
+    def raster(self, samples: OpenSamples, field: Tensor) -> Tensor:
+        """Return the rasters (T, wavelength, H', W') of a pupil field (T, P)."""
         rasters = (self.pupil.n_rasters, *self.window.field.shape)
         pupil = field.new_zeros(len(field), math.prod(rasters)).index_add_(1, samples.index, field)
-        return torch.fft.fft2(pupil.unflatten(1, rasters))
+        return pupil.unflatten(1, rasters)
 
     def spectrum(self, image: Tensor) -> Tensor:
         """Return the Fourier transform (..., H', W'/2 + 1) of objects (..., H', W') convolved with the pixel."""

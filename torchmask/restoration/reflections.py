@@ -9,13 +9,12 @@ frame, or noise does, the second projection leaves them as they are.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from torchmask.optics.conjugate import conjugate_gradients
 from torchmask.restoration.candidates import with_candidates
 from torchmask.restoration.forward import ExposureModel, intensity
 from torchmask.restoration.objective import MyopicObjective
@@ -61,7 +60,7 @@ class _Frames:
 
     def reflect(self, field: Tensor, n_reflections: int) -> Tensor:
         """Return the field (t, P) to which reflections lead from `field` (t, P)."""
-        now = self._raster(field)
+        now = self.model.raster(self.samples, field)
         for _ in range(n_reflections):
             fitted = self._fit_frames(now)
             mirrored = 2 * fitted - now
@@ -72,30 +71,26 @@ class _Frames:
         return now.flatten(1)[:, self.samples.index]
 
     def _fit_pupil(self, raster: Tensor) -> Tensor:
-        """Return the nearest rasters (t, H', W') with the amplitude of the pupil."""
-        return self._raster(self.samples.weights * torch.sgn(raster.flatten(1)[:, self.samples.index]))
+        """Return the nearest rasters (t, 1, H', W') with the amplitude of the pupil."""
+        field = self.samples.weights * torch.sgn(raster.flatten(1)[:, self.samples.index])
+        return self.model.raster(self.samples, field)
 
     def _fit_frames(self, raster: Tensor) -> Tensor:
-        """Return rasters (t, H', W') nearby whose PSFs give the frames.
+        """Return rasters (t, 1, H', W') nearby whose PSFs give the frames.
 
         The focal amplitude keeps its phase. Its distance from where it was, times `_STIFFNESS`, and the misfit have the
         least sum: a linear problem for the change of the intensity, as long as that is small.
         """
         focal = torch.fft.fft2(raster)
-        power = intensity(focal[:, None])
-        scale = ((power + _DARK) * (2 / _STIFFNESS)).sqrt()
-
-        def curved(x: Tensor) -> Tensor:
-            return x + scale * self._back(self.precision * self._imaged(scale * x))
-
-        pull = scale * self._back(self.precision * (self.frames - self._imaged(power)))
-        fitted = (power + scale * _conjugate_gradients(curved, pull, STEPS)).clamp(min=0)
-        return torch.fft.ifft2(fitted.sqrt() * torch.sgn(focal))
-
-    def _raster(self, field: Tensor) -> Tensor:
-        shape = self.model.window.field.shape
-        empty = field.new_zeros(len(field), math.prod(shape))
-        return empty.index_add_(1, self.samples.index, field).unflatten(1, shape)
+        power = intensity(focal)
+        held = 0.5 * _STIFFNESS / (power + _DARK)
+        change = conjugate_gradients(
+            lambda x: held * x + self._back(self.precision * self._imaged(x)),
+            self._back(self.precision * (self.frames - self._imaged(power))),
+            lambda x: x / held,
+            STEPS,
+        )
+        return torch.fft.ifft2((power + change).clamp(min=0).sqrt()[:, None] * torch.sgn(focal))
 
     def _imaged(self, psf: Tensor) -> Tensor:
         """Return the frames (t, H, W) of PSFs (t, H', W')."""
@@ -106,21 +101,3 @@ class _Frames:
         """Apply the adjoint of `_imaged`."""
         spectrum = torch.fft.rfft2(self.model.window.embed(frames)) * self.spectrum.conj()
         return torch.fft.irfft2(spectrum, s=self.model.window.field.shape)
-
-
-def _conjugate_gradients(curved: Callable[[Tensor], Tensor], pull: Tensor, n_steps: int) -> Tensor:
-    """Solve `curved`(x) = `pull` (t, H', W'), frame by frame, in so many steps from zero."""
-    x, left, step = torch.zeros_like(pull), pull.clone(), pull
-    square = _dot(left, left)
-    for _ in range(n_steps):
-        bent = curved(step)
-        length = square / _dot(step, bent)
-        x, left = x + length * step, left - length * bent
-        square, before = _dot(left, left), square
-        step = left + square / before * step
-    return x
-
-
-def _dot(x: Tensor, y: Tensor) -> Tensor:
-    """Return the scalar products (t, 1, 1), at least the least positive number, as a frame that fits has none left."""
-    return (x * y).sum((-2, -1), keepdim=True).clamp(min=torch.finfo(x.dtype).tiny)

@@ -75,7 +75,7 @@ def _retrieve_once(
     """Return the calibrated state after one round, and the number of frames that phase retrieval has brought lower."""
     shared = share_noise_inflation(state)
     fields = retrieve_fields(objective, shared, schedule.reflections)
-    known_object = objective.with_changes(free=Free.ABERRATIONS)
+    known_object = objective.with_changes(free=Free.ABERRATIONS)  # those in common stay, as only some frames may change
     trial = replace(shared, z=parameters_of_fields(objective, fields, shared.z))
     trial = descend(known_object, trial, schedule.retrieved_iterations, minimizer, listen)
     after, before = (objective.frame_costs(shared.image, z, shared.calibration) for z in (trial.z, shared.z))
@@ -90,26 +90,34 @@ def _retrieve_once(
 def parameters_of_fields(objective: MyopicObjective, fields: Tensor, z: Tensor) -> Tensor:
     """Return the parameters (T, K) whose phase is closest to that of `fields` (T, P); those in common are as in `z`.
 
-    Differences of the phase between neighbouring samples are fitted, in the least-squares sense, since they are known
-    where the phase itself is so but for whole waves (Hudgin, J. Opt. Soc. Am. 67, 375, 1977).
+    Differences of the phase between neighbouring samples are fitted first, since they are known where the phase itself
+    is so but for whole waves (Hudgin, J. Opt. Soc. Am. 67, 375, 1977). They weigh the steep structure that the modes
+    leave out too much; but what they leave is below half a wave nearly everywhere, so the phase itself is fitted then.
     """
-    samples, basis = objective.model.pupil.samples(), objective.model.aberrations
+    samples, n_own = objective.model.pupil.samples(), objective.model.aberrations.n_own
+    modes, amplitude = samples.basis.to(z), samples.weights.to(z)
+    own, found = modes[:, :n_own], z.clone()
+    found[:, :n_own] = 0
+
+    def turned_back() -> Tensor:
+        return fields * torch.exp(-1j * (found @ modes.T))
+
     first, second = _neighbours(objective.model, samples.index)
-    differences = (fields[:, second] * fields[:, first].conj()).angle().T.to(z)
-    weights = (samples.weights[first] * samples.weights[second]).sqrt().to(z)[:, None]
-    slopes = (samples.basis[second] - samples.basis[first]).to(z)
-    differences = differences - slopes[:, basis.n_own :] @ z[:1, basis.n_own :].T
-    matrix, pulls = (weights * slopes[:, : basis.n_own]).cpu(), (weights * differences).cpu()
-    own = torch.linalg.lstsq(matrix, pulls, driver="gelsd").solution.T
-    found = torch.cat([own.to(z), z[:, basis.n_own :]], dim=1)
-    modes, weights = samples.basis.to(z), samples.weights.to(z)[:, None]
-    matrix = (weights * torch.cat([modes[:, : basis.n_own], torch.ones_like(weights)], dim=1)).cpu()
-    for _ in range(_CORRECTIONS):  # what is left is below half a wave nearly everywhere, and errs less than differences
-        left = fields.T.to(torch.complex128) * torch.polar(torch.ones_like(weights), -(modes @ found.T))
-        left = (left * (weights * left).sum(0).sgn().conj()).angle()
-        change = torch.linalg.lstsq(matrix, (weights * left).cpu(), driver="gelsd").solution[:-1].T
-        found[:, : basis.n_own] += change.to(z)
+    turned = turned_back()
+    steps = (turned[:, second] * turned[:, first].conj()).angle()
+    found[:, :n_own] = _fit(own[second] - own[first], steps, (amplitude[first] * amplitude[second]).sqrt())
+    own = torch.cat([own, torch.ones_like(own[:, :1])], dim=1)  # and a piston, which no frame shows
+    for _ in range(_CORRECTIONS):
+        turned = turned_back()
+        left = (turned * (amplitude * turned).sum(1, keepdim=True).conj()).angle()
+        found[:, :n_own] += _fit(own, left, amplitude)[:, :-1]
     return found
+
+
+def _fit(columns: Tensor, values: Tensor, weights: Tensor) -> Tensor:
+    """Return the coefficients (T, K) of `columns` (M, K) that fit `values` (T, M) best, with weights (M,)."""
+    matrix, right = (weights[:, None] * columns).cpu(), (weights * values.to(columns)).T.cpu()
+    return torch.linalg.lstsq(matrix, right, driver="gelsd").solution.T.to(columns)
 
 
 def _neighbours(model: ExposureModel, index: Tensor) -> tuple[Tensor, Tensor]:

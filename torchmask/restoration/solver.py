@@ -106,8 +106,8 @@ class Solver:
             begun = saved
             if begun.status is Status.ITERATION_LIMIT and len(begun.costs) < self.traits.max_iterations:
                 begun.status = Status.RUNNING  # the limit has been raised since
-        # Without a prior on the aberrations a poor fit is to be expected, and more starts would not help.
         blind = known.nothing and start is None
+        # Without a prior on the aberrations a poor fit is to be expected, and more starts would not help.
         may_start_again = blind and self.traits.prior_on_aberrations and len(self.objective.frames) > 1
         ended = self.run(begun, may_start_again, save := save_nothing if file is None else file.save)
         cut_short = ended.status is Status.ITERATION_LIMIT  # it may go on from its file, which the end leaves as it is
