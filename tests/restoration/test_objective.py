@@ -12,7 +12,7 @@ from torchmask.restoration.adjoint import data_fidelity
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.priors import EdgePreserving, TotalVariation
-from torchmask.restoration.state import Calibration
+from torchmask.restoration.state import LEAST_TRANSMISSION, Calibration
 
 GRID = Grid((12, 15), 2.3e-7, 550e-9)
 THERE = [[0.05, 0.28], [0.21, -0.27], [-0.33, 0.02]]
@@ -89,6 +89,17 @@ def test_without_a_calibration_it_is_neutral(three_holes, random_exposures):
     assert neutral.noise_inflation.tolist() == [1.0] * 3
     assert neutral.aberration_weight == 1
     assert torch.equal(objective(image, z), objective(image, z, neutral))
+
+
+@pytest.mark.parametrize("light", [0.0, -0.1])
+def test_a_frame_of_background_alone_has_the_least_transmission(light, three_holes, random_exposures):
+    """None, and noise or a subtracted background may make it negative."""
+    model, image, z, frames, precision = random_exposures(ExposureModel(three_holes, GRID, 4))
+    frames[1] = light
+    objective = MyopicObjective(model, frames, precision, TotalVariation())
+    neutral = objective.neutral_calibration()
+    assert float(neutral.transmission[1]) == LEAST_TRANSMISSION
+    assert bool(objective.value_and_gradients(image, z).value.isfinite())
 
 
 def test_the_value_is_the_sum_of_its_parts(three_holes, random_exposures):

@@ -10,9 +10,7 @@ from torch import Tensor
 
 from torchmask.restoration.background import Background, weighted_mean
 from torchmask.restoration.objective import Free, MyopicObjective
-from torchmask.restoration.state import State
-
-_LEAST_TRANSMISSION = 1e-3
+from torchmask.restoration.state import LEAST_TRANSMISSION, State
 
 
 @torch.no_grad()
@@ -32,7 +30,7 @@ def fit_of_frames(objective: MyopicObjective, state: State) -> tuple[Tensor, Ten
         precision = precision.expand_as(frames)
         error = (precision * background.residual(frames - transmission * model, precision) ** 2).sum((1, 2))
         squares.append(error / (precision > 0).sum((1, 2)).clamp(min=1))
-    return torch.cat(transmissions).to(state.z).clamp(min=_LEAST_TRANSMISSION), torch.cat(squares).to(state.z)
+    return torch.cat(transmissions).to(state.z).clamp(min=LEAST_TRANSMISSION), torch.cat(squares).to(state.z)
 
 
 def _compared(objective: MyopicObjective, state: State) -> Iterator[tuple[Tensor, Tensor, Tensor]]:

@@ -14,7 +14,7 @@ from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.parallel import Map
 from torchmask.restoration.placed import PlacedSamples
 from torchmask.restoration.priors import ObjectPrior
-from torchmask.restoration.state import Calibration
+from torchmask.restoration.state import LEAST_TRANSMISSION, Calibration
 
 
 class Free(Flag):
@@ -169,10 +169,13 @@ class MyopicObjective(nn.Module):
         )
 
     def neutral_calibration(self) -> Calibration:
-        """Return the calibration with transmissions from the frames' mean light, and noise and priors as given."""
-        light = self.frames - self.model.background.first_guess(self.frames)
-        transmission = light.mean((1, 2)).double()
-        return Calibration(transmission / transmission.mean(), torch.ones_like(transmission), 1.0)
+        """Return the calibration with transmissions from the frames' mean light, and noise and priors as given.
+
+        A frame that shows only background, or by its noise even less, has the least transmission.
+        """
+        light = (self.frames - self.model.background.first_guess(self.frames)).mean((1, 2)).double()
+        transmission = (light / light.mean()).clamp(min=LEAST_TRANSMISSION)
+        return Calibration(transmission, torch.ones_like(transmission), 1.0)
 
     def forward(self, image: Tensor, z: Tensor, calibration: Calibration | None = None) -> Tensor:
         calibration = calibration or self.neutral_calibration()

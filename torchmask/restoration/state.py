@@ -10,6 +10,8 @@ from torch import Tensor
 
 from torchmask.optics.geometry import MaskGeometry
 
+LEAST_TRANSMISSION = 1e-3
+
 
 class Modes(Enum):
     """Aberrations that the parameters of a state stand for."""
@@ -23,7 +25,7 @@ class Modes(Enum):
 class Calibration:
     """Quantities that are updated between two descents and fixed during one.
 
-    transmission : (T,) transmission of the frames, 1 on average
+    transmission : (T,) transmission of the frames, 1 on average, none below `LEAST_TRANSMISSION`
     noise_inflation : (T,) factor by which a frame's precision is divided, from the variance of its residuals over that
         of its noise, at least 1
     aberration_weight : weight of ||z||^2 / 2 in the cost, which follows the strength of the turbulence; 0: no prior
