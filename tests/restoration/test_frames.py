@@ -58,6 +58,15 @@ def test_change_is_the_chi_square_against_the_mean_frame():
     assert scaled.change < 1e-20
 
 
+def test_change_counts_valid_pixels_only():
+    """What half of the pixels show of noise, they show whatever the others are."""
+    valid = torch.rand(GRID.shape, generator=torch.Generator().manual_seed(1)) < 0.5
+    stack = FrameStack.of(exposures(n_frames=8), valid, GRID, PUPIL, READOUT)
+    light = stack.frames[:, valid]
+    moved = light - stack.frames.mean((1, 2))[:, None] * light.mean(0)
+    assert stack.change == pytest.approx(float(moved.square().mean()) * stack.unit**2 / stack.variance, rel=1e-12)
+
+
 def test_a_stack_moves_to_another_precision():
     stack = FrameStack.of(exposures(), None, GRID, PUPIL, READOUT)
     single = stack.to(torch.float32, torch.device("cpu"))

@@ -107,10 +107,10 @@ class FrameStack:
 
     @property
     def change(self) -> float:
-        """Chi-square per pixel of the frames against their mean, scaled to the light of each frame."""
+        """Chi-square per valid pixel of the frames against their mean, scaled to the light of each frame."""
         light = self.frames - self.free.first_guess(self.frames)
         moved = light - light.mean((1, 2), keepdim=True) * light.mean(0)
-        return float((moved**2 * self.precision).mean())
+        return float((moved**2 * self.precision).sum() / self.valid.sum())
 
     @property
     def contrast(self) -> float:
