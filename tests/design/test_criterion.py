@@ -354,6 +354,19 @@ def test_wiener_mse_is_its_formula() -> None:
     assert wiener_mse(otfs.to(torch.complex64), s_o, s_n).dtype == torch.float32
 
 
+def test_wiener_mse_without_noise_is_what_no_light_arrives_of() -> None:
+    """Dark frequencies keep the object's power, those without an object have no error, and slopes are finite."""
+    otfs = torch.ones(2, 4, 4, dtype=torch.float64)
+    otfs[:, 1, 2] = otfs[:, 3, 0] = 0
+    s_o = 5 + uniform(4, 4)
+    s_o[3, 0] = s_o[2, 2] = 0
+    otfs.requires_grad_()
+    value = wiener_mse(otfs, s_o, torch.tensor(0.0))
+    assert float(value.detach()) == pytest.approx(float(s_o[1, 2]) / 16, rel=1e-15)
+    value.backward()
+    assert float(otfs.grad.abs().max()) == 0
+
+
 def test_more_frames_or_photons_restore_better() -> None:
     grid, mask = grid_of(32), mask_of(layouts()["random"])
     frames = [float(criterion_of(grid, n_frames=k).relative(mask)) for k in (1, 2, 10, 100)]

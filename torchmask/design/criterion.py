@@ -222,8 +222,8 @@ def wiener_mse(otfs: Tensor, object_psd: PSD, noise_psd: PSD) -> Tensor:
     Returns
     -------
     Tensor
-        (...), the mean over nu of S_o S_n / (S_o sum_k |h_k|^2 + S_n). Its average over random pistons is at least
-        MSE_a.
+        (...), the mean over nu of S_o S_n / (S_o sum_k |h_k|^2 + S_n), and of S_o where no light and no noise arrive.
+        Its average over random pistons is at least MSE_a.
 
     Raises
     ------
@@ -245,7 +245,9 @@ def wiener_mse(otfs: Tensor, object_psd: PSD, noise_psd: PSD) -> Tensor:
     s_o = evaluate_psd(object_psd, grid, "object_psd", real, otfs.device)
     s_n = evaluate_psd(noise_psd, grid, "noise_psd", real, otfs.device)
     power = (otfs.real**2 + otfs.imag**2 if otfs.is_complex() else otfs**2).sum(-3)
-    return (s_n / (power + s_n / s_o)).mean((-2, -1))
+    denominator = power + torch.where(s_o > 0, s_n / s_o, torch.inf)
+    is_seen = denominator > 0
+    return torch.where(is_seen, s_n / torch.where(is_seen, denominator, 1.0), s_o).mean((-2, -1))
 
 
 def _reflect(image: Tensor) -> Tensor:
