@@ -24,11 +24,10 @@ def scene(light=1e4):
 
 
 def bound(n_modes=3, n_frames=3, r0=0.4, seed=0, **changes):
-    known = {"image": scene(), "object_psd": OBJECT, "noise_psd": NOISE} | changes
+    known = {"image": scene(), "object_psd": OBJECT, "noise_psd": NOISE, "aperture": MASK} | changes
     generator = torch.Generator().manual_seed(seed)
     return myopic_bound(
         **known,
-        aperture=MASK,
         grid=GRID,
         n_frames=n_frames,
         n_modes=n_modes,
@@ -88,9 +87,26 @@ def test_more_modes_cost_more_and_more_light_tells_more():
     assert bright.unknown < bound().unknown
 
 
+def test_it_is_computed_in_float64_where_the_aperture_is():
+    """Whatever the precision of the mask, which stays as it is, and the default device."""
+    rounded = SparseAperture(MASK.centers.float(), 0.4, 1.0)
+    assert bound(aperture=rounded) == bound(aperture=SparseAperture(rounded.centers.double(), 0.4, 1.0))
+    assert rounded.centers.dtype == torch.float32
+    image, expected = scene(), bound()
+    with torch.device("meta"):
+        assert bound(image=image) == expected
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
-    [({"image": torch.ones(4, 4)}, r"image has shape \(4, 4\)"), ({"n_frames": 0}, "n_frames is 0")],
+    [
+        ({"image": torch.ones(4, 4)}, r"image has shape \(4, 4\)"),
+        ({"image": scene() / 0}, "image holds values that are not finite"),
+        ({"n_frames": 0}, "n_frames is 0"),
+        ({"n_frames": math.inf}, "n_frames is inf"),
+        ({"noise_psd": torch.tensor(-1.0)}, "noise_psd holds negative"),
+        ({"noise_psd": torch.tensor(0.0)}, "noise_psd is 0 somewhere"),
+    ],
 )
 def test_what_cannot_be_is_refused(changes, said):
     with pytest.raises(ValueError, match=said):

@@ -64,17 +64,20 @@ def myopic_bound(
     Bounds, 2007, for the bound with random parameters; here it is taken at the truth, not averaged over it). What the
     object's place is, nobody can tell from the mean tilt of the frames: a shift of all frames counts as no error. The
     bound is local: it knows nothing of false minima far from the truth, and an estimate that is biased, as one with a
-    positive object, may lie below it.
+    positive object, may lie below it. It is computed in float64 on the device of the aperture.
 
     Parameters
     ----------
     image : (H, W) tensor
         The object in expected electrons per frame, on the pixels of `grid`; frames are its circular convolutions.
     aperture : Aperture
+        One mask, or a full pupil.
     grid : Grid
+        Pixels and wavelength of the frames.
     object_psd, noise_psd : callable or Tensor
         As for `AsymptoticMSE`. The prior of the object is Gaussian, stationary and of this PSD.
     n_frames : int
+        Number of exposures, T.
     n_modes : int
         Zernike modes per sub-aperture, Noll 1 (piston) to this, drawn and to be found.
     r0, outer_scale : float
@@ -87,7 +90,8 @@ def myopic_bound(
     Raises
     ------
     ValueError
-        If the image does not have the grid's shape, or `n_frames` is below 1.
+        If the image does not have the grid's shape or is not finite, `n_frames` is not a whole number of at least 1, or
+        a PSD cannot be one; that of the noise must be positive.
 
     Examples
     --------
@@ -102,20 +106,27 @@ def myopic_bound(
     """
     if tuple(image.shape) != grid.shape:
         raise ValueError(f"image has shape {tuple(image.shape)}: it must be that of the grid, {grid.shape}")
-    if n_frames != int(n_frames) or n_frames < 1:
+    if not bool(torch.isfinite(image).all()):
+        raise ValueError("image holds values that are not finite: replace them")
+    if not math.isfinite(n_frames) or n_frames != int(n_frames) or n_frames < 1:
         raise ValueError(f"n_frames is {n_frames}: it must be a whole number of at least 1")
+    aperture = aperture.still().double()  # small differences of large sums: float32 would not do
+    device = aperture.centers.device
+    signal = evaluate_psd(object_psd, grid, "object_psd", torch.float64, device)
+    noise = evaluate_psd(noise_psd, grid, "noise_psd", torch.float64, device)
+    if not bool((noise > 0).all()):
+        raise ValueError("noise_psd is 0 somewhere: it must be positive, or nothing would be uncertain there")
     basis = turbulent_basis(aperture, n_modes, 0, r0, outer_scale)
-    z = torch.randn(n_frames, basis.n_parameters, dtype=torch.float64, generator=generator)
-    signal, noise = (evaluate_psd(psd, grid, name) for psd, name in ((object_psd, "object_psd"), (noise_psd, "noise")))
+    z = torch.randn(n_frames, basis.n_parameters, dtype=torch.float64, device="cpu", generator=generator).to(device)
     otfs, slopes = _otfs_and_slopes(aperture, grid, basis, z, oversampling)
     known = float(wiener_mse(otfs, signal, noise))
     own = 1 / ((otfs.abs() ** 2).sum(0) / noise + 1 / signal)  # of the object, known aberrations
-    moved = slopes * torch.fft.fft2(image.double())  # (T, K, H, W): what the frames' spectra change
+    moved = slopes * torch.fft.fft2(image.to(signal))  # (T, K, H, W): what the frames' spectra change
     mixed = otfs.conj()[:, None] * moved / noise  # information that object and aberrations share
-    half = _half_plane(grid)
+    half = _half_plane(grid).to(device)
     by_aberrations = _columns(moved / noise.sqrt(), half)
     information = torch.block_diag(*(part @ part.mT for part in by_aberrations))
-    information += torch.eye(len(information), dtype=information.dtype)
+    information.diagonal().add_(1)  # the prior of the whitened aberrations
     shared = _columns(mixed * own.sqrt(), half).flatten(0, 1)
     schur = information - shared @ shared.mT
     lost = _columns(mixed * own, half).flatten(0, 1)
@@ -138,7 +149,7 @@ def _otfs_and_slopes(
         def along(direction: Tensor) -> Tensor:
             return torch.func.jvp(transfer, (parameters,), (direction,))[1]
 
-        directions = torch.eye(len(parameters), dtype=parameters.dtype)
+        directions = torch.eye(len(parameters), dtype=parameters.dtype, device=parameters.device)
         return torch.func.vmap(along, chunk_size=_AT_ONCE)(directions)
 
     with torch.no_grad():
@@ -148,7 +159,7 @@ def _otfs_and_slopes(
 def _half_plane(grid: Grid) -> Tensor:
     """Return the weights (H, W) of a half spectrum of real fields: 2, 1, or 0 for what repeats the other half."""
     rows, columns = grid.shape
-    weights = torch.zeros(rows, columns, dtype=torch.float64)
+    weights = torch.zeros(rows, columns, dtype=torch.float64, device="cpu")
     weights[:, : columns // 2 + 1] = 2.0
     weights[:, 0] = 1.0
     if columns % 2 == 0:
@@ -168,10 +179,11 @@ def _common_tilts(aperture: Aperture, grid: Grid, basis: AberrationBasis, n_fram
     samples = aperture.samples(grid, oversampling)
     phase = ZernikePhase(aperture, grid, basis.n_modes, oversampling)
     lit = samples.weights > 0
-    modes = torch.stack([phase(basis.coefficients(unit))[lit] for unit in torch.eye(basis.n_parameters).double()], -1)
-    modes = torch.cat([modes, torch.ones(len(modes), 1, dtype=modes.dtype)], -1)  # and a piston of the whole pupil
+    units = torch.eye(basis.n_parameters, dtype=torch.float64, device=samples.weights.device)
+    modes = torch.stack([phase(basis.coefficients(unit))[lit] for unit in units], -1)
+    modes = torch.cat([modes, torch.ones_like(modes[:, :1])], -1)  # and a piston of the whole pupil
     tilts = (aperture.centers[:, None] + samples.offsets)[lit].to(modes) / aperture.mask_diameter
-    found = torch.linalg.lstsq(modes, tilts, driver="gelsd").solution
+    found = torch.linalg.lstsq(modes.cpu(), tilts.cpu(), driver="gelsd").solution.to(modes)  # CUDA has no such driver
     missed = (modes @ found - tilts).norm(dim=0) / tilts.norm(dim=0)
     return found[:-1].repeat(n_frames, 1)[:, missed < _EXACT]
 
