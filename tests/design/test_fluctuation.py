@@ -100,6 +100,9 @@ def test_the_mean_error_of_random_pistons_is_predicted(n_photons):
 def test_without_r0_the_term_is_that_of_pistons():
     piston, none = AsymptoticMSE(GRID, *PSDS, 10), TurbulentMSE(GRID, *PSDS, 10)
     assert float(none.jensen_term(REDUNDANT)) == float(piston.jensen_term(REDUNDANT)) > 0
+    with torch.device("meta"):  # another default device
+        again = float(none.jensen_term(REDUNDANT))
+    assert again == float(piston.jensen_term(REDUNDANT))
 
 
 @pytest.mark.parametrize("criterion", [AsymptoticMSE(GRID, *PSDS, 10), TurbulentMSE(GRID, *PSDS, 10, r0=0.2)])

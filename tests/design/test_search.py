@@ -58,6 +58,24 @@ def test_search_leaves_the_process_and_the_folder_alone(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("constraints", [(), (MinimumGap(0.02), KeepOutDisc(0.1), NFoldSymmetry(3))])
+@pytest.mark.parametrize("method", ["cma", "hybrid"])
+def test_another_default_device_sees_nothing_of_it(method, constraints):
+    """From the room for holes, over the coarse grid, to projections and checks, all is where the criterion is."""
+    criterion = reference(128)
+
+    def found():
+        return search_mask(criterion, 6, 1.0, 0.1, method=method, budget=96, seed=0, constraints=constraints)
+
+    expected = found()
+    with torch.device("meta"):
+        again = found()
+        refined = refine_mask(criterion, expected.aperture, budget=10, constraints=constraints)
+    assert torch.equal(again.aperture.centers, expected.aperture.centers)
+    assert all(torch.equal(again.history[stage], rows) for stage, rows in expected.history.items())
+    assert refined.aperture.centers.device.type == "cpu"
+
+
 def test_gradient_stage_improves_on_cma_alone():
     plain = search_mask(COARSE, 9, 1.0, 0.15, method="cma", refine=False, budget=640, seed=0)
     refined = search_mask(COARSE, 9, 1.0, 0.15, method="cma", refine=True, budget=640, seed=0)

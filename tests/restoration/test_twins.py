@@ -65,6 +65,8 @@ def test_a_twin_keeps_what_each_frame_has_found(explained):
     assert float(turned.image.min()) >= 0
     assert torch.equal(twin_of(objective, state, 30.0, seed=3).z, turned.z)
     assert not torch.equal(twin_of(objective, state, 30.0, seed=4).z, turned.z)
+    with torch.device("meta"):  # another default device
+        assert torch.equal(twin_of(objective, state, 30.0, seed=3).z, turned.z)
 
 
 def test_the_object_of_a_twin_suits_its_pistons(explained):

@@ -45,7 +45,7 @@ def evolve(
         strategy = cma.CMAEvolutionStrategy(start, 0.2, options)
         while not strategy.stop() and merit.evaluations + population <= budget:
             points = np.asarray(strategy.ask())
-            x = torch.as_tensor(points).to(best)
+            x = torch.from_numpy(points).to(best)
             values = merit.value(x)
             strategy.tell(list(points), values.double().cpu().tolist())
             index = int(values.argmin())

@@ -75,7 +75,9 @@ class LinearEquality(Constraint):
         """Return matrix (M, 2N) and values (M) [m] for the flattened centres x_0, y_0, x_1, ..."""
 
     def residuals(self, aperture: SparseAperture) -> Tensor:
-        matrix, values = (torch.as_tensor(a).to(aperture.centers) for a in self.equations(aperture.n_subapertures))
+        matrix, values = (
+            torch.as_tensor(part, device="cpu").to(aperture.centers) for part in self.equations(aperture.n_subapertures)
+        )
         return aperture.centers.flatten(-2) @ matrix.T - values
 
 
@@ -101,12 +103,12 @@ class Subspace:
         if np.abs(matrix @ origin - values).max(initial=0.0) > 1e-12 * max(1.0, np.abs(values).max(initial=0.0)):
             names = " and ".join(str(c) for c in constraints if isinstance(c, LinearEquality))
             raise Infeasible(f"no mask of {n_subapertures} holes obeys {names} together: leave one out")
-        like = torch.zeros((), dtype=torch.float64) if like is None else like
-        self.origin: Tensor = torch.as_tensor(origin).to(like)
-        self.basis: Tensor = torch.as_tensor(right[rank:].T.copy()).to(like)
+        like = torch.zeros((), dtype=torch.float64, device="cpu") if like is None else like
+        self.origin: Tensor = torch.from_numpy(origin).to(like)
+        self.basis: Tensor = torch.from_numpy(right[rank:].T.copy()).to(like)
         # The change of z that moves one hole by a given step, with the smallest change elsewhere.
         rows = right[rank:].T.reshape(n_subapertures, 2, -1)
-        self.lift: Tensor = torch.as_tensor(np.linalg.pinv(rows, rcond=1e-9)).to(like)  # (N, F, 2)
+        self.lift: Tensor = torch.from_numpy(np.linalg.pinv(rows, rcond=1e-9)).to(like)  # (N, F, 2)
 
     @property
     def size(self) -> int:
@@ -123,7 +125,8 @@ class Subspace:
 
     def spread(self) -> Tensor:
         """Return a step (F,) that moves every hole in its own direction (by the golden angle), within the subspace."""
-        angles = math.pi * (3 - math.sqrt(5)) * torch.arange(len(self.lift), dtype=self.basis.dtype)
+        holes = torch.arange(len(self.lift), dtype=self.basis.dtype, device=self.basis.device)
+        angles = math.pi * (3 - math.sqrt(5)) * holes
         return torch.stack([angles.cos(), angles.sin()], dim=-1).flatten() @ self.basis
 
     def place(self, z: Tensor, hole: int, position: Tensor) -> Tensor:
@@ -183,7 +186,7 @@ def _project_one(
         values = margins.values(z)
         shortfall = -values.min(initial=np.inf)
         if shortfall <= -slack / 2:
-            return subspace.centers(torch.as_tensor(z * scale))
+            return subspace.centers(torch.from_numpy(z * scale))
         # Only margins near zero matter. Others may come near as the holes move, so this is repeated.
         near = values < (0.05 if shortfall > 1e-3 else 0.002)
         before, relevant = relevant, near | relevant if len(relevant) else near
@@ -240,12 +243,12 @@ def _margin_function(aperture: SparseAperture, subspace: Subspace, constraints: 
 
     def values(z: Array) -> Array:
         with torch.no_grad():
-            return margins(torch.as_tensor(z)).numpy()
+            return margins(torch.from_numpy(z)).numpy()
 
     def jacobian(z: Array, rows: Array) -> Array:
         # With one copy of the mask per row, the gradient of the sum of each copy's own margin is the Jacobian.
-        copies = torch.as_tensor(z).expand(len(rows), -1).clone().requires_grad_()
-        own = margins(copies)[torch.arange(len(rows)), torch.as_tensor(rows)]
+        copies = torch.from_numpy(z).expand(len(rows), -1).clone().requires_grad_()
+        own = margins(copies).gather(1, torch.from_numpy(rows)[:, None])
         return torch.autograd.grad(own.sum(), copies)[0].numpy()
 
     return _Margins(values, jacobian)

@@ -159,9 +159,9 @@ class NonRedundancy(Inequality):
 
     def margins(self, aperture: SparseAperture) -> Tensor:
         device = aperture.centers.device
-        first, second = torch.triu_indices(aperture.n_subapertures, aperture.n_subapertures, 1).to(device)
+        first, second = torch.triu_indices(aperture.n_subapertures, aperture.n_subapertures, 1, device=device)
         baselines = aperture.centers[..., first, :] - aperture.centers[..., second, :]
-        one, other = torch.triu_indices(len(first), len(first), 1).to(device)
+        one, other = torch.triu_indices(len(first), len(first), 1, device=device)
         pairs = torch.cat(
             [
                 baselines,

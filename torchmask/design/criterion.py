@@ -168,7 +168,8 @@ class AsymptoticMSE(nn.Module):
         grid = replace(self.grid, n_pixels=n_pixels)
         noise = resample_psd(self.noise_psd, grid.shape)
         model = resample_psd(self.object_psd, grid.shape) if self._object_model is None else self._object_model
-        return self._like(grid, model, noise).to(self.object_psd.device, self.object_psd.dtype)
+        with self.object_psd.device:  # whatever the default device: PSDs are made where none is told
+            return self._like(grid, model, noise).to(self.object_psd.dtype)
 
     def _like(self, grid: Grid, object_psd: PSD, noise_psd: PSD) -> Self:
         """Return the same criterion with another grid and other PSDs."""

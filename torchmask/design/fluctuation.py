@@ -54,7 +54,8 @@ def steady_lenses(lenses: Lenses, n: int) -> Tensor:
 
 def piston_powers(centers: Tensor, geometry: Geometry, wavelength: float) -> tuple[Tensor, Tensor]:
     """Return P and the sum of A^4 (B, H // 2 + 1, W) of masks with `centers` (B, N, 2) [m], for pistons alone."""
-    patches = LensPatches(geometry, Band.of([wavelength]), wavelength, None, centers.dtype, centers.device)
+    with torch.device("cpu"):  # whatever the default device: their tables are made in numpy and scipy
+        patches = LensPatches(geometry, Band.of([wavelength]), wavelength, None, centers.dtype, centers.device)
     n, found = centers.shape[1], []
     for mask in centers.split(1):
         lenses = patches(mask)

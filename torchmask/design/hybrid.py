@@ -63,7 +63,7 @@ def basin_hopping(
                 start = random_mask(holes, rng)
             else:
                 start = changed_mask(holes, pool.entries[rng.integers(len(pool.entries))][1], rng)
-            descent.restart(torch.tensor([k]), start[None])
+            descent.restart(slice(k, k + 1), start[None])
     for k in range(batch):
         pool.offer(descent.points[k].clone(), float(descent.values[k]))
     return torch.stack([x for _, x, _ in pool.entries[:FINALISTS]]), merit.evaluations

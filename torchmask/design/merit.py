@@ -111,7 +111,6 @@ class Merit:
         x = x.detach().requires_grad_()
         aperture = self.holes.aperture(x)
         relative, margins = self.criterion.relative(aperture), self.holes.margins(aperture)
-        multipliers = torch.as_tensor(multipliers).to(margins)
         excess = (multipliers - self.weight * margins).clamp(min=0) ** 2 - multipliers**2
         merit = relative.log() + excess.sum(-1) / (2 * self.weight)
         (gradient,) = torch.autograd.grad(merit.sum(), x)

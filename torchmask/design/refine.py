@@ -96,7 +96,7 @@ class Monitor:
                 measured[id(centers)] = self._measure(criterion, centers)
         rows = [(evaluations, measured[id(centers)]) for evaluations, centers in self.rows]
         found = [row for row in rows if row[1] < float("inf")]
-        return {self.stage: torch.tensor(found, dtype=torch.float64).reshape(-1, 2)}
+        return {self.stage: torch.tensor(found, dtype=torch.float64, device="cpu").reshape(-1, 2)}
 
     def _measure(self, criterion: Criterion, centers: Tensor) -> float:
         try:
@@ -195,7 +195,7 @@ def polish(
         descent.tell(found.merit, found.gradient)
         if bool(descent.finished.all()):
             margins = merit(descent.points, multipliers).margins
-            update = (torch.as_tensor(multipliers) - merit.weight * margins).clamp(min=0)
+            update = (multipliers - merit.weight * margins).clamp(min=0)
             if float((update - multipliers).abs().amax()) <= 1e-4 * float(update.max()):
                 break
             multipliers = update

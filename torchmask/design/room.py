@@ -167,7 +167,7 @@ def _largest(fits: Callable[[float], bool], limit: float) -> float:
 
 def _holes(n: int, mask_diameter: float, fill_factor: float, constraints: Sequence[Constraint]) -> Holes:
     diameter = hole_diameter(n, mask_diameter, fill_factor)
-    template = SparseAperture(torch.zeros(n, 2, dtype=torch.float64), diameter, mask_diameter)
+    template = SparseAperture(torch.zeros(n, 2, dtype=torch.float64, device="cpu"), diameter, mask_diameter)
     return Holes(template, (InsideDisc(), NoOverlap(), *constraints))
 
 
@@ -176,9 +176,9 @@ def _first_mask(holes: Holes, rng: np.random.Generator, trials: _Trials) -> Spar
     if not any(not isinstance(c, (InsideDisc, NoOverlap)) for c in holes.constraints):
         template = holes.template
         generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
-        return SparseAperture.random(
-            template.n_subapertures, template.mask_diameter, template.fill_factor, generator=generator
-        )
+        size = template.n_subapertures, template.mask_diameter, template.fill_factor
+        with template.centers.device:
+            return SparseAperture.random(*size, generator)
     descent = BatchedBFGS(torch.stack([random_mask(holes, rng) for _ in range(_STARTS)]), 0.1, 1e-16)
     for _ in range(_ROUNDS):
         x = descent.ask().requires_grad_()

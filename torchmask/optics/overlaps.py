@@ -32,7 +32,7 @@ def pair_clearances(aperture: SparseAperture) -> Tensor:
     side: it is exact for sides that face each other, always has the right sign, and never exceeds the true distance.
     """
     n = aperture.n_subapertures
-    first, second = torch.triu_indices(n, n, 1).to(aperture.centers.device)
+    first, second = torch.triu_indices(n, n, 1, device=aperture.centers.device)
     difference = aperture.centers[..., first, :] - aperture.centers[..., second, :]
     return aperture.shape.separation(difference) - aperture.subaperture_diameter
 
@@ -44,7 +44,7 @@ def find_overlaps(aperture: SparseAperture, tolerance: float = 1e-6) -> list[Ove
     of all its masks are returned together.
     """
     n = aperture.n_subapertures
-    first, second = torch.triu_indices(n, n, 1).tolist()
+    first, second = torch.triu_indices(n, n, 1, device="cpu").tolist()
     depths = -pair_clearances(aperture).detach().cpu()
     depths = depths.reshape(math.prod(depths.shape[:-1]), len(first))
     found = [

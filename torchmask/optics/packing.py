@@ -112,7 +112,7 @@ def random_packing(
     reach = hole_diameter(n_subapertures, 1.0, fill_factor)
     best = 0.0
     for _ in range(_ATTEMPTS):
-        u = torch.rand(n_subapertures, 2, generator=generator, dtype=torch.float64).numpy()
+        u = torch.rand(n_subapertures, 2, generator=generator, dtype=torch.float64, device="cpu").numpy()
         angle = 2 * math.pi * u[:, 1]
         thrown = (1 - reach) / 2 * np.sqrt(u[:, :1]) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         for centers in (thrown, relaxed := _push_apart(thrown, reach)):

@@ -48,7 +48,7 @@ class TorchMinimizer:
     def __post_init__(self) -> None:
         if self.steps < 1:
             raise ValueError(f"steps is {self.steps}: it must be at least 1")
-        made = self.factory([torch.zeros(1)])
+        made = self.factory([torch.zeros(1, device="cpu")])
         if not isinstance(made, torch.optim.Optimizer):
             raise TypeError(f"factory returns a {type(made).__name__}: it must return an optimiser of torch.optim")
 

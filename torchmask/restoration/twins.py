@@ -30,7 +30,8 @@ def twin_of(objective: MyopicObjective, state: State, inflation: float, seed: in
     """
     basis = objective.model.aberrations
     generator = torch.Generator().manual_seed(seed)
-    pistons = math.pi * (2 * torch.rand(basis.n_subapertures, dtype=torch.float64, generator=generator) - 1)
+    uniform = torch.rand(basis.n_subapertures, dtype=torch.float64, device="cpu", generator=generator)
+    pistons = math.pi * (2 * uniform - 1)
     z = state.z + piston_parameters(basis, pistons).to(state.z)
     return settle(objective, replace(state, z=z).with_noise_inflation(inflation), _SETTLING)
 
