@@ -42,6 +42,12 @@ def test_a_mask_as_built_is_scaled_with_its_holes():
     assert Pattern.from_catalog("golay6").scaled(1.0) is None
 
 
+@pytest.mark.parametrize("shape", [(1, 2), (3, 4, 2)])
+def test_what_is_no_pattern_is_refused(shape):
+    with pytest.raises(ValueError, match="mine has centers of shape .*: one mask of at least two holes is needed"):
+        Pattern.of("mine", SparseAperture(torch.rand(shape), 0.2, 1.0))
+
+
 def test_fill_factors_that_are_none_are_refused():
     with pytest.raises(ValueError, match=r"fill_factor is -0\.15"):
         Pattern.from_catalog("golay6").afresh(1.0, -0.15)

@@ -17,14 +17,24 @@ from torchmask.optics.shapes import Disc, Shape
 class Pattern:
     """Where the holes of a mask lie, and the mask as built.
 
+    name : by which it is called in rankings and errors
     centers : (N, 2) in any unit
+    shape : of the holes
     built : the mask as built, of any diameter; None if it has no size of its own
+
+    Raises ValueError for anything but one mask of at least two holes: a single one has no pattern.
     """
 
     name: str
     centers: np.ndarray
     shape: Shape
     built: SparseAperture | None
+
+    def __post_init__(self) -> None:
+        if self.centers.ndim != 2 or len(self.centers) < 2:
+            raise ValueError(
+                f"{self.name} has centers of shape {self.centers.shape}: one mask of at least two holes is needed, (N, 2)"
+            )
 
     @classmethod
     def from_catalog(cls, name: str) -> Pattern:
