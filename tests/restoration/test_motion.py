@@ -13,7 +13,7 @@ from torchmask.grid import Grid
 from torchmask.metrics import relative_error
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.band import Band
-from torchmask.restoration.aberrations import moving_basis, turbulent_basis
+from torchmask.restoration.aberrations import AberrationBasis, moving_basis, turbulent_basis
 from torchmask.restoration.adjoint import data_fidelity
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.linearization import Linearization
@@ -139,6 +139,19 @@ def test_an_objective_follows_the_state(explain, five_holes):
     known = setting.in_motion(state, 0, change).z
     assert torch.allclose(moving.change(known)[:2], change, atol=1e-6)
     assert torch.equal(known[2:], moved.z[2:])
+
+
+def test_an_objective_has_the_basis_of_the_state_however_many_parameters_it_has(explain):
+    objective, state = explain()
+    still = objective.model.aberrations
+    other = AberrationBasis(2 * still.mixing, still.n_modes)
+    setting = Setting.of(objective, finer=lambda: other)
+    finer = setting.in_finer_modes(state)
+    there = setting.objective_at(objective, finer)
+    assert there.model.aberrations is other
+    torch.testing.assert_close(other.coefficients(finer.z), still.coefficients(state.z))
+    torch.testing.assert_close(there.model(state.image, finer.z), objective.model(state.image, state.z))
+    assert setting.objective_at(there, finer) is there
 
 
 # ---- whole restorations

@@ -82,7 +82,7 @@ class Setting:
         """Return the objective with its mask and its aberrations as `state` has them."""
         objective, basis = placed_as(objective, self.told, state.geometry), self._basis(state.modes)
         model, centre = objective.model, objective.centre
-        if model.aberrations.n_parameters == basis.n_parameters:
+        if model.aberrations is basis:
             return objective
         if state.modes is Modes.FINER:
             centre = torch.zeros_like(state.z)
