@@ -64,9 +64,11 @@ def expected_variance(
     """
     measured = noise_variance(frames, grid, aperture, valid)
     if errors is not None:
-        variance, told = float((errors if valid is None else errors[valid]).square().mean()), "errors"
+        variance = float((errors if valid is None else errors[valid]).square().mean())
+        told = option = "errors"
     elif readout_noise is not None:
-        variance, told = float(frames.mean()) + readout_noise**2, "photon noise and readout_noise"
+        variance = float(frames.mean()) + readout_noise**2
+        told, option = "photon noise and readout_noise", "readout_noise"
     elif measured is not None and measured > 0:
         return measured
     else:
@@ -74,7 +76,7 @@ def expected_variance(
     if measured is not None and not 0.5 < measured / variance < 2:
         warnings.warn(
             f"the noise of the frames is {measured**0.5:.3g} electrons rms, but {told} give {variance**0.5:.3g}: check "
-            f"the gain and {told.split()[-1]}",
+            f"the gain and {option}",
             stacklevel=4,
         )
     more_than_light = errors is None and measured is not None and measured > _CLEARLY_MORE * variance
