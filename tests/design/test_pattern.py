@@ -44,7 +44,7 @@ def test_a_mask_as_built_is_scaled_with_its_holes():
 
 @pytest.mark.parametrize("shape", [(1, 2), (3, 4, 2)])
 def test_what_is_no_pattern_is_refused(shape):
-    with pytest.raises(ValueError, match="mine has centers of shape .*: one mask of at least two holes is needed"):
+    with pytest.raises(ValueError, match=r"mine has centers of shape .*: one mask of at least two holes is needed"):
         Pattern.of("mine", SparseAperture(torch.rand(shape), 0.2, 1.0))
 
 

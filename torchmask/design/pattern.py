@@ -32,8 +32,9 @@ class Pattern:
 
     def __post_init__(self) -> None:
         if self.centers.ndim != 2 or len(self.centers) < 2:
+            shape = self.centers.shape
             raise ValueError(
-                f"{self.name} has centers of shape {self.centers.shape}: one mask of at least two holes is needed, (N, 2)"
+                f"{self.name} has centers of shape {shape}: one mask of at least two holes is needed, (N, 2)"
             )
 
     @classmethod
