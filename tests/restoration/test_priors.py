@@ -295,6 +295,14 @@ class OfWrongShape:
         return 2 * image[:-1]
 
 
+class OfCurvature:
+    def __init__(self, curvature):
+        self.curvature = curvature
+
+    def __call__(self, image):
+        return (image**2).sum()
+
+
 @pytest.mark.parametrize(
     ("prior", "words"),
     [
@@ -308,6 +316,10 @@ class OfWrongShape:
         (lambda image: image[9, 9], r"fails on an image \(6, 7\): index 9 is out of bounds"),
         (lambda image: (image @ image).sum(), r"fails on an image \(6, 7\)"),
         (OfWrongShape(), r"has shape \(5, 7\) or is not finite"),
+        (OfCurvature(lambda image: image[:-1]), r"curvature of .* is a tensor of shape \(5, 7\), or holds"),
+        (OfCurvature(lambda image: 2.0), r"curvature of .* is a float, or holds"),
+        (OfCurvature(lambda image: -image.abs()), r"negative or not finite: a tensor of shape \(6, 7\) is needed"),
+        (OfCurvature(lambda image: image / 0), "values that are negative or not finite"),
     ],
 )
 def test_refuses_what_is_no_prior(prior, words):

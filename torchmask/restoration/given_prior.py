@@ -50,7 +50,7 @@ def as_prior(prior: Callable[[Tensor], Tensor]) -> ObjectPrior:
 
 
 def check_prior(prior: ObjectPrior, image: Tensor) -> None:
-    """Raise ValueError unless `prior` is a finite, differentiable scalar at `image` (H', W')."""
+    """Raise ValueError unless `prior` is a finite, differentiable scalar with a curvature at `image` (H', W')."""
     try:
         with torch.enable_grad():
             value = prior(image.detach().requires_grad_())
@@ -68,4 +68,14 @@ def check_prior(prior: ObjectPrior, image: Tensor) -> None:
         raise ValueError(
             f"the gradient of the prior {prior!r} at the mean frame has shape {tuple(slope.shape)} or is not finite: "
             f"it must be finite, of shape {tuple(image.shape)}"
+        )
+    curved = prior.curvature(image)
+    fits = isinstance(curved, Tensor) and curved.shape == image.shape
+    if not fits or not bool((torch.isfinite(curved) & (curved >= 0)).all()):
+        what = (
+            f"a tensor of shape {tuple(curved.shape)}" if isinstance(curved, Tensor) else f"a {type(curved).__name__}"
+        )
+        raise ValueError(
+            f"the curvature of the prior {prior!r} at the mean frame is {what}, or holds values that are negative or "
+            f"not finite: a tensor of shape {tuple(image.shape)} is needed, finite and at least 0"
         )
