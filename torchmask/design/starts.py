@@ -22,7 +22,7 @@ def random_mask(holes: Holes, rng: np.random.Generator) -> Tensor:
     angles = 2 * math.pi * rng.random(n)
     if rng.random() < 0.5:
         angles = 2 * math.pi / n * (np.arange(n) + rng.random() * rng.standard_normal(n))
-    positions = torch.from_numpy(np.stack([radii * np.cos(angles), radii * np.sin(angles)], axis=-1))
+    positions = torch.as_tensor(np.stack([radii * np.cos(angles), radii * np.sin(angles)], axis=-1), device="cpu")
     x = holes.subspace.origin.new_zeros(holes.subspace.size)
     for hole in range(n):
         x = holes.place(x, hole, positions[hole])
@@ -33,7 +33,7 @@ def changed_mask(holes: Holes, x: Tensor, rng: np.random.Generator) -> Tensor:
     """Return a start near the mask x (F,), with all holes moved slightly, or one or two moved anywhere."""
     moved = int(rng.integers(3))
     if moved == 0:
-        return x + 0.03 * torch.from_numpy(rng.standard_normal(len(x))).to(x)
+        return x + 0.03 * torch.as_tensor(rng.standard_normal(len(x)), device="cpu").to(x)
     n = holes.template.n_subapertures
     for hole in rng.choice(n, size=min(n, moved), replace=False):
         radius, angle = holes.radius * rng.random() ** rng.uniform(0, 0.5), 2 * math.pi * rng.random()
