@@ -449,3 +449,15 @@ def test_a_wind_without_an_exposure_is_refused(wind):
     for turbulence in ({}, {"r0": 0.2}):
         with pytest.raises(ValueError, match="exposure is 0"):
             criterion_of(wind=wind, **turbulence)
+
+
+@pytest.mark.parametrize("wavelengths", [None, (500e-9, 550e-9, 600e-9), (500e-9,)])
+def test_the_floor_is_what_a_full_pupil_leaves_in_bright_light(wavelengths):
+    """Up to the cut-off of the band's shortest wavelength; what is above falls as one over the photons."""
+    excess = []
+    for n_photons in (1e9, 1e11, 1e13):
+        bright = criterion_of(Grid(48, 500e-9 / 2, 550e-9), n_photons, 1000, r0=0.2, wavelengths=wavelengths)
+        excess.append(float(bright.relative(FullAperture(1.0))) / bright.relative_floor(1.0) - 1)
+    assert excess[1] == pytest.approx(excess[0] / 100, rel=0.05)
+    assert excess[2] == pytest.approx(excess[1] / 100, rel=0.05)
+    assert 0 < excess[0] < 1e-3

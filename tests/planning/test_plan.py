@@ -129,6 +129,20 @@ def test_points_are_the_criterion_under_turbulence(exposures):
     assert choice.blind_mse == pytest.approx(float(still.relative(MASK)), rel=1e-12)
 
 
+def test_the_floor_is_that_of_the_band_and_blind_errors_grow_above_that_of_narrow_light(monkeypatch):
+    """A band of 100 nm reaches further than its middle; what restorations lose was measured in narrow light."""
+    costly = BlindOutlook(cost=1.1, success=0.5, low=0.4, high=0.6)
+    monkeypatch.setattr(torchmask.planning.plan, "_blind_outlook", lambda *point: costly)
+    known = make(**BRIGHT | {"width": 100e-9, "n_wavelengths": 2})
+    best = plan_observation(known, aperture=MASK, exposures=(1e-3,), n_frequencies=24).best
+    there, area = known.with_exposure(1e-3), float(MASK.area)
+    band, narrow = (criterion(there, area, 24) for criterion in (instrument_criterion, instant_criterion))
+    assert best.relative_mse - best.above_floor == pytest.approx(band.relative_floor(1.0), rel=1e-12)
+    error, least = float(narrow.relative(MASK)), narrow.relative_floor(1.0)
+    assert best.blind_mse == pytest.approx(error + (1.1**2 - 1) * (error - least), rel=1e-12)
+    assert band.relative_floor(1.0) < 0.9 * least
+
+
 @pytest.mark.parametrize("instrument", [make(), make(exposure=6e-3, n_wavelengths=2)])
 def test_the_criterion_is_that_of_turbulence_band_pixels_and_sky(instrument):
     criterion = instrument_criterion(instrument, float(MASK.area), 24)

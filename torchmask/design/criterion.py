@@ -152,8 +152,12 @@ class AsymptoticMSE(nn.Module):
         if not (math.isfinite(mask_diameter) and mask_diameter > 0):
             raise ValueError(f"mask_diameter is {mask_diameter}: it must be finite and positive, in m")
         nu_y, nu_x = self.grid.frequencies(self.object_psd.dtype, self.object_psd.device)
-        beyond = torch.hypot(nu_y, nu_x) >= self.grid.cutoff(mask_diameter)
+        beyond = torch.hypot(nu_y, nu_x) >= self._cutoff(mask_diameter)
         return (self.object_psd * beyond).mean()
+
+    def _cutoff(self, mask_diameter: float) -> float:
+        """Return the highest frequency that a mask of this diameter [m] transmits [cycles/pixel]."""
+        return self.grid.cutoff(mask_diameter)
 
     def relative_floor(self, mask_diameter: float) -> float:
         """Return `floor` over the mean of the object's PSD: no mask of `mask_diameter` [m] has a lower `relative`."""

@@ -261,11 +261,15 @@ class TurbulentMSE(AsymptoticMSE):
         ratio = still(baselines) ** 2 / still(baselines, smooth).clamp(min=_NOTHING)
         return (ratio * PolarTable(kept, reach, 1.5)(baselines)).reshape(-1, self.grid.shape[1])
 
+    def _cutoff(self, mask_diameter: float) -> float:
+        shortest = self.grid.wavelength if self.band is None else self.band.shortest
+        return replace(self.grid, wavelength=shortest).cutoff(mask_diameter)
+
     def _check_sampling(self, aperture: Aperture, band: Band) -> None:
-        reach = aperture.outer_diameter * self.grid.wavelength / band.shortest
-        if reach > 0.5 * self.grid.period * (1 + 1e-9):
+        highest = self._cutoff(aperture.outer_diameter)
+        if highest > 0.5 * (1 + 1e-9):
             raise ValueError(
-                f"the OTF of a sub-aperture reaches {self.grid.cutoff(reach):.3f} cycles/pixel at the band's shortest "
+                f"the OTF of a sub-aperture reaches {highest:.3f} cycles/pixel at the band's shortest "
                 f"wavelength, {band.shortest} m, above 1/2, and overlaps itself: pixel_scale must be at most "
                 f"{(1 - 1e-6) * band.shortest / (2 * aperture.outer_diameter):.7g} rad"
             )

@@ -237,25 +237,25 @@ def _measure(
             criterion = criterion or instrument_criterion(instrument, area, n_frequencies)
             change_light(criterion, instrument, area)
             error = float(criterion.relative(mask))
-            floor = criterion.relative_floor(instrument.telescope.diameter)
+            above = error - criterion.relative_floor(instrument.telescope.diameter)
             photons, sky = instrument.photons(area), instrument.sky(area)
             light = instrument.exposure, instrument.width, instrument.frames, photons, sky
             blind, expected = None, error
             if not mask.is_full:
                 blind = _blind_outlook(instrument, hole, area)
-                expected = _expected_error(blind, *instants[n, hole, place], floor)
-            choices.append(Choice(n, hole, *light, error, error - floor, expected, blind))
+                expected = _expected_error(blind, *instants[n, hole, place])
+            choices.append(Choice(n, hole, *light, error, above, expected, blind))
             _tell(callback, "plan/map", len(choices), n_steps, error)
     return sorted(choices, key=lambda choice: tuple(getattr(choice, name) for name in AXES))
 
 
 def _predict_instants(
     exposed: Sequence[Instrument], masks: dict[tuple[int, float], Aperture], n_frequencies: int
-) -> dict[tuple[int, float, int], tuple[float, float]]:
+) -> dict[tuple[int, float, int], tuple[float, float, float]]:
     """Return the error predicted for instants in narrow light with the photons of each exposure, for each mask.
 
     What is known of the turbulence then depends on the holes alone. The second error is that in the least light in
-    which restorations were tried, if there is less: it is that of as much less noise.
+    which restorations were tried, if there is less: it is that of as much less noise. The third is the floor of both.
     """
     errors, criterion = {}, None
     for (n, hole), mask in sorted(masks.items(), key=lambda item: item[0][1]):
@@ -267,15 +267,15 @@ def _predict_instants(
             if (share := instrument.equivalent_photons(area) / smearing_map().n_photons[0]) < 1:
                 criterion.load_state_dict(criterion.state_dict() | {"noise_psd": share * criterion.noise_psd})
                 tried = float(criterion.relative(mask))
-            errors[n, hole, place] = error, tried
+            errors[n, hole, place] = error, tried, criterion.relative_floor(instrument.telescope.diameter)
     return errors
 
 
 def _expected_error(blind: BlindOutlook, error: float, tried: float, floor: float) -> float:
     """Return the error expected of a blind restoration, where `error` is predicted for instants in narrow light.
 
-    `tried` is predicted for the least light in which restorations were tried, or is `error` where there is more. In
-    less light a restoration is taken to lose the same share of the image as the linear estimate does, so that from no
+    `tried` is predicted for the least light in which restorations were tried, or is `error` where there is more, and
+    `floor` is what of both no mask can avoid. In less light a restoration is taken to lose the same share of the image as the linear estimate does, so that from no
     light nothing is expected.
     """
     return 1 - (1 - blind.mse(tried, tried - floor)) * (1 - error) / (1 - tried)
