@@ -187,7 +187,8 @@ class Instrument:
     def equivalent_photons(self, area: float) -> float:
         """Return the electrons per frame that would tell as much of the target without sky and read-out noise.
 
-        That is photons^2 / noise, where noise is the variance of a frame that photons, sky and read-out make [m^2].
+        That is photons^2 / variance, through an open `area` of the pupil [m^2]; the variance [electrons^2] is that of a
+        whole frame, which photons, sky and read-out make.
         """
         photons, camera = self.photons(area), self.camera
         return photons**2 / (photons + camera.n_pixels**2 * (self.sky(area) + camera.readout_noise**2))

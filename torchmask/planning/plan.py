@@ -275,8 +275,8 @@ def _expected_error(blind: BlindOutlook, error: float, tried: float, floor: floa
     """Return the error expected of a blind restoration, where `error` is predicted for instants in narrow light.
 
     `tried` is predicted for the least light in which restorations were tried, or is `error` where there is more, and
-    `floor` is what of both no mask can avoid. In less light a restoration is taken to lose the same share of the image as the linear estimate does, so that from no
-    light nothing is expected.
+    `floor` is what of both no mask can avoid. In less light a restoration is taken to lose the same share of the image
+    as the linear estimate does, so that from no light nothing is expected.
     """
     return 1 - (1 - blind.mse(tried, tried - floor)) * (1 - error) / (1 - tried)
 

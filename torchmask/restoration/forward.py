@@ -158,7 +158,7 @@ class ExposureModel(nn.Module):
 
     @property
     def cutoff(self) -> float:
-        """Highest spatial frequency that the aperture transmits and the pixels sample [cycles/pixel]."""
+        """Highest frequency that the aperture transmits at the grid's wavelength and pixels sample [cycles/pixel]."""
         return min(0.5, self.window.grid.cutoff(self.pupil.aperture.extent))
 
     def beside(self, background: Background) -> ExposureModel:
