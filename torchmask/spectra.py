@@ -99,7 +99,7 @@ class NoisePSD:
     def __post_init__(self) -> None:
         _require_positive("n_photons", self.n_photons, "in photons per exposure")
         _require_positive("readout_noise", self.readout_noise, "in electrons rms per pixel", zero=True)
-        if self.n_pixels is not None and (self.n_pixels != int(self.n_pixels) or self.n_pixels < 1):
+        if self.n_pixels is not None and (not float(self.n_pixels).is_integer() or self.n_pixels < 1):
             raise ValueError(f"n_pixels is {self.n_pixels}: it must be a whole number of at least 1")
 
     def __call__(

@@ -251,6 +251,11 @@ def test_contradictions_and_impossible_symmetries_are_refused():
         project(thrown(3, 0), [InsideDisc(), NonRedundancy(0.9)])
 
 
+def test_a_whole_number_of_folds_may_be_a_float():
+    for one, other in zip(NFoldSymmetry(3.0).equations(7), NFoldSymmetry(3).equations(7), strict=True):
+        assert np.array_equal(one, other)
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -263,6 +268,7 @@ def test_contradictions_and_impossible_symmetries_are_refused():
         (lambda: FixedHoles([(0.0, 0.0)], indices=[1, 2]), "indices is"),
         (lambda: FixedHoles([(0.0, 0.0)], indices=[-1]), "counted from 0"),
         (lambda: NFoldSymmetry(1), "n_fold is 1"),
+        (lambda: NFoldSymmetry(math.inf), "n_fold is inf"),
         (lambda: FixedHoles([(0.0, 0.0)], indices=[4]).equations(3), "mask has 3 holes"),
     ],
 )

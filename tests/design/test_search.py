@@ -134,6 +134,7 @@ def test_extra_rules_are_obeyed_exactly():
         ((6, 1.0, 0.0), r"fill_factor"),
         ((6, 1.0, math.nan), r"fill_factor"),
         ((0, 1.0, 0.15), r"n_subapertures"),
+        ((math.inf, 1.0, 0.15), r"n_subapertures is inf: it must be a whole number"),
         ((6, -1.0, 0.15), r"mask_diameter"),
     ],
 )
@@ -147,7 +148,9 @@ def test_unknown_method_lists_the_known_ones():
         search_mask(COARSE, 6, 1.0, 0.15, method="annealing")
 
 
-@pytest.mark.parametrize("option", [{"seed": -1}, {"seed": 0.5}, {"budget": 0}])
+@pytest.mark.parametrize(
+    "option", [{"seed": -1}, {"seed": 0.5}, {"seed": math.inf}, {"budget": 0}, {"budget": math.inf}]
+)
 def test_bad_options_are_refused(option):
     (name,) = option
     with pytest.raises(ValueError, match=f"{name} is {option[name]}"):

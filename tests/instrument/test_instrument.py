@@ -160,6 +160,7 @@ def test_files_that_hold_none_say_why(text, said, tmp_path):
         ({"n_frames": 3}, "not both"),
         ({"observing_time": None}, "not both"),
         ({"observing_time": None, "n_frames": 0}, "n_frames is 0"),
+        ({"observing_time": None, "n_frames": math.inf}, "n_frames is inf: it must be a whole number"),
         ({"source": Source(magnitude=3.0, system="Vega")}, "known for the filters bessell-U"),
     ],
 )
@@ -187,6 +188,7 @@ def test_observations_that_cannot_be_are_refused(changes, said):
         (Site, {"r0": 0.1, "wind": 0.0}, r"site.wind is 0.0: .*in m/s"),
         (Site, {"r0": 0.1, "wind": 1.0, "sky": math.inf}, "per square arcsec"),
         (Camera, {"n_pixels": 1}, "at least 2"),
+        (Camera, {"n_pixels": math.inf}, "camera.n_pixels is inf: it must be a whole number"),
         (Camera, {"readout_noise": -1.0}, "in electrons rms"),
         (Camera, {"pixel_scale": 0.0}, "in arcsec"),
         (Camera, {"pixel_fill": 2.0}, "fill_factor"),

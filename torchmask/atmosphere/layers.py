@@ -116,7 +116,7 @@ class Layers:
 
         Raises ValueError if `n_layers` is not a whole number of at least 1.
         """
-        if n_layers != int(n_layers) or n_layers < 1:
+        if not float(n_layers).is_integer() or n_layers < 1:
             raise ValueError(f"n_layers is {n_layers}: it must be a whole number of at least 1")
         if n_layers >= len(self.heights):
             return self

@@ -218,7 +218,7 @@ def _check_options(
             raise ValueError(f"{name} is {value}: it must be finite and positive, in {unit}")
     if readout_noise is not None and not (math.isfinite(readout_noise) and readout_noise >= 0):
         raise ValueError(f"readout_noise is {readout_noise}: it must be finite and at least 0, in electrons rms")
-    if crop is not None and (crop != int(crop) or crop < 2):
+    if crop is not None and (not float(crop).is_integer() or crop < 2):
         raise ValueError(f"crop is {crop}: it must be a whole number of pixels, at least 2")
     if keep is not None and not 0 < keep <= 1:
         raise ValueError(f"keep is {keep}: it must be a fraction of the frames, above 0 and at most 1")

@@ -218,11 +218,12 @@ class NFoldSymmetry(LinearEquality):
     n_fold: int
 
     def __post_init__(self) -> None:
-        if self.n_fold != int(self.n_fold) or self.n_fold < 2:
+        if not float(self.n_fold).is_integer() or self.n_fold < 2:
             raise ValueError(f"n_fold is {self.n_fold}: it must be a whole number of at least 2")
 
     def equations(self, n_subapertures: int) -> tuple[np.ndarray, np.ndarray]:
-        n, left = self.n_fold, n_subapertures % self.n_fold
+        n = int(self.n_fold)
+        left = n_subapertures % n
         if left > 1:
             near = sorted({n_subapertures - left, n_subapertures - left + 1, n_subapertures - left + n} - {0})
             raise ValueError(

@@ -75,7 +75,7 @@ class AsymptoticMSE(nn.Module):
 
     def __init__(self, grid: Grid, object_psd: PSD, noise_psd: PSD, n_frames: int) -> None:
         super().__init__()
-        if not math.isfinite(n_frames) or n_frames != int(n_frames) or n_frames < 1:
+        if not float(n_frames).is_integer() or n_frames < 1:
             raise ValueError(f"n_frames is {n_frames}: it must be a whole number of at least 1")
         self.grid: Grid = grid
         self.n_frames: int = int(n_frames)

@@ -106,7 +106,7 @@ def amplitude_map(aperture: SparseAperture, n_pixels: int) -> tuple[Tensor, floa
     """
     require_one_mask(aperture)
     width, needed = max(aperture.mask_diameter, 2 * aperture.reach), least_pixels(aperture)
-    if n_pixels != int(n_pixels) or n_pixels < needed:
+    if not float(n_pixels).is_integer() or n_pixels < needed:
         raise ValueError(f"n_pixels is {n_pixels}: a hole must span two pixels, so at least {needed} are needed")
     step = width / (n_pixels - 2)
     # The pupil raster of a field of twice the width is wide enough for the spatial frequencies of any aperture.

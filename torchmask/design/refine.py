@@ -160,7 +160,7 @@ def refine_mask(
     if aperture.centers.ndim != 2:
         raise ValueError(f"centers has shape {tuple(aperture.centers.shape)}: refine_mask takes one mask, (N, 2)")
     require_constraints(constraints)
-    if budget != int(budget) or budget < 1:
+    if not float(budget).is_integer() or budget < 1:
         raise ValueError(f"budget is {budget}: it must be a whole number of evaluations, at least 1")
     still = aperture.still()
     holes = Holes(still, (InsideDisc(), NoOverlap(), *constraints))

@@ -91,10 +91,10 @@ def search_mask(
         raise ValueError(f"method is {method!r}: known methods are {', '.join(METHODS)}")
     if budget is None:
         # The cost of an evaluation grows with N, and searches should take about the same time.
-        budget = int(DEFAULT_BUDGETS[method] * min(1.0, 11 / n_subapertures)) if n_subapertures > 0 else 1
-    if budget != int(budget) or budget < 1:
+        budget = max(1, int(DEFAULT_BUDGETS[method] * min(1.0, 11 / n_subapertures))) if n_subapertures > 0 else 1
+    if not float(budget).is_integer() or budget < 1:
         raise ValueError(f"budget is {budget}: it must be a whole number of evaluations, at least 1")
-    if seed != int(seed) or seed < 0:
+    if not float(seed).is_integer() or seed < 0:
         raise ValueError(f"seed is {seed}: it must be a whole number that is not negative")
     holes, fallback = require_room(n_subapertures, mask_diameter, fill_factor, constraints, callback=callback)
     rng = np.random.default_rng(seed)

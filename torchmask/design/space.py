@@ -169,6 +169,6 @@ def _number(name: str, value: Any, whole: bool) -> int | float:
     unit = {"mask_diameter": ", in m", "wavelength": ", in m", "outer_scale": ", in m"}.get(name, "")
     least = "not negative" if name in _MAY_BE_ZERO else "positive"
     fits = math.isfinite(value) and (value > 0 or (value == 0 and name in _MAY_BE_ZERO))
-    if not fits or (whole and value != int(value)):
+    if not fits or (whole and not float(value).is_integer()):
         raise ValueError(f"{name} is {value}: it must be {'whole' if whole else 'finite'} and {least}{unit}")
     return int(value) if whole else float(value)

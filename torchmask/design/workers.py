@@ -29,7 +29,7 @@ def require_backend(backend: str, n_workers: int | None) -> None:
     """Raise ValueError unless `run_side_by_side` can use this backend with this number of workers."""
     if backend not in BACKENDS:
         raise ValueError(f"backend is {backend!r}: known backends are {', '.join(BACKENDS)}")
-    if n_workers is not None and (n_workers != int(n_workers) or n_workers < 1):
+    if n_workers is not None and (not float(n_workers).is_integer() or n_workers < 1):
         raise ValueError(f"n_workers is {n_workers}: it must be a whole number of at least 1, or None for all cores")
     try:
         import joblib  # noqa: F401

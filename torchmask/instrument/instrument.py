@@ -89,7 +89,7 @@ class Instrument:
             raise ValueError("wavelength is missing: give it in m, such as 550e-9")
         if (self.observing_time is None) == (self.n_frames is None):
             raise ValueError("give observing_time [s] or n_frames, and not both")
-        if self.n_frames is not None and (self.n_frames != int(self.n_frames) or self.n_frames < 1):
+        if self.n_frames is not None and (not float(self.n_frames).is_integer() or self.n_frames < 1):
             raise ValueError(f"n_frames is {self.n_frames}: it must be a whole number of at least 1")
         self._check_time()
         self._check_band()

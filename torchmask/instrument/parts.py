@@ -162,7 +162,7 @@ class Camera:
     """Time from the end of one exposure to the start of the next [s]."""
 
     def __post_init__(self) -> None:
-        if self.n_pixels != int(self.n_pixels) or self.n_pixels < 2:
+        if not float(self.n_pixels).is_integer() or self.n_pixels < 2:
             raise ValueError(f"camera.n_pixels is {self.n_pixels}: it must be a whole number of at least 2")
         require("camera.pixel_scale", self.pixel_scale, ", in arcsec")
         require("camera.readout_noise", self.readout_noise, ", in electrons rms", zero=True)

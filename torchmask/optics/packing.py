@@ -87,7 +87,7 @@ def hole_diameter(n_subapertures: int, mask_diameter: float, fill_factor: float)
     ValueError
         If a number is out of range or the holes cannot be packed; the message gives the largest fill factor.
     """
-    if n_subapertures != int(n_subapertures) or n_subapertures < 1:
+    if not float(n_subapertures).is_integer() or n_subapertures < 1:
         raise ValueError(f"n_subapertures is {n_subapertures}: it must be a whole number of at least 1")
     if not (math.isfinite(mask_diameter) and mask_diameter > 0):
         raise ValueError(f"mask_diameter is {mask_diameter}: it must be finite and positive, in m")

@@ -122,7 +122,7 @@ def sample_holes(
     if centers.dtype not in (torch.float32, torch.float64):
         raise TypeError(f"the centres are {centers.dtype}: float32 or float64 is needed, as by aperture.float()")
     finer = 1 if oversampling is None else oversampling
-    if finer != int(finer) or finer < 1:
+    if not float(finer).is_integer() or finer < 1:
         raise ValueError(f"oversampling is {oversampling}: it must be a whole number of at least 1")
     raster = (grid.shape[0] * finer, grid.shape[1] * finer)
     step = (grid.period / raster[0], grid.period / raster[1])

@@ -108,7 +108,7 @@ def myopic_bound(
         raise ValueError(f"image has shape {tuple(image.shape)}: it must be that of the grid, {grid.shape}")
     if not bool(torch.isfinite(image).all()):
         raise ValueError("image holds values that are not finite: replace them")
-    if not math.isfinite(n_frames) or n_frames != int(n_frames) or n_frames < 1:
+    if not float(n_frames).is_integer() or n_frames < 1:
         raise ValueError(f"n_frames is {n_frames}: it must be a whole number of at least 1")
     aperture = aperture.still().double()  # small differences of large sums: float32 would not do
     device = aperture.centers.device

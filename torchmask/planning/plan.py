@@ -144,7 +144,11 @@ def _positive(name: str, values: tuple[float, ...], unit: str) -> tuple[float, .
 
 
 def _whole(values: Sequence[int]) -> tuple[int, ...]:
-    if not values or not all(value == int(value) and value >= 2 for value in values) or len(set(values)) < len(values):
+    if (
+        not values
+        or not all(float(value).is_integer() and value >= 2 for value in values)
+        or len(set(values)) < len(values)
+    ):
         raise ValueError(f"n_subapertures are {tuple(values)}: at least one is needed, none twice, whole, at least 2")
     return tuple(sorted(int(value) for value in values))
 

@@ -160,9 +160,9 @@ class StackDataset(Dataset[dict[str, Tensor]]):
         seed: int = 0,
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        if length != int(length) or length < 1:
+        if not float(length).is_integer() or length < 1:
             raise ValueError(f"length is {length}: it must be a whole number of at least 1")
-        if seed != int(seed) or seed < 0:
+        if not float(seed).is_integer() or seed < 0:
             raise ValueError(f"seed is {seed}: it must be a whole number of at least 0")
         if scene is not None and not callable(scene):
             raise TypeError(f"scene is a {type(scene).__name__}: it must be a function of an index and a generator")

@@ -216,7 +216,7 @@ def _check(scene: Tensor, aperture: Aperture, grid: Grid, n_frames: int) -> None
         raise ValueError("scene is black: scale it so that its sum is the number of photons per frame")
     if aperture.centers.ndim != 2:
         raise ValueError(f"aperture is a population {tuple(aperture.centers.shape[:-2])}: simulate one at a time")
-    if n_frames != int(n_frames) or n_frames < 1:
+    if not float(n_frames).is_integer() or n_frames < 1:
         raise ValueError(f"n_frames is {n_frames}: it must be a whole number of at least 1")
 
 
