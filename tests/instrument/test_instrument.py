@@ -176,11 +176,17 @@ def test_observations_that_cannot_be_are_refused(changes, said):
         (Telescope, {"diameter": 1.0, "central_obstruction": 1.0}, "less than the diameter, 1 m"),
         (Telescope, {"diameter": 1.0, "throughput": 1.5}, "at most 1"),
         (Telescope, {"diameter": 1.0, "vane_width": 0.1}, r"vane_angles are \[\] degrees"),
-        (Telescope, {"diameter": 1.0, "vane_width": -0.1, "vane_angles": (0.0,)}, r"vane_width is -0.1: .*in m"),
+        (
+            Telescope,
+            {"diameter": 1.0, "vane_width": -0.1, "vane_angles": (0.0,)},
+            r"telescope.vane_width is -0.1: .*in m",
+        ),
+        (Telescope, {"diameter": 1.0, "vane_width": 0.1, "vane_angles": (math.nan,)}, "hold nan: .* in degrees"),
         (Telescope, {"diameter": 1.0, "vane_width": 0.1, "vane_angles": (0.0, 5.0)}, "vanes 5 degrees apart"),
         (Source, {}, "and not both"),
         (Source, {"magnitude": 1.0, "photon_rate": 1.0}, "and not both"),
         (Source, {"magnitude": math.nan}, "magnitude is nan"),
+        (Source, {"magnitude": 1.0, "system": "vega"}, "source.system is 'vega': known systems are AB and Vega"),
         (Source, {"photon_rate": -1.0}, r"photons / \(s m\^2\)"),
         (Source, {"magnitude": 1.0, "temperature": 0.0}, "in K"),
         (Source, {"magnitude": 1.0, "size": 0.0}, "in arcsec"),
@@ -191,7 +197,8 @@ def test_observations_that_cannot_be_are_refused(changes, said):
         (Camera, {"n_pixels": math.inf}, "camera.n_pixels is inf: it must be a whole number"),
         (Camera, {"readout_noise": -1.0}, "in electrons rms"),
         (Camera, {"pixel_scale": 0.0}, "in arcsec"),
-        (Camera, {"pixel_fill": 2.0}, "fill_factor"),
+        (Camera, {"pixel_fill": 2.0}, "camera.pixel_fill is 2.0: .* at most 1"),
+        (Camera, {"pixel_fill": -0.5}, "camera.pixel_fill is -0.5"),
     ],
 )
 def test_parts_that_cannot_be_are_refused(part, numbers, said):

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from torchmask.optics.aperture import FullAperture
 from torchmask.optics.detector import Detector
 from torchmask.optics.pixel import PixelResponse, square_pixel
+
+System = Literal["AB", "Vega"]
 
 
 def require(name: str, value: float | None, unit: str, zero: bool = False, most: float = math.inf) -> None:
@@ -53,11 +55,14 @@ class Telescope:
                 f"telescope.central_obstruction is {self.central_obstruction}: it must be at least 0 and less than the "
                 f"diameter, {self.diameter:g} m"
             )
-        require("vane_width", self.vane_width, ", in m", zero=True, most=self.diameter)
+        require("telescope.vane_width", self.vane_width, ", in m", zero=True, most=self.diameter)
+        for angle in self.vane_angles:
+            if not math.isfinite(angle):
+                raise ValueError(f"telescope.vane_angles hold {angle}: they must be finite, in degrees")
         if bool(self.vane_width) != bool(self.vane_angles):
             raise ValueError(
-                f"vane_width is {self.vane_width:g} m and vane_angles are {list(self.vane_angles)} degrees: vanes need "
-                "both, a width and angles"
+                f"telescope.vane_width is {self.vane_width:g} m and vane_angles are {list(self.vane_angles)} degrees: "
+                "vanes need both, a width and angles"
             )
         self.pupil()  # raises for vanes that leave no opening
 
@@ -88,7 +93,7 @@ class Source:
 
     magnitude: float | None = None
     """Magnitude of the whole target in the band, as seen from the site."""
-    system: Literal["AB", "Vega"] = "AB"
+    system: System = "AB"
     """Magnitude system; Vega is known for bessell and twomass filters."""
     photon_rate: float | None = None
     """Photons per second and square metre that the band passes, instead of a magnitude."""
@@ -102,6 +107,8 @@ class Source:
     def __post_init__(self) -> None:
         if (self.magnitude is None) == (self.photon_rate is None):
             raise ValueError("source: give either its magnitude or its photon_rate [1 / (s m^2)], and not both")
+        if self.system not in get_args(System):
+            raise ValueError(f"source.system is {self.system!r}: known systems are {' and '.join(get_args(System))}")
         if self.magnitude is not None and not math.isfinite(self.magnitude):
             raise ValueError(f"source.magnitude is {self.magnitude}: it must be finite")
         require("source.photon_rate", self.photon_rate, ", in photons / (s m^2)")
@@ -167,7 +174,7 @@ class Camera:
         require("camera.pixel_scale", self.pixel_scale, ", in arcsec")
         require("camera.readout_noise", self.readout_noise, ", in electrons rms", zero=True)
         require("camera.readout_time", self.readout_time, ", in s", zero=True)
-        self.detector()  # raises for a fill factor that cannot be
+        require("camera.pixel_fill", self.pixel_fill, "", zero=True, most=1.0)
 
     @property
     def pixel(self) -> PixelResponse | None:
