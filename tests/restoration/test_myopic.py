@@ -344,8 +344,11 @@ def test_an_object_beyond_the_field_is_noticed(restoring):
         ({"outer_scale": math.inf}, "outer_scale is inf"),
         ({"readout_noise": math.nan}, "readout_noise"),
         ({"max_iterations": 0}, "max_iterations"),
+        ({"max_iterations": math.nan}, "max_iterations is nan"),
         ({"tolerance": -1.0}, "tolerance"),
         ({"n_modes": 0}, "n_modes is 0"),
+        ({"n_modes": 3.5}, r"n_modes is 3\.5: it must be a whole number"),
+        ({"dtype": torch.float16}, r"dtype is torch\.float16: take torch\.float32"),
         ({"static_modes": -1}, "static_modes is -1"),
     ],
 )

@@ -158,6 +158,7 @@ def test_says_why_it_stopped_and_keeps_to_its_budgets():
     assert seen[-1] == (found.value, found.n_evaluations)
     assert all(later[0] < earlier[0] for earlier, later in itertools.pairwise(seen))
     assert minimize_bounded(cost, start, lower, max_iterations=50, max_evaluations=7).n_evaluations == 7
+    assert minimize_bounded(cost, start, lower, max_iterations=50, max_evaluations=0).n_evaluations == 1  # at the start
     # every variable pushed on its bound
     at_rest = minimize_bounded(lambda x: (float(x.sum()), torch.ones_like(x)), lower, lower, max_iterations=5)
     assert at_rest.converged

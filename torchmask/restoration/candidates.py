@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchmask.restoration.calibration import calibrate
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.state import Calibration, State
 
@@ -64,9 +63,9 @@ def play_stage(
     candidates: Candidates,
     n_kept: int,
     descend: Descend,
-    recalibrate: Descend = calibrate,
+    recalibrate: Descend,
 ) -> Candidates:
-    """Play one stage: all candidates descend and are calibrated, and the best `n_kept` of each frame are kept.
+    """Play one stage: all candidates descend and are recalibrated, and the best `n_kept` of each frame are kept.
 
     `objective` is that of the frames themselves.
     """

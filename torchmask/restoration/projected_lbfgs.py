@@ -178,7 +178,7 @@ def minimize_bounded(
     tensor([1., 0.], dtype=torch.float64)
     """
     require_vectors(start, lower)
-    budget = max_evaluations or 4 * max_iterations
+    budget = 4 * max_iterations if max_evaluations is None else max_evaluations
     x = torch.maximum(start, lower)
     value, gradient = cost(x)
     require_finite(value)

@@ -45,7 +45,8 @@ class ModelRecipe:
     Raises
     ------
     ValueError
-        If several apertures are given, a number is out of range, or holes have more whitened modes than samples.
+        If several apertures are given, a number is out of range, holes have more whitened modes than samples, or the
+        data type is of half precision.
     """
 
     aperture: Aperture
@@ -66,11 +67,13 @@ class ModelRecipe:
         shape = tuple(self.aperture.centers.shape)
         if len(shape) != 2:
             raise ValueError(f"centers has shape {shape}: one mask (n_subapertures, 2) is needed")
+        if self.dtype in (torch.float16, torch.bfloat16):  # FFTs do not know them, and frames would overflow
+            raise ValueError(f"dtype is {self.dtype}: take torch.float32 or torch.float64")
         for name, value in (("r0", self.r0), ("outer_scale", self.outer_scale)):
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{name} is {value}: it must be finite and positive, in m")
         for name, count, least in (("n_modes", self.frame_modes, 1), ("static_modes", self.static_modes, 0)):
-            if count < least:
+            if not float(count).is_integer() or count < least:
                 raise ValueError(f"{name} is {count}: it must be a whole number of at least {least}")
         self._check_exposure()
         if self.whitened and not self.aperture.is_full:  # whose usual modes are many, and quick to make

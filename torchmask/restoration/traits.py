@@ -84,7 +84,7 @@ def check_numbers(readout_noise: float | None, max_iterations: int, tolerance: f
     """Raise ValueError for a read-out noise [electrons rms], a number of iterations or a tolerance out of range."""
     if readout_noise is not None and not (math.isfinite(readout_noise) and readout_noise >= 0):
         raise ValueError(f"readout_noise is {readout_noise}: it must be finite and at least 0, in electrons rms")
-    if max_iterations < 1:
+    if not max_iterations >= 1:
         raise ValueError(f"max_iterations is {max_iterations}: it must be at least 1")
     if not tolerance >= 0:
         raise ValueError(f"tolerance is {tolerance}: it must be at least 0, a fraction of the cost")
