@@ -16,7 +16,7 @@ from torchmask.grid import Grid
 from torchmask.optics import catalog
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.psf import psf_from_samples
-from torchmask.optics.shapes import Disc, Hexagon, Square
+from torchmask.optics.shapes import Disc, Hexagon, Polygon, Square
 
 
 def mask_of(points, hole=0.1, diameter=1.0, **keywords):
@@ -151,6 +151,23 @@ def test_psf_width_of_two_holes():
     assert report.fwhm_min == pytest.approx(2.0 / (2 * baseline), rel=(hole / baseline) ** 2)
     assert report.fwhm_max == pytest.approx(2.0 * 1.0289940 / hole, rel=1e-6)
     assert report.fwhm_min < report.fwhm < report.fwhm_max
+
+
+@dataclasses.dataclass(frozen=True)
+class Slit(Polygon):
+    """A fifth as wide along y as along x."""
+
+    name = "slit"
+
+    def strips(self):
+        return (0.0, 1.0), (math.pi / 2, 0.2)
+
+
+def test_psf_width_of_holes_narrower_than_their_diameter():
+    """Across the baseline sinc^2 = 1/2 at 0.44295 over the width of a slit, far beyond that of a round hole."""
+    report = analyse_redundancy(SparseAperture([[-0.4, 0.0], [0.4, 0.0]], 0.1, 1.0, shape=Slit()))
+    assert report.fwhm_max == pytest.approx(2 * 0.4429465 / (0.2 * 0.1), rel=1e-6)
+    assert report.fwhm_min == pytest.approx(1 / (2 * 0.8), rel=(0.1 / 0.8) ** 2)
 
 
 def test_side_lobe_of_two_holes():

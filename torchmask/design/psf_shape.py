@@ -38,11 +38,15 @@ def psf_widths(centers: Array, aperture: Aperture) -> Array:
     """Return the full width at half maximum in directions all around [1/m]."""
     angles = np.arange(_DIRECTIONS) * np.pi / _DIRECTIONS
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-    # The PSF of a hole drops to one half within 0.52 / d. Steps much smaller than a fringe find the first crossing.
+    # The PSF of a hole as wide as its diameter drops to one half within 0.52 / d, that of a narrower one further out.
+    # Steps much smaller than a fringe find the first crossing.
     limit, step = 0.6 / aperture.subaperture_diameter, 0.02 / aperture.extent
-    radii = np.arange(1, math.ceil(limit / step) + 1) * step
-    below = np.stack([mask_psf(radii[:, None] * e, centers, aperture) for e in directions]) < 0.5
-    high = radii[below.argmax(axis=1)]
+    below = np.zeros((1, 0), dtype=bool)
+    while not below.any(axis=1).all():
+        radii = np.arange(1, math.ceil(limit / step) + 1) * step
+        below = np.stack([mask_psf(radii[:, None] * e, centers, aperture) for e in directions]) < 0.5
+        limit *= 2
+    high = step * (below.argmax(axis=1) + 1)
     low = high - step
     for _ in range(40):
         middle = (low + high) / 2
