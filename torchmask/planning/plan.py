@@ -112,19 +112,10 @@ def plan_observation(
     if not exposed:
         raise ValueError(f"no exposure is short enough: {left_out[-1]}")
     if aperture is None:
-        masks = _search(
-            instrument,
-            tuple(
-                itertools.product(
-                    _whole(n_subapertures),
-                    _positive("hole_diameters", _default(hole_diameters, _HOLES, instrument.site.r0), "m"),
-                )
-            ),
-            _rules(instrument, constraints),
-            {"budget": budget, "seed": seed, "n_frequencies": n_frequencies},
-            left_out,
-            callback,
-        )
+        numbers, sizes = _whole(n_subapertures), _default(hole_diameters, _HOLES, instrument.site.r0)
+        points = tuple(itertools.product(numbers, _positive("hole_diameters", sizes, "m")))
+        settings = {"budget": budget, "seed": seed, "n_frequencies": n_frequencies}
+        masks = _search(instrument, points, _rules(instrument, constraints), settings, left_out, callback)
     else:
         masks = {(aperture.n_subapertures, aperture.subaperture_diameter): aperture}
     if not masks:
