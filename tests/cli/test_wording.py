@@ -24,6 +24,7 @@ class Options:
     n_frequencies: int = 64
     n_pixels: int = 128
     min_gap: float = 0.0
+    out: Path | None = None
     rim_margin: float = 0.0
     gain: float | None = None
     weights: tuple[float, ...] = ()
@@ -51,6 +52,8 @@ class Options:
         ("imaging.d_over_r0 is 0.0: no", {"imaging": Imaging(d_over_r0=0.0)}, "--imaging.d-over-r0 is 0.0: no"),
         ("n_photons is 0.0: no", {"imaging": Imaging(n_photons=0.0)}, "--imaging.n-photons is 0.0: no"),
         ("weights are [1.0, -2.0]: no", {"weights": (1.0, -2.0)}, "--weights are [1.0, -2.0]: no"),
+        ("gap is 0.0: no", {"min_gap": 0.0, "out": Path("runs/night-0")}, "gap is 0.0: no"),
+        ("n_photons is 0.0: no", {"out": Path("night-0"), "imaging": Imaging(0.0)}, "--imaging.n-photons is 0.0: no"),
         ("weights are given without wavelengths: no", {}, "--weights are given without wavelengths: no"),
         ("a.fits: seed is 3: no", {"seed": 3}, "a.fits: --seed is 3: no"),
         (

@@ -8,6 +8,7 @@ import re
 import typing
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 _START = r"(?:^|(?<=: ))"  # of a message, or of its part after the name of a file
@@ -105,7 +106,7 @@ def _flatten(options: Any, prefix: str = "--") -> Iterator[Option]:
         if dataclasses.is_dataclass(value):
             yield from _flatten(value, f"{flag}.")
         elif tyro.conf.Positional not in typing.get_args(hints[item.name]):
-            numbers = [] if isinstance(value, bool) else _numbers(str(value))
+            numbers = [] if isinstance(value, (bool, Path)) else _numbers(str(value))  # those in a path are names
             yield Option(flag, item.name, numbers, value != item.default, isinstance(value, bool))
 
 
