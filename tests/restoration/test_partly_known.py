@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from torch import Tensor
 
 from torchmask.grid import Grid
 from torchmask.metrics import relative_error
@@ -79,6 +80,17 @@ def test_with_a_known_object(exposures):
     fits = refined.chi_square < 1.3  # one frame may stay in a local minimum, which it shows
     assert int(fits.sum()) >= 7
     assert error(refined.coefficients[fits], true[fits]) < 0.2 * ERROR
+
+
+def test_what_is_known_may_be_arrays(exposures):
+    mask, scene, frames, _, measured = exposures
+    method = MyopicDeconvolution(mask, GRID, N_MODES, max_iterations=3)
+    told = {"coefficients": measured, "covariance": ERROR**2 * torch.eye(15, dtype=torch.float64)}
+    for given in (told, {"coefficients": measured}, {"known_object": scene}):
+        tensors = method.restore(frames, **given)
+        for kind in (Tensor.numpy, Tensor.tolist):
+            same = method.restore(frames, **{name: kind(values) for name, values in given.items()})
+            assert torch.equal(same.coefficients, tensors.coefficients)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -51,6 +52,18 @@ def test_what_is_known_must_leave_something_open():
         Known(covariance=SOMETHING).check()
 
 
+def test_what_is_known_may_be_arrays_and_lists_too():
+    known = Known.of([[[1.0, 2.0]]], np.eye(2, dtype=">f4")[::-1], None)
+    assert known.coefficients.tolist() == [[[1.0, 2.0]]]
+    assert known.covariance.tolist() == [[0.0, 1.0], [1.0, 0.0]]
+    assert {known.coefficients.dtype, known.covariance.dtype} == {torch.float64}
+    assert known.object is None
+    with pytest.raises(ValueError, match=r"known_object is torch\.complex128: it must be real"):
+        Known.of(None, None, np.ones((2, 2), complex))
+    with pytest.raises(ValueError, match="covariance is given without coefficients"):
+        Known.of(None, np.eye(2), None)
+
+
 def test_expected_parameters_are_those_of_the_coefficients(explained):
     objective, state = explained
     basis = objective.model.aberrations
@@ -59,7 +72,7 @@ def test_expected_parameters_are_those_of_the_coefficients(explained):
     torch.testing.assert_close(found, state.z, rtol=0, atol=1e-9)
     with pytest.raises(ValueError, match=r"coefficients has shape \(3, 5, 3\): it must be \(4, 5, 3\)"):
         expected_parameters(objective, basis.coefficients(state.z[:3]))
-    with pytest.raises(ValueError, match="coefficients hold values that are not finite"):
+    with pytest.raises(ValueError, match="coefficients hold values that are not finite: leave out the frames"):
         expected_parameters(objective, basis.coefficients(state.z) / 0)
 
 
@@ -89,7 +102,7 @@ def test_a_known_object_is_scaled_to_the_frames(explained):
     with pytest.raises(ValueError, match=r"known_object has shape \(31, 32\): it must be \(32, 32\)"):
         first_state(objective, state.z, known[1:], 30.0, 1.0)
     for nothing in (0 * known, known / 0):
-        with pytest.raises(ValueError, match="known_object holds values that are not finite, or no light"):
+        with pytest.raises(ValueError, match=r"known_object holds .* not finite, or no light: give the light"):
             first_state(objective, state.z, nothing, 30.0, 1.0)
 
 

@@ -204,9 +204,9 @@ class MyopicDeconvolution:
         *,
         valid: Array | None = None,
         errors: Array | None = None,
-        coefficients: Tensor | None = None,
-        covariance: Tensor | None = None,
-        known_object: Tensor | None = None,
+        coefficients: Array | None = None,
+        covariance: Array | None = None,
+        known_object: Array | None = None,
         start: RestorationResult | None = None,
         n_samples: int = 0,
         seed: int = 0,
@@ -224,12 +224,12 @@ class MyopicDeconvolution:
         errors : (H, W) or (T, H, W) tensor or array, optional
             Standard deviations of the pixels' noise [electrons]. Photon noise in them, which follows the frames, is
             evened out (`even_photons`), so that bright pixels keep their weight. None: the same for all pixels.
-        coefficients : (T, N, J) tensor, optional
+        coefficients : (T, N, J) tensor or array, optional
             Known aberrations [rad rms], which stay fixed: non-blind deconvolution.
-        covariance : (N J, N J) tensor, optional
+        covariance : (N J, N J) tensor or array, optional
             Covariance of the errors of `coefficients` [rad^2], ordered by sub-aperture, the same for all frames. The
             coefficients are then refined, with these errors as their prior. Errors below 1 mrad count as 1 mrad.
-        known_object : (H, W) tensor, optional
+        known_object : (H, W) tensor or array, optional
             Known object, up to its flux, which stays fixed: only the aberrations are restored.
         start : RestorationResult, optional
             Earlier result to continue from (warm start). It may come from the first T' <= T of these frames: the
@@ -262,9 +262,9 @@ class MyopicDeconvolution:
         keep_freed_memory()
         stack = self._stack(frames, valid, errors)
         (look := look_at_mask(stack.frames, self.recipe.aperture, self.recipe.grid)).warn(stacklevel=2)
-        (known := Known(coefficients, covariance, known_object)).check()
-        model = (self.model if covariance is None else self.recipe.estimated_model(covariance)).beside(stack.free)
-        stack = stack.to(model.dtype, model.device)
+        known = Known.of(coefficients, covariance, known_object)
+        model = self.model if known.covariance is None else self.recipe.estimated_model(known.covariance)
+        model, stack = model.beside(stack.free), stack.to(model.dtype, model.device)
         with torch.inference_mode(False), each_on_a_core(model.device) as parallel:
             objective = MyopicObjective(
                 model, stack.frames, stack.precision, self.prior, free=known.free, parallel=parallel

@@ -8,9 +8,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from torchmask.io import as_tensor
 from torchmask.restoration.calibration import calibrate, share_noise_inflation
 from torchmask.restoration.candidates import Candidates, play_stage, several
 from torchmask.restoration.descent import Variables, descend
+from torchmask.restoration.frames import Array
 from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.result import RestorationResult
@@ -31,6 +33,18 @@ class Known:
     coefficients: Tensor | None = None
     covariance: Tensor | None = None
     object: Tensor | None = None
+
+    @classmethod
+    def of(cls, coefficients: Array | None, covariance: Array | None, known_object: Array | None) -> Known:
+        """Return what is known, as tensors. Raises ValueError if they are complex, and as `check`."""
+        given = {"coefficients": coefficients, "covariance": covariance, "known_object": known_object}
+        held = {name: None if values is None else as_tensor(values) for name, values in given.items()}
+        for name, values in held.items():
+            if values is not None and values.is_complex():
+                raise ValueError(f"{name} is {values.dtype}: it must be real, give its real part")
+        known = cls(*(None if values is None else values.detach().double() for values in held.values()))
+        known.check()
+        return known
 
     def check(self) -> None:
         """Raise ValueError if nothing is left to restore, or a covariance comes without coefficients."""
@@ -77,7 +91,7 @@ def expected_parameters(objective: MyopicObjective, coefficients: Tensor | None)
     if tuple(coefficients.shape) != expected:
         raise ValueError(f"coefficients has shape {tuple(coefficients.shape)}: it must be {expected}")
     if not bool(torch.isfinite(coefficients).all()):
-        raise ValueError("coefficients hold values that are not finite")
+        raise ValueError("coefficients hold values that are not finite: leave out the frames that have them")
     return basis.parameters_of(coefficients)
 
 
@@ -97,7 +111,10 @@ def first_state(
             raise ValueError(f"known_object has shape {tuple(known_object.shape)}: it must be {window.grid.shape}")
         image = window.embed(known_object.to(image).clamp(min=0))
         if not 0 < float(image.sum()) < math.inf:
-            raise ValueError("known_object holds values that are not finite, or no light")
+            raise ValueError(
+                "known_object holds values that are not finite, or no light: give the light of each pixel, 0 where it "
+                "is dark"
+            )
         with torch.no_grad():
             image = image / float(model(image, z).mean())
     inflation = torch.full_like(neutral.transmission, first_inflation)
