@@ -1,5 +1,7 @@
 """The numbers of a restoration: what a tournament may look like, and what is refused."""
 
+import math
+
 import pytest
 
 from torchmask.restoration.schedule import Schedule
@@ -36,7 +38,42 @@ def test_refuses_candidates_that_do_not_halve(candidates):
         Schedule(candidates=candidates)
 
 
-@pytest.mark.parametrize("name", ["segment", "start_iterations", "starts", "averaged"])
-def test_refuses_counts_below_one(name):
-    with pytest.raises(ValueError, match=f"{name} is 0: it must be at least 1"):
-        Schedule(**{name: 0})
+@pytest.mark.parametrize(
+    ("name", "wrong", "range_"),
+    [
+        ("segment", 0, "a whole number from 1 to inf"),
+        ("segment", 2.5, "a whole number from 1 to inf"),
+        ("starts", 0, "a whole number from 1 to inf"),
+        ("doubtful_starts", 0, "a whole number from 1 to inf"),
+        ("averaged", 0, "a whole number from 1 to inf"),
+        ("rounds", 0, "a whole number from 1 to inf"),
+        ("renewal", 0, "a whole number from 1 to inf"),
+        ("moves", -1, "a whole number from 0 to inf"),
+        ("restarts", -1, "a whole number from 0 to inf"),
+        ("twins", -1, "a whole number from 0 to inf"),
+        ("reflections", math.inf, "a whole number from 0 to inf"),
+        ("memory", 1.5, "a number from 0 to 1"),
+        ("memory", math.nan, "a number from 0 to 1"),
+        ("outlying", -1.0, "a number from 0 to inf"),
+        ("chance", math.nan, "a number from -inf to inf"),
+        ("start_rms", math.inf, r"a number from 0 to 1\.8e\+308"),
+        ("first_inflation", 0.0, "a number from 2.23e-308 to inf"),
+    ],
+)
+def test_refuses_numbers_out_of_range(name, wrong, range_):
+    with pytest.raises(ValueError, match=f"{name} is {wrong}: it must be {range_}"):
+        Schedule(**{name: wrong})
+
+
+def test_refuses_stages_and_steps_that_cannot_be():
+    with pytest.raises(ValueError, match=r"candidates is \(\(2, 0\),\): each stage needs at least 1 iteration"):
+        Schedule(candidates=((2, 0),))
+    for step in (0.0, math.nan):
+        with pytest.raises(ValueError, match=r"pixel_steps is .*: they must be finite and positive, in pixels"):
+            Schedule(pixel_steps=(0.4, step))
+
+
+def test_what_switches_a_step_off_is_allowed():
+    off = {"faint": math.inf, "chance": math.inf, "alike": -1.0, "nearly_at_rest": -math.inf, "twins": 0, "restarts": 0}
+    assert Schedule(**off, last_segments=0, retrievals=0, first_inflation=math.inf).twins == 0
+    assert Schedule.plain().averaged == 1

@@ -3,15 +3,29 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+import sys
+from dataclasses import dataclass, fields
 from itertools import pairwise
+from numbers import Integral
 
 _NO_LIMIT = 10**9  # iterations
+
+# Ranges of the numbers that are not simply at least 0, with both ends.
+_COUNTS = ("segment", "start_iterations", "starts", "doubtful_starts", "faint_starts", "averaged", "rounds", "renewal")
+_RANGES = {
+    **dict.fromkeys(_COUNTS, (1, math.inf)),
+    **dict.fromkeys(("nearly_at_rest", "chance", "alike"), (-math.inf, math.inf)),  # negative ones never apply
+    **dict.fromkeys(("start_rms", "start_rms_unwhitened", "move_size"), (0, sys.float_info.max)),
+    **dict.fromkeys(("memory", "farthest"), (0, 1)),
+    "first_inflation": (sys.float_info.min, math.inf),  # as it divides
+}
 
 
 @dataclass(frozen=True)
 class Schedule:
     """Numbers that control the course of a restoration. How the defaults were chosen is told in docs/tried.md.
+
+    Raises ValueError, which names the number, if one is out of its range.
 
     segment : number of iterations between two recalibrations of scales, transmissions, noise and turbulence
     recalibrates : whether to recalibrate transmissions, noise and turbulence; the scales of the variables always are
@@ -124,9 +138,20 @@ class Schedule:
         stages = [number for number, _ in self.candidates] + [1]
         if any(later * 2 != earlier for earlier, later in pairwise(stages)):
             raise ValueError(f"candidates is {self.candidates}: each stage must have half as many as the one before it")
-        for name in ("segment", "start_iterations", "starts", "faint_starts", "averaged"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}: it must be at least 1")
+        if not all(isinstance(count, Integral) and count >= 1 for _, count in self.candidates):
+            raise ValueError(f"candidates is {self.candidates}: each stage needs at least 1 iteration, a whole number")
+        if not all(0 < step < math.inf for step in self.pixel_steps):
+            raise ValueError(f"pixel_steps is {self.pixel_steps}: they must be finite and positive, in pixels")
+        for item in fields(self):
+            if item.type in ("int", "float"):
+                self._check(item.name, whole=item.type == "int")
+
+    def _check(self, name: str, whole: bool) -> None:
+        """Raise ValueError unless the number of this name is in its range, and whole if it has to be."""
+        value, (least, most) = getattr(self, name), _RANGES.get(name, (0, math.inf))
+        if not least <= value <= most or (whole and not isinstance(value, Integral)):
+            kind = "a whole number" if whole else "a number"
+            raise ValueError(f"{name} is {value}: it must be {kind} from {least:.3g} to {most:.3g}")
 
     @classmethod
     def plain(cls) -> Schedule:
