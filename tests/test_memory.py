@@ -9,6 +9,9 @@ import sys
 
 import pytest
 
+from torchmask import memory
+from torchmask.memory import require_memory
+
 _COUNT_FAULTS = """
 import resource, sys, numpy
 from torchmask.memory import keep_freed_memory
@@ -33,3 +36,19 @@ def test_freed_memory_stays_with_the_process():
     pages = 20 * 40 * 100_000 * 8 // 4096  # of all arrays together
     assert count_faults("keep") < pages / 100
     assert count_faults("leave") > pages / 10  # what there is to gain
+
+
+def test_what_exceeds_the_memory_is_refused_with_the_most_that_fits(monkeypatch):
+    monkeypatch.setattr(memory, "_machine_memory", lambda: 8.0 * 2**30)
+    require_memory("n_pixels", 2**15, 8.0 * 2**30, power=2)
+    with pytest.raises(
+        ValueError,
+        match=r"n_pixels is 65536: that takes at least 32 GiB of memory, and this machine has 8 GiB, enough for 32768",
+    ):
+        require_memory("n_pixels", 2**16, 8.0 * 2**32, power=2)
+    with pytest.raises(ValueError, match=r"the separation \[arcsec\] is 2\.5: .* enough for 1\.249 at most"):
+        require_memory("the separation [arcsec]", 2.5, 2.0**34)
+
+
+def test_a_machine_tells_its_memory():
+    assert memory._machine_memory() > 2**28

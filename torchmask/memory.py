@@ -1,6 +1,9 @@
-"""Keep memory that an evaluation frees in the process, where the next one can reuse it."""
+"""Memory of this machine: refuse what exceeds it before any work, and keep what an evaluation frees in the process."""
 
 from __future__ import annotations
+
+import math
+import os
 
 import torch
 
@@ -16,3 +19,40 @@ def keep_freed_memory() -> None:
     one large block raises the threshold; its pages are never touched. Other allocators are not affected.
     """
     torch.empty(_LARGEST, dtype=torch.uint8, device="cpu")
+
+
+def require_memory(name: str, value: float, n_bytes: float, power: int = 1) -> None:
+    """Raise ValueError if arrays exceed the memory of this machine; the message says what of `value` it would hold.
+
+    Parameters
+    ----------
+    name : str
+        Name of the number on which the size of the arrays depends.
+    value : float
+        That number.
+    n_bytes : float
+        Size of the arrays, or a lower limit on it [bytes].
+    power : int
+        Power of the number with which the size grows.
+
+    Examples
+    --------
+    >>> require_memory("n_pixels", 1000, 8.0 * 1000**2, power=2)
+    """
+    held = _machine_memory()
+    if n_bytes <= held:
+        return
+    most = value * (held / n_bytes) ** (1 / power)
+    told, fits = (value, math.floor(most)) if isinstance(value, int) else (f"{value:.6g}", f"{0.9995 * most:.4g}")
+    raise ValueError(
+        f"{name} is {told}: that takes at least {n_bytes / 2**30:.4g} GiB of memory, and this machine has "
+        f"{held / 2**30:.4g} GiB, enough for {fits} at most"
+    )
+
+
+def _machine_memory() -> float:
+    """Return the memory of this machine [bytes], infinite where the system does not tell."""
+    try:
+        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    except (AttributeError, ValueError, OSError):  # Windows has no sysconf
+        return math.inf

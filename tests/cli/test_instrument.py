@@ -273,6 +273,12 @@ def test_a_plan_is_made_of_the_whole_file(folder):
     assert plan.instrument_of(parsed) == expected
 
 
+@pytest.mark.parametrize("given", [["--mask-diameter", "0"], ["--fill-factor", "0.2"], ["--mirrored"]])
+def test_a_plan_of_searched_masks_refuses_options_of_one_that_exists(given, folder, capsys):
+    assert main(["plan", "--instrument", str(folder / "instrument.json"), *given]) == 1
+    assert f"{given[0]} is for a mask that exists: give --mask, or leave it out" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("command", ["plan", "design", "rank", "simulate"])
 def test_files_that_are_no_instrument_are_refused(command, folder, capsys):
     assert main([command, "--instrument", str(folder / "mask.json")]) == 1

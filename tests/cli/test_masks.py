@@ -52,6 +52,9 @@ def test_drawings_are_as_large_as_the_scale_says(tmp_path):
         (["--scale", "5", "--out", "NEW.json"], "--scale is for drawings"),
         (["--scale", "-5", "--out", "NEW.dxf"], "scale is -5.0"),
         (["--out", "NEW.pdf"], "does not end in one of"),
+        (["--scale", "5"], r"--scale is for a drawing: give --out with a file that ends in \.dxf or \.svg"),
+        (["--mask-diameter", "0"], r"--mask-diameter is 0\.0: it must be finite and positive"),
+        (["--fill-factor", "0"], r"--fill-factor is 0\.0: it must be finite and positive"),
         (["--fill-factor", "0.9", "--out", "NEW.dxf"], r"9 pairs of holes overlap: .* --allow-overlap"),
     ],
 )

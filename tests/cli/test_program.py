@@ -100,6 +100,18 @@ def test_a_mistake_is_one_line_and_1_and_a_traceback_with_debug(capsys, error):
         status(fails(error), "--debug")
 
 
+@pytest.mark.parametrize("error", [MemoryError("8 TiB"), RuntimeError("can't allocate memory: you tried 8 TiB")])
+def test_too_little_memory_is_one_line_and_1(capsys, error):
+    assert status(fails(error)) == 1
+    err = capsys.readouterr().err
+    assert err.startswith("program: error: memory is short, take fewer or smaller frames")
+    assert err.endswith("8 TiB\n")
+    with pytest.raises(type(error), match="8 TiB"):
+        status(fails(error), "--debug")
+    with pytest.raises(RuntimeError, match="no convergence"):
+        status(fails(RuntimeError("no convergence")))
+
+
 def test_a_mistake_of_the_program_itself_keeps_its_traceback():
     with pytest.raises(ZeroDivisionError):
         status(fails(ZeroDivisionError()))

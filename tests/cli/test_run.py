@@ -67,8 +67,9 @@ def test_without_a_name_it_is_that_of_the_program_and_the_time(tmp_path, monkeyp
 
 
 def test_what_is_refused_before_any_work_leaves_nothing(tmp_path, capsys):
-    fail(RunOptions(out=tmp_path / "new" / "run"), ValueError("no such mask"))
-    assert list(tmp_path.iterdir()) == []
+    for error in (ValueError("no such mask"), MemoryError(), RuntimeError("can't allocate memory")):
+        fail(RunOptions(out=tmp_path / "new" / "run"), error)
+        assert list(tmp_path.iterdir()) == []
     assert capsys.readouterr() == ("", "")
 
 

@@ -522,6 +522,12 @@ def test_numbers_of_frames_that_are_none_are_refused(n_frames: float) -> None:
         AsymptoticMSE(grid_of(16), PowerLawPSD(1.5, 1.0), NoisePSD(1.0), n_frames)  # type: ignore[arg-type]
 
 
+def test_a_grid_beyond_the_memory_is_refused() -> None:
+    grid = Grid.nyquist(1.0, 550e-9, 10**8)
+    with pytest.raises(ValueError, match=r"n_pixels is 100000000: that takes at least .* enough for \d+ at most"):
+        AsymptoticMSE(grid, PowerLawPSD(1.5, 1e7), NoisePSD(1e7), 20)
+
+
 def test_impossible_psds_are_refused() -> None:
     one, grid = torch.ones(16, 16), grid_of(16)
     for s_o, s_n, message in (

@@ -149,7 +149,8 @@ def test_missing_and_unknown_files_are_refused(tmp_path):
     ("change", "message"),
     [
         ({"format": "other"}, "its 'format' is not 'torchmask mask, version 1'"),
-        ({"centers": None}, "lacks centers"),
+        ({"units": {"length": "mm", "angle": "rad"}}, r"its 'units' are .*mm.*: convert its numbers to .*'m'"),
+        ({"centers": None, "mask_diameter": None}, "lacks 'mask_diameter', 'centers'"),
         ({"centers": [[0, 1, 2]]}, "centers has shape"),
         ({"centers": "none"}, "cannot be read as a mask"),
         ({"subaperture_diameter": -1}, "subaperture_diameter is -1"),

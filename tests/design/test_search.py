@@ -143,6 +143,16 @@ def test_impossible_requests_are_refused_with_the_reason(arguments, message):
         search_mask(COARSE, *arguments)
 
 
+def test_holes_narrower_than_a_sample_of_the_frequencies_are_refused_at_once():
+    """Their baselines fall between the samples; thousands of holes were packed for minutes first."""
+    with pytest.raises(
+        ValueError,
+        match=r"holes of 0\.007071 m are narrower than a sample .*, 0\.03125 m .*: take holes of at least 0\.03125 m, "
+        r"n_subapertures of at most 153 at this fill factor, or a grid of at least 283 x 283 frequencies",
+    ):
+        search_mask(reference(64), 3000, 1.0, 0.15)
+
+
 def test_unknown_method_lists_the_known_ones():
     with pytest.raises(ValueError, match="cma"):
         search_mask(COARSE, 6, 1.0, 0.15, method="annealing")

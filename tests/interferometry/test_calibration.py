@@ -192,7 +192,12 @@ def test_a_fit_with_its_light_through_one_hole_is_refused():
 
 
 @pytest.mark.parametrize(
-    ("keywords", "message"), [({"n_modes": 2}, "n_modes"), ({"readout_noise": -1.0}, "readout_noise")]
+    ("keywords", "message"),
+    [
+        ({"n_modes": 2}, "n_modes"),
+        ({"n_modes": 100_000}, r"n_modes is 100000: a frame has \d+ pixels around the star, .* take at most \d+, or"),
+        ({"readout_noise": -1.0}, "readout_noise"),
+    ],
 )
 def test_numbers_out_of_range_are_refused(keywords, message):
     with pytest.raises(ValueError, match=message):

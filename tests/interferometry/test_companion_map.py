@@ -134,6 +134,10 @@ def test_what_cannot_be_is_refused(measure_pair):
     seen = measure_pair(TRUTH)
     with pytest.raises(ValueError, match=r"from 0\.3 to 0\.2 arcsec: the first must"):
         raster(seen, 0.3 * math.pi / 648000, 0.2 * math.pi / 648000)
+    with pytest.raises(ValueError, match="to inf arcsec: the first must"):
+        raster(seen, most=math.inf)
+    with pytest.raises(ValueError, match=r"the largest separation \[arcsec\] is 1e\+09: that takes at least .* GiB"):
+        raster(seen, most=1e9 * math.pi / 648000)
     with pytest.raises(ValueError, match="no point lies between"):
         raster(seen, 0.0, 1e-12)
     few = seen.closures_only()

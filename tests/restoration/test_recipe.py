@@ -1,6 +1,7 @@
 """What a model is made from: the aperture where it lies now, and the aberrations it is assumed to have."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -11,7 +12,7 @@ from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.band import Band
 from torchmask.optics.zernike import zernike_basis
 from torchmask.restoration.aberrations import turbulent_basis
-from torchmask.restoration.recipe import ModelRecipe
+from torchmask.restoration.recipe import FULL_MODES, ModelRecipe
 
 GRID = Grid.nyquist(1.0, 550e-9, 32)
 HERE = [[0.0, 0.3], [0.3, -0.2], [-0.3, -0.15]]
@@ -24,8 +25,8 @@ def mask(trains=False):
 
 def recipe(aperture=None, **changes):
     given = {"frame_modes": 3, "static_modes": 0, "r0": 0.2, "outer_scale": 20.0, "whitened": True}
-    given |= {"band": Band.of([550e-9]), "dtype": torch.float64, "device": None}
-    return ModelRecipe(aperture or mask(), GRID, **given | changes)
+    given |= {"grid": GRID, "band": Band.of([550e-9]), "dtype": torch.float64, "device": None}
+    return ModelRecipe(aperture or mask(), **given | changes)
 
 
 def test_turbulent_parameters_are_white():
@@ -93,5 +94,20 @@ def test_no_more_modes_than_samples_of_a_hole(name):
         ValueError, match=f"{said} is {most + 1}: a hole has {most} pupil samples, .* at most {most}, or a"
     ):
         recipe(**{name: most + 1})
-    assert recipe(FullAperture(1.0), frame_modes=2000).frame_modes == 2000  # of one opening they are quick to make
+    assert recipe(FullAperture(1.0), frame_modes=1000).frame_modes == 1000  # of one opening they are quick to make
     assert getattr(recipe(**{name: most + 1}, whitened=False), name) == most + 1  # no covariance; they may be known
+
+
+def test_no_more_modes_than_pixels():
+    """What has no limit by samples: a full pupil, and modes without a prior; the usual modes are always allowed."""
+    for known, most in (({"aperture": FullAperture(1.0)}, 1024), ({"whitened": False}, 341)):
+        with pytest.raises(ValueError, match=f"n_modes is 100000: a frame has 1024 pixels, .* at most {most}, or a"):
+            recipe(**known, frame_modes=100_000)
+    small = {"aperture": FullAperture(1.0), "grid": Grid.nyquist(1.0, 550e-9, 8)}
+    assert recipe(**small, frame_modes=FULL_MODES).frame_modes == FULL_MODES
+
+
+def test_a_pixel_scale_in_another_unit_is_told_before_the_holes_are_sampled():
+    """Milliarcseconds for arcseconds: each hole had some 10^7 samples then."""
+    with pytest.raises(ValueError, match="undersamples an aperture"):
+        recipe(grid=replace(GRID, pixel_scale=1e30 * GRID.pixel_scale))

@@ -356,3 +356,5 @@ def test_bad_requests_are_refused(scene, mask, grid):
     for n_frames in (0, -1, 1.5):
         with pytest.raises(ValueError, match="n_frames"):
             simulate(scene, mask, grid, n_frames=n_frames)
+    with pytest.raises(ValueError, match="n_frames is 1000000000000: that takes at least"):
+        simulate(scene, mask, grid, n_frames=10**12)

@@ -244,6 +244,11 @@ def test_bad_views_are_refused(view, message):
         render_mesh(plate(1, 1), (8, 8), **view)
 
 
+def test_a_raster_beyond_the_memory_is_refused():
+    with pytest.raises(ValueError, match="n_pixels is 10000000: that takes at least"):
+        render_mesh(plate(1, 1), (10**7, 10**7))
+
+
 def test_meshes_without_outline_are_refused():
     for triangles in (np.zeros((1, 3, 3)), np.full((1, 3, 3), np.nan)):
         with pytest.raises(ValueError, match="outline"):

@@ -44,8 +44,9 @@ def run(options: Options) -> None:
     if options.name is not None:
         show(options.name, options)
         return
-    if options.out is not None:
-        raise ValueError("--out is for one mask: give its name or file")
+    for name in ("out", "scale", "mask_diameter", "fill_factor", "mirrored"):
+        if (value := getattr(options, name)) is not None and value is not False:
+            raise ValueError(f"--{name.replace('_', '-')} is for one mask: give its name or file")
     print(listing())
 
 
@@ -69,6 +70,8 @@ def listing() -> str:
 
 def show(name: str, options: Options) -> None:
     """Print the properties of a mask, and write it to a file if --out is given."""
+    if options.scale is not None and options.out is None:
+        raise ValueError("--scale is for a drawing: give --out with a file that ends in .dxf or .svg")
     if is_mask_file(Path(name)):
         entry, aperture, wavelength = None, load_mask_file(name, options), mask_wavelength(name)
     else:
@@ -86,10 +89,10 @@ def show(name: str, options: Options) -> None:
 def _from_catalog(mask: catalog.CatalogEntry, options: Options) -> SparseAperture:
     """Return the mask as built or as the options say, with default sizes where the catalogue has none."""
     diameter, fill = options.mask_diameter, options.fill_factor
-    if mask.pupil_diameter is None:
-        diameter, fill = diameter or _ANY_SIZE[0], fill or _ANY_SIZE[1]
-    elif mask.hole_diameter is None:
-        fill = fill or _ANY_SIZE[1]
+    if mask.pupil_diameter is None and diameter is None:
+        diameter = _ANY_SIZE[0]
+    if (mask.pupil_diameter is None or mask.hole_diameter is None) and fill is None:
+        fill = _ANY_SIZE[1]
     return SparseAperture.from_catalog(mask.name, diameter, fill, options.mirrored)
 
 

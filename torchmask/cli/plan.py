@@ -69,6 +69,12 @@ def _fields(known: Instrument) -> dict[str, Any]:
 def existing_mask(options: Options) -> Aperture | None:
     """Return the mask that --mask names; patterns without a size, and full pupils, are as wide as the telescope."""
     if options.mask is None:
+        for name in ("mask_diameter", "fill_factor", "mirrored", "allow_overlap"):
+            if (value := getattr(options, name)) is not None and value is not False:
+                raise ValueError(
+                    f"--{name.replace('_', '-')} is for a mask that exists: give --mask, or leave it out, as masks "
+                    "that are searched are as wide as the telescope"
+                )
         return None
     names = (item.name for item in dataclasses.fields(CatalogOptions))
     return load_aperture(

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import os
+import re
 import signal
 import sys
 import threading
@@ -27,6 +28,7 @@ from torchmask.instrument.instrument import Instrument
 T = TypeVar("T")
 
 NOT_EXPLAINED = 3  # exit status
+_NO_MEMORY = re.compile("allocate memory|out of memory", re.IGNORECASE)  # PyTorch raises RuntimeError
 
 # What programs need beyond a plain install, by the name of the module.
 _EXTRAS = (
@@ -94,6 +96,11 @@ def exit_status(program: str, work: Callable[[], int | None], debug: bool) -> in
             if debug or missing not in _EXTRAS:
                 raise
             _say(program, f"needs {missing}, which a plain install leaves out: pip install 'torchmask[experiments]'")
+            return 1
+        except (MemoryError, RuntimeError) as error:
+            if debug or not (isinstance(error, MemoryError) or _NO_MEMORY.search(str(error))):
+                raise
+            _say(program, f"error: memory is short, take fewer or smaller frames, frequencies, holes or modes: {error}")
             return 1
         except BrokenPipeError:  # `torchmask masks | head` has read enough
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit

@@ -54,8 +54,9 @@ class Run:
 def new_run(command: str, options: RunOptions, seed: int | None = None) -> Iterator[Run]:
     """Log to a new folder (by default runs/COMMAND-date-time), and to the terminal.
 
-    If the request turns out to be impossible before there are any results (ValueError), the folder is removed again. If
-    the run ends early for any other reason, the results so far are kept, and the user is told where.
+    If the request turns out to be impossible before there are any results (ValueError, or memory is short), the folder
+    is removed again. If the run ends early for any other reason, the results so far are kept, and the user is told
+    where.
 
     Raises ValueError if the folder exists or cannot be made.
     """
@@ -85,7 +86,7 @@ def new_run(command: str, options: RunOptions, seed: int | None = None) -> Itera
     except KeyboardInterrupt:
         print("", *_ways_on(command, directory, options), sep="\n", file=sys.stderr)
         raise
-    except ValueError:
+    except (ValueError, MemoryError, RuntimeError):
         if useless:
             shutil.rmtree(directory)
             for parent in parents:

@@ -17,10 +17,12 @@ from torch import Tensor, nn
 from torchmask.design.fluctuation import mean_inverse, piston_powers
 from torchmask.design.overlap import Geometry, baseline_mse
 from torchmask.grid import Grid
-from torchmask.memory import keep_freed_memory
+from torchmask.memory import keep_freed_memory, require_memory
 from torchmask.optics.aperture import FullAperture
 from torchmask.optics.pupil import Aperture
 from torchmask.spectra import PSD, evaluate_psd, resample_psd
+
+_BYTES = 60  # of memory for each frequency, in one evaluation
 
 
 class AsymptoticMSE(nn.Module):
@@ -77,6 +79,7 @@ class AsymptoticMSE(nn.Module):
         super().__init__()
         if not float(n_frames).is_integer() or n_frames < 1:
             raise ValueError(f"n_frames is {n_frames}: it must be a whole number of at least 1")
+        require_memory("n_pixels", max(grid.shape), _BYTES * math.prod(grid.shape), power=2)
         self.grid: Grid = grid
         self.n_frames: int = int(n_frames)
         self._object_model = None if isinstance(object_psd, Tensor) else object_psd

@@ -24,6 +24,7 @@ from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.records import aperture_record, read_mask
 
 _FORMAT = "torchmask mask, version 1"
+_UNITS = {"length": "m", "angle": "rad"}
 _DTYPES = {"float64": torch.float64, "float32": torch.float32}
 
 
@@ -43,7 +44,7 @@ def save_json(path: str | Path, aperture: SparseAperture, wavelength: float | No
         raise ValueError(f"wavelength is {wavelength}: it must be finite and positive, in m")
     record = {
         "format": _FORMAT,
-        "units": {"length": "m", "angle": "rad"},
+        "units": _UNITS,
         **aperture_record(aperture),
         "dtype": str(centers.dtype).removeprefix("torch."),
         "centers": centers.tolist(),
@@ -189,7 +190,7 @@ def _read_json(path: Path) -> SparseAperture:
     needed = ("shape", "subaperture_diameter", "mask_diameter", "centers", "dtype")
     missing = [key for key in needed if key not in record]
     if missing:
-        raise ValueError(f"it lacks {', '.join(missing)}")
+        raise ValueError(f"it lacks {', '.join(map(repr, missing))}")
     centers = torch.tensor(record["centers"], dtype=torch.float64).to(_dtype(record["dtype"]))
     return read_mask(record | {"centers": centers})
 
@@ -198,6 +199,8 @@ def _json_record(path: Path) -> dict[str, Any]:
     record = json.loads(path.read_text(encoding="utf-8"))
     if not isinstance(record, dict) or record.get("format") != _FORMAT:
         raise ValueError(f"its 'format' is not {_FORMAT!r}")
+    if record.get("units", _UNITS) != _UNITS:
+        raise ValueError(f"its 'units' are {record['units']!r}: convert its numbers to {_UNITS!r}")
     return record
 
 

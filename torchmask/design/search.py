@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 import torch
 
 from torchmask.design.cma import evolve
-from torchmask.design.constraint_base import Constraint
+from torchmask.design.constraint_base import Constraint, Infeasible
 from torchmask.design.hybrid import basin_hopping, coarse_criterion
 from torchmask.design.merit import Criterion
 from torchmask.design.refine import Monitor, SearchResult, conclude, polish
 from torchmask.design.room import require_room
+from torchmask.optics.packing import hole_diameter
 from torchmask.record import Callback
 
 DEFAULT_BUDGETS = {"hybrid": 100_000, "cma": 20_000}  # evaluations for up to 11 holes
@@ -70,7 +72,8 @@ def search_mask(
     Raises
     ------
     ValueError
-        If an argument is out of range, or no mask that fulfils the request is found.
+        If an argument is out of range, the holes are narrower than a sample of the criterion's frequencies, or no mask
+        that fulfils the request is found.
     TypeError
         If `constraints` is not a sequence of constraints.
 
@@ -96,6 +99,7 @@ def search_mask(
         raise ValueError(f"budget is {budget}: it must be a whole number of evaluations, at least 1")
     if not float(seed).is_integer() or seed < 0:
         raise ValueError(f"seed is {seed}: it must be a whole number that is not negative")
+    _require_sampling(criterion, n_subapertures, mask_diameter, fill_factor)
     holes, fallback = require_room(n_subapertures, mask_diameter, fill_factor, constraints, callback=callback)
     rng = np.random.default_rng(seed)
     monitor = Monitor(f"design/{method}", budget, holes, callback)
@@ -108,3 +112,20 @@ def search_mask(
     monitor = Monitor("design/refine", allowance, holes, callback, before=used)
     aperture, polished = polish(criterion, holes, starts, allowance, monitor, fallback)
     return conclude(criterion, aperture, constraints, used + polished, history | monitor.history(criterion))
+
+
+def _require_sampling(criterion: Criterion, n_subapertures: int, mask_diameter: float, fill_factor: float) -> None:
+    """Raise `Infeasible` for holes narrower than a sample of the criterion's frequencies, if it has a grid.
+
+    The light of a baseline lies within a hole diameter of its frequency: that of narrower holes falls in between.
+    """
+    hole, grid = hole_diameter(n_subapertures, mask_diameter, fill_factor), getattr(criterion, "grid", None)
+    if grid is None or hole >= (step := grid.period / min(grid.shape)):
+        return
+    most, needed = math.floor(fill_factor * (mask_diameter / step) ** 2), math.ceil(grid.period / hole)
+    fewer = f", n_subapertures of at most {most} at this fill factor" if most else ""
+    raise Infeasible(
+        f"holes of {hole:.4g} m are narrower than a sample of the criterion's frequencies, {step:.4g} m in the pupil, "
+        f"which would miss their baselines: take holes of at least {step:.4g} m{fewer}, or a grid of at least {needed} "
+        f"x {needed} frequencies"
+    )

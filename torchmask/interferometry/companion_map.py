@@ -13,6 +13,7 @@ from torchmask.grid import ARCSEC
 from torchmask.interferometry.companion_limits import SIGNIFICANCE, DetectionLimits, search_offsets
 from torchmask.interferometry.measurements import Measurements
 from torchmask.interferometry.pair_model import PARAMETERS, PairResiduals, square
+from torchmask.memory import require_memory
 from torchmask.record import Brief
 
 _PER_ELEMENT = 8  # points of the raster along the finest fringe
@@ -20,6 +21,7 @@ _WIDEST = 25  # maximum radius of the raster, in periods of the finest fringe
 _STEPS = 40  # maximum number of Gauss-Newton steps for contrast and position
 _LEAST_CURVATURE = 1e-12  # of the largest: below, the companion's position along some direction is unconstrained
 _CHUNK = 1024  # positions at a time
+_BYTES = 80  # of memory for each position: itself, its separation, and what is found there
 _ERRORS_WITHIN = 1.5  # factor by which errors may be too small: 20 frames give them to 16 %, three times which is 1.5
 _CHANCE = 5.0  # standard deviations of the chi-square that are put down to chance
 
@@ -139,20 +141,22 @@ def raster(measured: Measurements, least: float | None = None, most: float | Non
     Raises
     ------
     ValueError
-        Unless 0 <= least < most, and the raster has a point between them.
+        Unless 0 <= least < most, and the raster has a point between them, and no more than memory holds.
     """
     least = measured.finest / 2 if least is None else least
     most = min(measured.widest / 2, _WIDEST * measured.finest) if most is None else most
-    if not 0 <= least < most:
+    if not 0 <= least < most < math.inf:
         raise ValueError(
             f"separations from {least / ARCSEC:.4g} to {most / ARCSEC:.4g} arcsec: the first must be at least 0 and "
             "less than the second"
         )
-    offsets = search_offsets(measured.finest / _PER_ELEMENT / ARCSEC, least / ARCSEC, most / ARCSEC)
+    step = measured.finest / _PER_ELEMENT
+    require_memory("the largest separation [arcsec]", most / ARCSEC, _BYTES * (2 * most / step + 1) ** 2, power=2)
+    offsets = search_offsets(step / ARCSEC, least / ARCSEC, most / ARCSEC)
     if not len(offsets):
         raise ValueError(
             f"no point lies between {least / ARCSEC:.4g} and {most / ARCSEC:.4g} arcsec on a raster of "
-            f"{measured.finest / _PER_ELEMENT / ARCSEC:.4g} arcsec: give separations farther apart"
+            f"{step / ARCSEC:.4g} arcsec: give separations farther apart"
         )
     return offsets
 

@@ -71,6 +71,12 @@ class StarModel:
         self, aperture: SparseAperture, grid: Grid, reach: int, n_modes: int, pixel: PixelResponse | None = None
     ) -> None:
         self.side: int = 2 * reach + 1
+        most = self.side**2 // aperture.n_subapertures
+        if n_modes > most:
+            raise ValueError(
+                f"n_modes is {n_modes}: a frame has {self.side**2} pixels around the star, fewer than unknowns of "
+                f"{aperture.n_subapertures} holes, so take at most {most}, or a wider image"
+            )
         self.n_modes: int = n_modes
         self.centers: Tensor = aperture.centers.detach().double().cpu()
         y, x = torch.meshgrid(*2 * [torch.arange(-reach, reach + 1, dtype=torch.float64)], indexing="ij")

@@ -27,7 +27,7 @@ from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.parallel import each_on_a_core
 from torchmask.restoration.priors import ObjectPrior, TotalVariation
 from torchmask.restoration.projected_lbfgs import Minimizer, ProjectedLBFGS
-from torchmask.restoration.recipe import ModelRecipe
+from torchmask.restoration.recipe import FULL_MODES, ModelRecipe
 from torchmask.restoration.result import RestorationResult
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.solver import Solver
@@ -156,7 +156,7 @@ class MyopicDeconvolution:
             aperture,
             grid,
             Band.of([grid.wavelength] if wavelengths is None else wavelengths, weights),
-            frame_modes=(231 if self.many_minima else 6) if n_modes is None else n_modes,
+            frame_modes=(FULL_MODES if self.many_minima else 6) if n_modes is None else n_modes,
             last_modes=self.schedule.last_modes if n_modes is None and not self.many_minima else 0,
             static_modes=static_modes,
             # The holes of a mask are usually about r0 wide; a full pupil that needs a restoration spans several r0.

@@ -23,6 +23,8 @@ from torchmask.restoration.aberrations import (
 )
 from torchmask.restoration.forward import ExposureModel, Window
 
+FULL_MODES = 231  # of a full pupil, as far as nobody says
+
 
 @dataclass(frozen=True)
 class ModelRecipe:
@@ -45,8 +47,8 @@ class ModelRecipe:
     Raises
     ------
     ValueError
-        If several apertures are given, a number is out of range, holes have more whitened modes than samples, or the
-        data type is of half precision.
+        If several apertures are given, a number is out of range, the grid samples the aperture too coarsely, there are
+        more modes than samples or pixels tell apart, or the data type is of half precision.
     """
 
     aperture: Aperture
@@ -76,18 +78,23 @@ class ModelRecipe:
             if not float(count).is_integer() or count < least:
                 raise ValueError(f"{name} is {count}: it must be a whole number of at least {least}")
         self._check_exposure()
-        if self.whitened and not self.aperture.is_full:  # whose usual modes are many, and quick to make
-            self._check_modes()
+        self.aperture.require_sampling(self.bluest_grid)
+        self._check_modes()
 
     def _check_modes(self) -> None:
         aperture, field = self.aperture, Window.around(self.grid).field
-        samples = sample_holes(aperture.centers.detach(), aperture.shape, aperture.subaperture_diameter, field)
-        most = int((samples.weights > 0).sum(-1).max())
+        if self.whitened and not aperture.is_full:
+            samples = sample_holes(aperture.centers.detach(), aperture.shape, aperture.subaperture_diameter, field)
+            most = int((samples.weights > 0).sum(-1).max())
+            where = f"a hole has {most} pupil samples"
+        else:  # the modes of one opening are quick to make, and those without a prior may be known
+            most = max(FULL_MODES, math.prod(self.grid.shape) // aperture.n_subapertures)
+            where = f"a frame has {math.prod(self.grid.shape)} pixels"
         for name, count in (("n_modes", self.frame_modes), ("static_modes", self.static_modes)):
             if count > most:
                 raise ValueError(
-                    f"{name} is {count}: a hole has {most} pupil samples, on which no more modes can be told apart, so "
-                    f"take at most {most}, or a wider image"
+                    f"{name} is {count}: {where}, on which no more modes can be told apart, so take at most {most}, or "
+                    "a wider image"
                 )
 
     def _check_exposure(self) -> None:

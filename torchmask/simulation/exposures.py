@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torchmask.atmosphere.screens import draw_seed
 from torchmask.grid import Grid
+from torchmask.memory import require_memory
 from torchmask.observation import Observation
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.detector import Detector, image_formation
@@ -126,6 +127,7 @@ def simulate_observation(
     conditions = conditions or Conditions()
     scene = scene.detach()
     _check(scene, aperture, grid, n_frames)
+    require_memory("n_frames", n_frames, 2.0 * n_frames * scene.numel() * scene.element_size())  # frames and PSFs
     turbulence = with_layers(turbulence, grid.wavelength)
     delays = exposure_delays(turbulence, conditions.exposure_time)
     if keep_phases and (len(delays) > 1 or conditions.band is not None or told is not None):

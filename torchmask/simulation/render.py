@@ -16,10 +16,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchmask.io import extra
+from torchmask.memory import require_memory
 
 Array = NDArray[np.float64]
 
 _SAMPLES = 1024  # minimum samples on the longer side of a rendering, before they are averaged into pixels
+_BYTES = 25  # of memory for each sample: nearness, index of the face, light, and whether there is any
 _FRAGMENTS = 1 << 21  # samples processed together
 _EDGE_ON = 1e-9  # a face whose normal is this close to the image plane is seen edge-on and skipped
 _MAX_SLOPE = 10.0  # limit on the slope of a face towards the sun, in the tolerance of the shadow test
@@ -139,6 +141,7 @@ def render_mesh(
         raise ValueError(f"ambient is {ambient}: it must be finite and not negative")
     samples = max(4, math.ceil(_SAMPLES / max(shape)))
     raster = (shape[0] * samples, shape[1] * samples)
+    require_memory("n_pixels", max(shape), _BYTES * math.prod(raster), power=2)
     triangles = _to_raster(mesh.triangles @ rotation.T, raster, size)
     depth, face = _z_buffer(triangles, raster)
 
