@@ -100,7 +100,13 @@ def test_ratios_of_the_library_never_fall_with_blur_and_fall_with_light():
 
 
 @pytest.mark.parametrize(
-    "change", [{"exposure_ratio": LONG[:, :2]}, {"band_ratio": 0 * WIDE}, {"spreads": (0.1, 0.05, 1)}]
+    "change",
+    [
+        {"exposure_ratio": LONG[:, :2]},
+        {"band_ratio": 0 * WIDE},
+        {"band_ratio": math.inf * WIDE},
+        {"spreads": (0.1, 0.05, 1)},
+    ],
 )
 def test_tables_that_cannot_be_are_refused(change):
     axes = {"n_photons": PHOTONS, "exposures": EXPOSURES, "spreads": SPREADS}

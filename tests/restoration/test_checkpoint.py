@@ -21,6 +21,7 @@ from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.priors import EdgePreserving, TotalVariation
 from torchmask.restoration.projected_lbfgs import ProjectedLBFGS
 from torchmask.restoration.schedule import Schedule
+from torchmask.restoration.solver import Solver
 from torchmask.restoration.state import Calibration, State
 
 CPU = torch.device("cpu")
@@ -207,6 +208,41 @@ def test_a_fingerprint_tells_frames_priors_settings_and_masks_apart():
     assert len(set(prints)) == len(prints)
 
 
+class Anonymous:
+    """A prior without a repr of its own."""
+
+    def __call__(self, image):
+        return (image**2).sum()
+
+
+def adam(parameters):
+    return torch.optim.Adam(parameters, lr=0.1)
+
+
+def penalty(image, weight):
+    return weight * (image**2).sum()
+
+
+def test_a_function_is_known_by_its_name_and_not_by_where_it_lies():
+    for options in ({"prior": partial(penalty, weight=2.0)}, {"settings": (TorchMinimizer(adam),)}):
+        (found,) = {fingerprint(**options), fingerprint(**options)}
+        assert found != fingerprint()
+    assert fingerprint(prior=partial(penalty, weight=2.0)) != fingerprint(prior=partial(penalty, weight=3.0))
+
+
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [
+        ({"prior": Anonymous()}, r"<\S*Anonymous object at 0x\w+>"),
+        ({"prior": partial(lambda image: image.sum())}, r"<function <lambda> at 0x\w+>"),
+        ({"settings": (TorchMinimizer(lambda z: torch.optim.SGD(z, lr=1.0)),)}, r"<function <lambda> at 0x\w+>"),
+    ],
+)
+def test_what_has_only_an_address_in_memory_has_no_checkpoint(options, name):
+    with pytest.raises(ValueError, match=rf"a checkpoint cannot know (?:{name}) again, which has no name"):
+        fingerprint(**options)
+
+
 # --- whole restorations
 
 
@@ -234,6 +270,34 @@ def test_interrupted_and_resumed_is_the_same(observation, restoring, tmp_path):
     spread = method.restore(observation.frames, checkpoint=path, n_samples=2)  # of what is there, without a step more
     assert torch.equal(spread.object, whole.object)
     assert torch.equal(spread.object_std, method.restore(observation.frames, checkpoint=path, n_samples=2).object_std)
+
+
+@pytest.mark.parametrize("begun_from", ["an earlier result", "estimated aberrations"])
+def test_a_resumed_restoration_does_not_begin_again(
+    begun_from, observation, restored, restoring, tmp_path, monkeypatch
+):
+    """Neither pays for the fit of new frames a second time, nor forgets where its prior is centred."""
+    frames, path, begun = observation.frames, tmp_path / "state.npz", []
+    method = restoring(3, max_iterations=60, tolerance=0, schedule=Schedule(segment=20))
+    known = {"start": method.restore(frames[:6])}
+    if begun_from == "estimated aberrations":
+        known = {"coefficients": restored.coefficients[..., :3], "covariance": 0.01 * torch.eye(15)}
+    whole = method.restore(frames, **known)
+    begin = Solver.begin
+    monkeypatch.setattr(Solver, "begin", lambda self, *told: begun.append(told) or begin(self, *told))
+
+    def interrupt(record: Record) -> None:
+        if record.step == 30:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        method.restore(frames, checkpoint=path, callback=interrupt, **known)
+    resumed = method.restore(frames, checkpoint=path, **known)
+    assert len(begun) == 1
+    assert torch.equal(resumed.object, whole.object)
+    assert torch.equal(resumed.coefficients, whole.coefficients)
+    assert torch.equal(resumed.cost, whole.cost)
+    assert resumed.n_evaluations == whole.n_evaluations
 
 
 def test_a_checkpoint_belongs_to_what_was_known(observation, restored, restoring, tmp_path):

@@ -41,7 +41,7 @@ class SmearingMap:
         light, the bands those of instants
     conditions : what all restorations share, in a sentence
 
-    Raises ValueError if a shape or an order is wrong, or a ratio is not positive.
+    Raises ValueError if a shape or an order is wrong, or a ratio is not finite and positive.
 
     Examples
     --------
@@ -62,8 +62,8 @@ class SmearingMap:
         photons, exposures, spreads = self._axes
         for name, axis in (("exposure_ratio", exposures), ("band_ratio", spreads)):
             table, shape = np.asarray(getattr(self, name), float), (len(photons.values), len(axis.values))
-            if table.shape != shape or not (table > 0).all():
-                raise ValueError(f"{name} is {table.tolist()}: positive numbers of shape {shape} are needed")
+            if table.shape != shape or not ((table > 0) & np.isfinite(table)).all():
+                raise ValueError(f"{name} is {table.tolist()}: finite positive numbers of shape {shape} are needed")
             object.__setattr__(self, name, table)
 
     @property

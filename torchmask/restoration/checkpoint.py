@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from enum import Enum
@@ -206,9 +207,20 @@ def save_nothing(progress: Progress) -> None:
 
 
 def fingerprint_of(objective: MyopicObjective, settings: Sequence[object], known: Sequence[Tensor | None]) -> str:
-    """Return a hash of the frames, priors, settings and further known tensors, to recognise their checkpoint."""
+    """Return a hash of the frames, priors, settings and further known tensors, to recognise their checkpoint.
+
+    Functions are known by their names. Raises ValueError if a prior or a setting has none, but only an address in
+    memory, which would be another one in the process that resumes.
+    """
     prior, model = objective.prior, objective.model
-    digest = hashlib.sha256(repr((*settings, objective.free, model.background, repr(prior))).encode())
+    told = repr((*settings, objective.free, model.background, repr(prior)))
+    told = re.sub(r"(<function [\w.]+) at 0x[0-9a-fA-F]+>", r"\1>", told)
+    if nameless := re.search(r"<[^(),=]+ at 0x[0-9a-fA-F]+>", told):
+        raise ValueError(
+            f"a checkpoint cannot know {nameless[0]} again, which has no name but an address in memory: give a "
+            "function that a module defines, no lambda, or an object whose __repr__ tells its numbers, or no checkpoint"
+        )
+    digest = hashlib.sha256(told.encode())
     tensors = [objective.frames, objective.precision, *model.pupil.samples(), model.response]
     tensors += prior.state_dict().values()
     for tensor in [*tensors, *known]:

@@ -101,11 +101,13 @@ class Solver:
 
     def solve(self, known: Known, start: RestorationResult | None = None, file: Checkpoint | None = None) -> Progress:
         """Run a restoration to its end, from scratch, from an earlier result or from a checkpoint."""
-        begun = self.begin(known, start)
-        if file is not None and (saved := file.load(self.objective.frames.device)) is not None:
-            begun = saved
-            if begun.status is Status.ITERATION_LIMIT and len(begun.costs) < self.traits.max_iterations:
-                begun.status = Status.RUNNING  # the limit has been raised since
+        if known.covariance is not None:  # the prior is centred on the estimated aberrations
+            centre = expected_parameters(self.objective, known.coefficients)
+            self.objective = self.objective.with_changes(centre=centre)
+        saved = None if file is None else file.load(self.objective.frames.device)
+        begun = saved or self.begin(known, start)
+        if begun.status is Status.ITERATION_LIMIT and len(begun.costs) < self.traits.max_iterations:
+            begun.status = Status.RUNNING  # the limit has been raised since
         blind = known.nothing and start is None
         # Without a prior on the aberrations a poor fit is to be expected, and more starts would not help.
         may_start_again = blind and self.traits.prior_on_aberrations and len(self.objective.frames) > 1
@@ -121,8 +123,6 @@ class Solver:
     def begin(self, known: Known, start: RestorationResult | None) -> Progress:
         """Return the initial progress of a restoration, from scratch or from an earlier result."""
         state = self._first_state(known)
-        if known.covariance is not None:  # the prior is centred on the estimated aberrations
-            self.objective = self.objective.with_changes(centre=state.z)
         if start is None:
             first = first_candidates(self.objective, state, self.traits, self.schedule, self.traits.seed)
             return Progress(first, refinement=self.traits.refinement)
