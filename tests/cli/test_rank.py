@@ -82,6 +82,7 @@ def test_pixels_may_be_finer_than_needed():
         (["--pixel-scale-arcsec", "-1"], "--pixel-scale-arcsec is -1"),
         (["--pixel-scale-arcsec", "0.5"], "undersamples"),
         (["--central-obstruction", "0.95"], "no mask is left to rank"),
+        (["--search", "5", "1"], "--search is 1: masks of at least two holes can be ranked"),
         (["--wind", "3"], "--wind needs --criterion turbulent"),
     ],
 )

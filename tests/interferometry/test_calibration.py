@@ -1,6 +1,7 @@
 """Geometry and transmissions of a mask from frames of a star, with their errors."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -202,6 +203,12 @@ def test_a_fit_with_its_light_through_one_hole_is_refused():
 def test_numbers_out_of_range_are_refused(keywords, message):
     with pytest.raises(ValueError, match=message):
         calibrate_mask(bench(), TOLD, GRID, **keywords)
+
+
+def test_a_pixel_scale_in_milliarcseconds_is_told_as_such():
+    """It was said to leave too few pixels for the modes."""
+    with pytest.raises(ValueError, match=r"pixel_scale .* undersamples an aperture"):
+        calibrate_mask(bench(), TOLD, replace(GRID, pixel_scale=1000 * GRID.pixel_scale))
 
 
 def test_a_population_and_two_holes_are_refused():

@@ -23,6 +23,7 @@ from torchmask.design.criterion import AsymptoticMSE
 from torchmask.design.search import SearchResult
 from torchmask.grid import Grid
 from torchmask.io import save_npz
+from torchmask.memory import require_memory
 from torchmask.metrics import relative_error, ssim
 from torchmask.observation import Observation
 from torchmask.optics.aperture import Aperture, FullAperture, SparseAperture
@@ -157,7 +158,10 @@ def check(options: Options) -> None:
     design, diameter = options.design, options.imaging.diameter
     size = hole_diameter(design.n_subapertures, diameter, design.fill_factor)
     hole = SparseAperture(torch.zeros(1, 2, dtype=torch.float64), size, diameter)
-    inversion(options, hole, options.restoration.n_modes or 1)
+    modes = options.restoration.n_modes
+    inversion(options, hole, 3 if modes is None else modes)
+    imaging = options.imaging
+    require_memory("imaging.n_frames", imaging.n_frames, 16.0 * imaging.n_frames * imaging.n_pixels**2)  # and PSFs
 
 
 def design_mask(options: Options, callback: Callback) -> SearchResult:

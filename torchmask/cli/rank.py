@@ -65,8 +65,11 @@ class Options(ObservationOptions, MaskRules, RunOptions):
 def patterns(options: Options) -> list[Pattern]:
     """Return the masks of the options.
 
-    Raises ValueError for an unknown name, a file that is no mask, and two masks or searches of one name.
+    Raises ValueError for an unknown name, a file that is no mask, two masks or searches of one name, and a search for
+    a single hole.
     """
+    if options.search and min(options.search) < 2:
+        raise ValueError(f"--search is {min(options.search)}: masks of at least two holes can be ranked")
     found = [
         Pattern.of(Path(name).stem, load_mask(name)) if is_mask_file(Path(name)) else Pattern.from_catalog(name)
         for name in options.masks or catalog.names()

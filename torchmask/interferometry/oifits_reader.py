@@ -109,7 +109,10 @@ def _read(path: Path, hdus: Any, target: str | None) -> Measurements:
     sides = ("U1COORD", "V1COORD", "U2COORD", "V2COORD")
     t3 = _gather(path, hdus, "OI_T3", ("T3PHI", "T3PHIERR"), sides, chosen, waves)
     if not len(vis2.wavelength) and not len(t3.wavelength):
-        raise ValueError(f"{path} has no squared visibility and no closure phase that is finite and not flagged")
+        raise ValueError(
+            f"{path} has no squared visibility and no closure phase that is finite and not flagged: give an OIFITS "
+            "file with OI_VIS2 or OI_T3 tables, such as `torchmask restore --oifits` writes"
+        )
     closure_correlation = correlation_of(t3.corrname, t3.place, triplets)
     return Measurements(
         baselines=_tensor(vis2, "UCOORD", "VCOORD"),

@@ -70,6 +70,7 @@ class StarModel:
     def __init__(
         self, aperture: SparseAperture, grid: Grid, reach: int, n_modes: int, pixel: PixelResponse | None = None
     ) -> None:
+        grid.require_sampling(aperture.outer_diameter)  # else the images of single holes are aliased
         self.side: int = 2 * reach + 1
         most = self.side**2 // aperture.n_subapertures
         if n_modes > most:
