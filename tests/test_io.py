@@ -275,6 +275,8 @@ def test_a_new_folder_is_new(tmp_path):
     assert new_folder(str(tmp_path / "runs" / "run")) == tmp_path / "runs" / "run"
     (tmp_path / "runs" / "run-2").touch()
     assert free_name(tmp_path / "runs" / "run") == tmp_path / "runs" / "run-3"
+    with pytest.raises(ValueError, match=r"\. exists and is not overwritten: choose another, such as run-2"):
+        new_folder(".")
     with pytest.raises(ValueError, match=r"run exists and is not overwritten: choose another, such as .*run-3$"):
         new_folder(tmp_path / "runs" / "run")
     with pytest.raises(ValueError, match="cannot be created"):

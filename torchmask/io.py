@@ -120,7 +120,7 @@ def free_name(path: str | Path) -> Path:
     number = 1
     while candidate.exists():
         number += 1
-        candidate = path.with_name(f"{path.name}-{number}")
+        candidate = path.parent / f"{path.name or 'run'}-{number}"  # the present folder has no name
     return candidate
 
 
