@@ -11,14 +11,10 @@ import torch
 from torch import Tensor
 
 from torchmask.grid import Grid
+from torchmask.numbers import require
 
 PSD = Tensor | Callable[..., Tensor]
 """A tensor that broadcasts to (H, W) in FFT order, or a callable psd(grid, dtype, device) that returns one."""
-
-
-def _require_positive(name: str, value: float, unit: str, zero: bool = False) -> None:
-    if not (math.isfinite(value) and (value > 0 or (zero and value == 0))):
-        raise ValueError(f"{name} is {value}: it must be finite and {'not negative' if zero else 'positive'}, {unit}")
 
 
 @dataclass(frozen=True)
@@ -53,9 +49,9 @@ class PowerLawPSD:
     knee: float = 1 / 64
 
     def __post_init__(self) -> None:
-        _require_positive("exponent", self.exponent, "a pure number", zero=True)
-        _require_positive("n_photons", self.n_photons, "in photons per image")
-        _require_positive("knee", self.knee, "in cycles/pixel")
+        require("exponent", self.exponent, ", a pure number", zero=True)
+        require("n_photons", self.n_photons, ", in photons per image")
+        require("knee", self.knee, ", in cycles/pixel")
 
     def __call__(
         self, grid: Grid, dtype: torch.dtype | None = torch.float64, device: torch.device | str | None = None
@@ -97,8 +93,8 @@ class NoisePSD:
     n_pixels: int | None = None
 
     def __post_init__(self) -> None:
-        _require_positive("n_photons", self.n_photons, "in photons per exposure")
-        _require_positive("readout_noise", self.readout_noise, "in electrons rms per pixel", zero=True)
+        require("n_photons", self.n_photons, ", in photons per exposure")
+        require("readout_noise", self.readout_noise, ", in electrons rms per pixel", zero=True)
         if self.n_pixels is not None and (not float(self.n_pixels).is_integer() or self.n_pixels < 1):
             raise ValueError(f"n_pixels is {self.n_pixels}: it must be a whole number of at least 1")
 

@@ -107,11 +107,11 @@ def test_no_more_modes_than_pixels():
     assert recipe(**small, frame_modes=FULL_MODES).frame_modes == FULL_MODES
 
 
-@pytest.mark.parametrize("whitened", [True, False])
-def test_the_piston_of_a_single_opening_is_refused(whitened):
-    """There would be nothing to estimate: a search without aberrations failed within PyTorch."""
+def test_the_piston_of_a_single_opening_is_refused():
+    """There would be no parameter left under the prior: a search without aberrations failed within PyTorch."""
     with pytest.raises(ValueError, match="n_modes is 1: the piston of a single opening does not show, take at least 3"):
-        recipe(FullAperture(1.0), frame_modes=1, whitened=whitened)
+        recipe(FullAperture(1.0), frame_modes=1)
+    assert recipe(FullAperture(1.0), frame_modes=1, whitened=False).n_modes == 1
     assert recipe(FullAperture(1.0), frame_modes=1, static_modes=3).n_modes == 3
 
 

@@ -12,8 +12,9 @@ from typing import Any
 
 from torchmask.atmosphere.seeing import Seeing
 from torchmask.grid import ARCSEC, Grid
-from torchmask.instrument.parts import Camera, Site, Source, Telescope, require
+from torchmask.instrument.parts import Camera, Site, Source, Telescope
 from torchmask.io import extra, from_json, read_json, to_json, write_json
+from torchmask.numbers import require
 from torchmask.optics.band import Band
 from torchmask.optics.passband import Passband
 from torchmask.spectra import NoisePSD, PowerLawPSD

@@ -6,21 +6,12 @@ import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+from torchmask.numbers import require
 from torchmask.optics.aperture import FullAperture
 from torchmask.optics.detector import Detector
 from torchmask.optics.pixel import PixelResponse, square_pixel
 
 System = Literal["AB", "Vega"]
-
-
-def require(name: str, value: float | None, unit: str, zero: bool = False, most: float = math.inf) -> None:
-    """Raise ValueError unless the number is None, or finite, positive (or `zero`) and no more than `most`."""
-    if value is None or (math.isfinite(value) and (value > 0 or (zero and value == 0)) and value <= most):
-        return
-    least = "at least 0" if zero else "positive"
-    raise ValueError(
-        f"{name} is {value}: it must be finite and {least}{f', at most {most:g}' * (most < math.inf)}{unit}"
-    )
 
 
 @dataclass(frozen=True, kw_only=True)

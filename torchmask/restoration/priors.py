@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor, nn
+
+from torchmask.numbers import require
 
 _PROBES = 8  # random vectors that estimate the diagonal of a Hessian
 _SEED = 0
@@ -86,7 +86,8 @@ class TotalVariation(ObjectPrior):
 
     def __init__(self, weight: float = 1.0, epsilon: float = 0.01) -> None:
         super().__init__()
-        _require_positive(weight=weight, epsilon=epsilon)
+        require("weight", weight)
+        require("epsilon", epsilon)
         self.weight: float = float(weight)
         self.epsilon: float = float(epsilon)
 
@@ -158,7 +159,7 @@ class SmoothVariation(TotalVariation):
 
     def __init__(self, weight: float = 1.0, bending: float = 0.25, epsilon: float = 0.01) -> None:
         super().__init__(weight, epsilon)
-        _require_positive(bending=bending)
+        require("bending", bending)
         self.bending: float = float(bending)
 
     def forward(self, image: Tensor) -> Tensor:
@@ -221,7 +222,8 @@ class EdgePreserving(ObjectPrior):
 
     def __init__(self, weight: float = 2.0, threshold: float = 0.5) -> None:
         super().__init__()
-        _require_positive(weight=weight, threshold=threshold)
+        require("weight", weight)
+        require("threshold", threshold)
         self.weight: float = float(weight)
         self.threshold: float = float(threshold)
 
@@ -255,9 +257,3 @@ def gradient(image: Tensor) -> tuple[Tensor, Tensor]:
 def divergence(dy: Tensor, dx: Tensor) -> Tensor:
     """Return the adjoint of `gradient`."""
     return dy.roll(1, -2) - dy + dx.roll(1, -1) - dx
-
-
-def _require_positive(**numbers: float) -> None:
-    for name, value in numbers.items():
-        if not (math.isfinite(value) and value > 0):
-            raise ValueError(f"{name} is {value}: it must be finite and positive")

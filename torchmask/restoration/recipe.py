@@ -77,7 +77,7 @@ class ModelRecipe:
         for name, count, least in (("n_modes", self.frame_modes, 1), ("static_modes", self.static_modes, 0)):
             if not float(count).is_integer() or count < least:
                 raise ValueError(f"{name} is {count}: it must be a whole number of at least {least}")
-        if self.n_modes * self.aperture.n_subapertures == 1:
+        if self.whitened and self.n_modes * self.aperture.n_subapertures == 1:
             raise ValueError(
                 "n_modes is 1: the piston of a single opening does not show, take at least 3 for its tilts"
             )
