@@ -21,7 +21,7 @@ from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.pupil import OpenSamples
 from torchmask.restoration.state import State
 
-STEPS = 60  # conjugate-gradient steps of a projection onto the frames
+STEPS = 8  # conjugate-gradient steps of a projection onto the frames, from where the one before has ended
 _RELAXATION = 0.9  # of the reflections; 1 has no attraction to the present field
 _STIFFNESS = 3e3  # holds focal amplitudes, of unit norm, where they are while their PSF is fitted to a frame
 _DARK = 1e-6  # intensity below which a PSF of unit sum is free to change as if it had so much
@@ -61,13 +61,14 @@ class _Frames:
     def reflect(self, field: Tensor, n_reflections: int) -> Tensor:
         """Return the field (t, P) to which reflections lead from `field` (t, P)."""
         now = self.model.raster(self.samples, field)
+        pull = torch.zeros_like(now[:, 0].real)
         for _ in range(n_reflections):
-            fitted = self._fit_frames(now)
+            fitted, pull = self._fit_frames(now, pull)
             mirrored = 2 * fitted - now
             reflected = 2 * self._fit_pupil(mirrored) - mirrored
             now = _RELAXATION * (reflected + now) / 2 + (1 - _RELAXATION) * fitted
         for _ in range(_LAST):
-            now = self._fit_frames(self._fit_pupil(now))
+            now, pull = self._fit_frames(self._fit_pupil(now), pull)
         return now.flatten(1)[:, self.samples.index]
 
     def _fit_pupil(self, raster: Tensor) -> Tensor:
@@ -75,22 +76,25 @@ class _Frames:
         field = self.samples.weights * torch.sgn(raster.flatten(1)[:, self.samples.index])
         return self.model.raster(self.samples, field)
 
-    def _fit_frames(self, raster: Tensor) -> Tensor:
-        """Return rasters (t, 1, H', W') nearby whose PSFs give the frames.
+    def _fit_frames(self, raster: Tensor, pull: Tensor) -> tuple[Tensor, Tensor]:
+        """Return rasters (t, 1, H', W') nearby whose PSFs give the frames, and the frames' pull (t, H', W') on them.
 
         The focal amplitude keeps its phase. Its distance from where it was, times `_STIFFNESS`, and the misfit have the
-        least sum: a linear problem for the change of the intensity, as long as that is small.
+        least sum: a linear problem for the change of the intensity, as long as that is small. The pull on a pixel, its
+        change times what holds it, hardly differs between one projection and the next, which goes on from it.
         """
         focal = torch.fft.fft2(raster)
         power = intensity(focal)
         held = 0.5 * _STIFFNESS / (power + _DARK)
-        change = conjugate_gradients(
-            lambda x: held * x + self._back(self.precision * self._imaged(x)),
-            self._back(self.precision * (self.frames - self._imaged(power))),
-            lambda x: x / held,
-            STEPS,
-        )
-        return torch.fft.ifft2((power + change).clamp(min=0).sqrt()[:, None] * torch.sgn(focal))
+
+        def forces(change: Tensor) -> Tensor:
+            return held * change + self._back(self.precision * self._imaged(change))
+
+        before = pull / held
+        left = self._back(self.precision * (self.frames - self._imaged(power + before))) - pull
+        change = before + conjugate_gradients(forces, left, lambda x: x / held, STEPS)
+        amplitude = (power + change).clamp(min=0).sqrt()
+        return torch.fft.ifft2(amplitude[:, None] * torch.sgn(focal)), held * change
 
     def _imaged(self, psf: Tensor) -> Tensor:
         """Return the frames (t, H, W) of PSFs (t, H', W')."""

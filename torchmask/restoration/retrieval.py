@@ -28,7 +28,7 @@ from torchmask.restoration.state import State
 _LOWER = 0.99  # of its cost before: a frame that comes back to where it was is no gain
 _PROMISING = 0.9  # of the excess chi-square before all rounds: with more left after one, others bring little
 _CORRECTIONS = 3  # of the modes by the phase that is left
-_EVALUATIONS = STEPS / 2  # whose FFTs a reflection makes
+_EVALUATIONS = STEPS / 2 + 1  # whose FFTs a reflection makes
 
 
 def retrieve_phases(
