@@ -15,6 +15,7 @@ from collections.abc import Callable
 import torch
 
 from torchmask.grid import Grid
+from torchmask.memory import keep_freed_memory
 from torchmask.metrics import relative_error
 from torchmask.observation import Observation
 from torchmask.optics.aperture import Aperture, FullAperture, SparseAperture
@@ -91,6 +92,7 @@ def main() -> None:
     args = parser.parse_args()
     angle = torch.arange(11, dtype=torch.float64) * 2 * math.pi / 11
     mask = SparseAperture(torch.stack([angle.cos(), angle.sin()], -1) * 0.44, 0.117, 1.0)
+    keep_freed_memory()  # as a restoration does
     print(f"torch {torch.__version__}, {args.device}, {torch.get_num_threads()} threads")
     for n_pixels in (128, 256):
         for dtype in (torch.float64, torch.float32):

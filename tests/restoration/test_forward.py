@@ -1,5 +1,6 @@
 """The exposure model against the PSF layer, direct sums over waves and brute-force convolution."""
 
+import copy
 import math
 
 import pytest
@@ -116,6 +117,12 @@ def test_chunks_cover_the_frames_once_and_stay_small(monkeypatch):
     model = ExposureModel(MASK, GRID, 4, Band.of((550e-9, 560e-9)))
     monkeypatch.setattr("torchmask.restoration.forward._CHUNK", 2 * 16 * 2 * math.prod(model.window.field.shape))
     assert [(part.start, part.stop) for part in model.chunks(5)] == [(0, 2), (2, 4), (4, 5)]
+
+
+def test_chunks_are_large_where_launches_cost_more_than_a_cache_saves():
+    model = ExposureModel(copy.deepcopy(MASK), GRID, 4).to("meta")
+    most = 2**28 // (16 * math.prod(model.window.field.shape))
+    assert [(part.start, part.stop) for part in model.chunks(most + 3)] == [(0, most), (most, most + 3)]
 
 
 def test_a_single_precision_twin_shares_the_basis_and_leaves_the_model_alone(random_exposures):

@@ -1,5 +1,7 @@
 """The objective and its fast gradients against automatic differentiation, finite differences and known parts."""
 
+import copy
+
 import pytest
 import torch
 from torch import nn
@@ -9,6 +11,7 @@ from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.band import Band
 from torchmask.restoration.aberrations import AberrationBasis, turbulent_basis
 from torchmask.restoration.adjoint import data_fidelity
+from torchmask.restoration.background import Background
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.priors import EdgePreserving, TotalVariation
@@ -43,6 +46,24 @@ def test_gradient_of_common_aberrations_is_that_of_one_variable(three_holes, ran
     misfits = [float(data_fidelity(model, image, at, frames, precision).value.sum()) for at in (z, z - z)]
     weight = (cost(z) - misfits[0]) - (cost(z - z) - misfits[1])
     assert weight == pytest.approx(0.5 * float(0.7 * (z[:, :8] ** 2).sum() + (z[0, 8:] ** 2).sum()), rel=1e-9)
+
+
+@pytest.mark.parametrize("background", [Background.NONE, Background.PER_FRAME, Background.COMMON])
+@pytest.mark.parametrize("band", [None, BAND])
+def test_an_evaluation_stays_on_its_device(background, band, three_holes, random_exposures, monkeypatch):
+    """The meta device stands for any other: it refuses to be mixed with the CPU, and has no values to copy to it."""
+    mask = copy.deepcopy(three_holes)  # it moves with the model
+    model, image, z, frames, precision = random_exposures(ExposureModel(mask, GRID, 4, band))
+    objective = MyopicObjective(model.beside(background), frames, precision, TotalVariation()).to("meta")
+    each = torch.ones(3, dtype=torch.float64, device="meta")
+    calibration = Calibration(each, each, 0.7)
+    image, z = image.to("meta"), z.to("meta")
+    monkeypatch.setattr(torch, "equal", lambda one, other: True)  # whether centres have changed, asked once a descent
+    found = objective.evaluator(calibration)
+    for parts in (found(image, z), objective.object_quadratic(image, z, calibration)):
+        assert all(part is None or part.device.type == "meta" for part in parts)
+    assert objective.frame_costs(image, z, calibration).device.type == "meta"
+    assert objective(image, z, calibration).device.type == "meta"
 
 
 # --- one value and its gradients, two ways

@@ -109,8 +109,10 @@ def test_inverse_hessian_is_that_of_the_bfgs_matrix(n_pairs):
     _, hessian, _ = bowl(1, n)
     memory = Corrections(size, hessian[0])
     pairs = []
-    for _ in range(n_pairs):
-        step = torch.randn(n, generator=generator, dtype=torch.float64)
+    for _ in range(n_pairs):  # as in a descent: steps move what was free at the last solve
+        free = torch.rand(n, generator=generator) < 0.7
+        memory.solve(torch.randn(n, generator=generator, dtype=torch.float64), free)
+        step = torch.randn(n, generator=generator, dtype=torch.float64) * free
         memory.add(step, hessian @ step)
         pairs.append((step, hessian @ step))
     kept = pairs[-size:]

@@ -44,6 +44,7 @@ def data_fidelity(
     want_aberrations: bool = True,
     unit: Tensor | float = 1.0,
     samples: OpenSamples | None = None,
+    want_samples: bool = False,
     parallel: Map = map,
 ) -> DataFidelity:
     """Return 1/2 sum precision (model + background - frames)^2 of every frame, and its gradients.
@@ -65,19 +66,21 @@ def data_fidelity(
     unit : (T, 1, 1) tensor or float
         What a background of 1, if it is common to all frames, amounts to in each of them.
     samples : OpenSamples, optional
-        Samples of a moved pupil; the gradients with respect to them are computed too. None: those of the model.
+        Samples of the pupil, such as those of a moved one. None: those of the model.
+    want_samples : bool
+        Whether to compute the gradients with respect to the samples too.
     parallel : callable
         Function like `map`, which is applied to a few frames at a time.
     """
-    shape, moved = model.window.field.shape, samples is not None
+    shape = model.window.field.shape
     samples = model.pupil.samples() if samples is None else samples
     spectrum = model.spectrum(image)
     conjugate = spectrum.conj().resolve_conj()
-    phase = samples.phase(z)  # for all frames at once: one large matrix product is faster than many small ones
+    fields = samples.field(samples.phase(z))  # of all frames at once: few large operations instead of many small ones
 
     @torch.no_grad()  # needed here too, as no_grad applies to one thread only
     def make(part: slice) -> Tensor:
-        transfer = torch.fft.rfft2(intensity(model.amplitude(samples, samples.field(phase[part]))))
+        transfer = torch.fft.rfft2(intensity(model.amplitude(samples, fields[part])))
         return model.window.crop(torch.fft.irfft2(transfer * spectrum, s=shape))
 
     background = model.background
@@ -87,7 +90,7 @@ def data_fidelity(
 
     @torch.no_grad()  # needed here too, as no_grad applies to one thread only
     def compare(part: slice) -> tuple[Tensor | None, ...]:
-        field = samples.field(phase[part])
+        field = fields[part]
         amplitude = model.amplitude(samples, field)
         transfer = torch.fft.rfft2(intensity(amplitude))
         weight = precision[part] if len(precision) > 1 else precision
@@ -98,11 +101,12 @@ def data_fidelity(
         if not (want_object or want_aberrations):
             return value, None, None, None
         back = torch.fft.rfft2(residual, s=shape)
-        by_object = (transfer.conj() * back).sum(0) if want_object else None
+        by_object = torch.linalg.vecdot(transfer, back, dim=0) if want_object else None
         if not want_aberrations:
             return value, by_object, None, None
-        back = pull_back_field(samples, amplitude, torch.fft.irfft2(back * conjugate, s=shape))
-        weights = along(field, back).sum(0) / samples.weights if moved else None
+        by_psf = torch.fft.irfft2(back.mul_(conjugate), s=shape)
+        back = pull_back_field(samples, amplitude.mul_(by_psf[:, None]))
+        weights = along(field, back).sum(0) / samples.weights if want_samples else None
         return value, by_object, across(field, back), weights
 
     values, by_object, slopes, weights = zip(*parallel(compare, model.chunks(len(z))), strict=True)
@@ -111,20 +115,22 @@ def data_fidelity(
         torch.cat(values),
         model.spectrum_adjoint(reduce(torch.add, by_object)).to(image.dtype) if want_object else None,
         None if slope is None else (slope @ samples.basis).to(z.dtype),
-        reduce(torch.add, weights) if moved else None,
-        slope.T @ z.to(slope.dtype) if moved and slope is not None else None,
+        reduce(torch.add, weights) if want_samples else None,
+        slope.T @ z.to(slope.dtype) if want_samples and slope is not None else None,
     )
 
 
 def pull_back(samples: OpenSamples, field: Tensor, amplitude: Tensor, psf_gradient: Tensor) -> Tensor:
     """Return the gradient (T, P) with respect to the phase from that with respect to the PSF (T, H', W')."""
-    return across(field, pull_back_field(samples, amplitude, psf_gradient))
+    return across(field, pull_back_field(samples, amplitude * psf_gradient[:, None]))
 
 
-def pull_back_field(samples: OpenSamples, amplitude: Tensor, psf_gradient: Tensor) -> Tensor:
-    """Return half the gradient with respect to the pupil field (T, P), real and imaginary part as a complex number."""
-    back = torch.fft.ifft2(amplitude * psf_gradient[:, None], norm="forward").flatten(1)
-    return back.index_select(1, samples.index)
+def pull_back_field(samples: OpenSamples, by_amplitude: Tensor) -> Tensor:
+    """Return half the gradient with respect to the pupil field (T, P), real and imaginary part as a complex number.
+
+    `by_amplitude` (T, wavelength, H', W') is the focal amplitude times the gradient with respect to the PSF.
+    """
+    return torch.fft.ifft2(by_amplitude, norm="forward").flatten(1).index_select(1, samples.index)
 
 
 def across(field: Tensor, back: Tensor) -> Tensor:

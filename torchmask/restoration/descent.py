@@ -36,23 +36,31 @@ def descend(
     image_scale, z_scale = scales(objective, state)
     step_scale = place_scale(objective, state) if moves else state.z.new_zeros(0)
     evaluate = objective.evaluator(state.calibration)
-    n, place, seen = state.image.numel(), state.image.numel() + state.z.numel(), 0
+    # What is known is no part of the vector: the minimiser's own work grows with its length.
+    n = state.image.numel() if Free.OBJECT in objective.free else 0
+    place = n + (state.z.numel() if objective.free & (Free.ABERRATIONS | Free.COMMON) else 0)
+    seen = 0
 
     def split(x: Tensor) -> tuple[Tensor, Tensor]:
-        return x[:n].view_as(state.image) * image_scale, x[n:place].view_as(state.z) * z_scale
+        image = x[:n].view_as(state.image) * image_scale if n else state.image
+        return image, x[n:place].view_as(state.z) * z_scale if place > n else state.z
 
     def cost(x: Tensor) -> tuple[float, Tensor]:
         value, by_image, by_z, by_step = evaluate(*split(x), x[place:] * step_scale if moves else None)
-        slopes = [(by_image * image_scale).flatten(), (by_z * z_scale).flatten()]
-        return float(value), torch.cat(slopes if by_step is None else [*slopes, by_step * step_scale])
+        slope = step_scale if by_step is None else by_step * step_scale
+        return float(value), joined(by_image * image_scale, by_z * z_scale, slope)
+
+    def joined(image: Tensor, z: Tensor, step: Tensor) -> Tensor:
+        return torch.cat([image.flatten()[:n], z.flatten()[: place - n], step])
 
     def after(x: Tensor, value: float, evaluations: int) -> None:
         nonlocal seen
         seen, new = evaluations, evaluations - seen
         listener(value, new, lambda: split(x))
 
-    parts = [(state.image / image_scale).flatten(), (state.z / z_scale).flatten(), torch.zeros_like(step_scale)]
-    start = torch.cat(parts)
+    start = joined(state.image / image_scale, state.z / z_scale, torch.zeros_like(step_scale))
+    if not len(start):
+        return state
     lower = torch.full_like(start, -torch.inf)
     lower[:n] = 0
     if moves:

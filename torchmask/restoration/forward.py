@@ -23,7 +23,8 @@ from torchmask.restoration.background import Background
 from torchmask.restoration.pupil import OpenSamples, SampledPupil
 
 MARGIN = 0.25  # minimum by which the object's field is wider, as a fraction of the frames' width
-_CHUNK = 2**20  # bytes of one complex work array, which then stays in a core's cache
+# bytes of one complex work array: what stays in a core's cache, and what amortises the launches of kernels elsewhere
+_CHUNK, _CHUNK_OF_DEVICE = 2**20, 2**28
 
 
 @dataclass(frozen=True)
@@ -168,9 +169,10 @@ class ExposureModel(nn.Module):
         return twin
 
     def chunks(self, n_frames: int) -> Iterator[slice]:
-        """Return slices of the frames whose work arrays fit into a core's cache."""
+        """Return slices of the frames whose work arrays fit into a core's cache, or large ones for other devices."""
         pixels = self.pupil.n_rasters * math.prod(self.window.field.shape)
-        size = max(1, _CHUNK // (2 * self.dtype.itemsize * pixels))
+        most = _CHUNK if self.device.type == "cpu" else _CHUNK_OF_DEVICE
+        size = max(1, most // (2 * self.dtype.itemsize * pixels))
         return (slice(start, min(start + size, n_frames)) for start in range(0, n_frames, size))
 
     def amplitude(self, samples: OpenSamples, field: Tensor) -> Tensor:
@@ -216,7 +218,7 @@ class ExposureModel(nn.Module):
 
 def intensity(amplitude: Tensor) -> Tensor:
     """Return the intensity (T, H', W') of amplitudes (T, wavelength, H', W'), summed over wavelengths."""
-    power = amplitude.real**2 + amplitude.imag**2
+    power = torch.addcmul(amplitude.real.square(), amplitude.imag, amplitude.imag)
     return power[:, 0] if power.shape[1] == 1 else power.sum(1)
 
 

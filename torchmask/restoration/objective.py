@@ -196,6 +196,8 @@ class MyopicObjective(nn.Module):
         Its third argument is a step (2,) that rotates [rad] and shrinks the mask (`placed.PlacedSamples`).
         """
         frames, precision, unit = self.scaled_data(calibration)
+        with torch.no_grad():
+            samples = self.model.pupil.samples()  # once: whether they are up to date is asked of the device
         by_object = Free.OBJECT in self.free
         by_aberrations = bool(self.free & (Free.ABERRATIONS | Free.COMMON))
 
@@ -211,7 +213,8 @@ class MyopicObjective(nn.Module):
                 want_object=by_object,
                 want_aberrations=by_aberrations or placed is not None,
                 unit=unit,
-                samples=None if placed is None else placed.samples,
+                samples=samples if placed is None else placed.samples,
+                want_samples=placed is not None,
                 parallel=self.parallel,
             )
             penalty, slope = self._penalty_and_slope(image)

@@ -71,22 +71,21 @@ class Corrections:
         self._free = torch.ones_like(like, dtype=torch.bool)
         self._free_products = like.new_zeros(2 * size, 2 * size)
         self._order: list[int] = []  # oldest first
+        self._new: int | None = None  # pair whose products are not known yet
         self._theta = 1.0
 
     def add(self, step: Tensor, change: Tensor) -> None:
-        """Add a pair, if its curvature is positive, and drop the oldest when there are too many."""
+        """Add a pair, if its curvature is positive, and drop the oldest when there are too many.
+
+        The step must have followed from `solve`: it is 0 in the variables that were not free there.
+        """
         curvature, energy = float(step @ change), float(change @ change)
         if not curvature > _CURVED * energy:
             return
-        row = self._order.pop(0) if len(self._order) == self._size else len(self._order)
-        self._order.append(row)
+        self._new = self._order.pop(0) if len(self._order) == self._size else len(self._order)
+        self._order.append(self._new)
         self._theta = energy / curvature
-        rows, vectors = [row, self._size + row], torch.stack([change, step])
-        self._pairs[rows] = vectors
-        # Reading all pairs takes most of the time, so they are read once for both tables.
-        products = (torch.cat([vectors, vectors * self._free]) @ self._pairs.T).split(2)
-        for table, found in zip((self._products, self._free_products), products, strict=True):
-            table[rows], table[:, rows] = found, found.T
+        self._pairs[self._new], self._pairs[self._size + self._new] = change, step
 
     def forget(self) -> None:
         """Drop all pairs, so that the approximate Hessian is the identity."""
@@ -103,12 +102,9 @@ class Corrections:
         """
         gradient, theta = gradient * free, self._theta
         if not self._order:
+            self._free = free
             return gradient
-        changed = (free != self._free).nonzero().flatten()
-        entered = self._pairs[:, changed]
-        sign = free[changed].to(gradient) * 2 - 1
-        self._free_products += (entered * sign) @ entered.T
-        self._free = free
+        products = self._update(gradient, free)
         y = torch.tensor(self._order, device=gradient.device)
         w = torch.cat([y, y + self._size])
         scale = gradient.new_ones(len(w))
@@ -119,8 +115,32 @@ class Corrections:
         middle = torch.cat([torch.cat([-sy.diag().diag(), older.T], 1), torch.cat([older, theta * ss], 1)])
         middle = middle - self._free_products[w[:, None], w] * (scale[:, None] * scale) / theta
         weights = torch.zeros_like(self._pairs[:, 0])
-        weights[w] = scale * torch.linalg.solve(middle, scale * (self._pairs @ gradient)[w])
+        weights[w] = scale * torch.linalg.solve(middle, scale * products[w])
         return (gradient + (weights @ self._pairs) * free / theta) / theta
+
+    def _update(self, gradient: Tensor, free: Tensor) -> Tensor:
+        """Update all products to the latest pair and to the variables now `free`, and return those with `gradient`.
+
+        Reading all pairs takes most of the time, so they are read once for all products.
+        """
+        vectors, row = [gradient], self._new
+        if row is not None:
+            rows = [row, self._size + row]
+            change, step = self._pairs[rows]
+            vectors += [change, step, change * self._free]
+        products, *new = (self._pairs @ torch.stack(vectors).T).T
+        if row is not None:
+            change, step, free_change = new  # a step is 0 where variables were not free
+            for table, found in ((self._products, change), (self._free_products, free_change)):
+                found = torch.stack([found, step])
+                table[rows], table[:, rows] = found, found.T
+            self._new = None
+        changed = (free != self._free).nonzero().flatten()
+        entered = self._pairs[:, changed]
+        sign = free[changed].to(gradient) * 2 - 1
+        self._free_products += (entered * sign) @ entered.T
+        self._free = free
+        return products
 
 
 def minimize_bounded(
