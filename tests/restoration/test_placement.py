@@ -37,7 +37,7 @@ GRID = Grid.nyquist(1.05, 550e-9, (24, 30))
 def gradient_in_step(model, exposures, step):
     image, z, frames, precision = exposures
     placed = PlacedSamples(model.pupil, step)
-    found = data_fidelity(model, image, z, frames, precision, samples=placed.samples)
+    found = data_fidelity(model, image, z, frames, precision, samples=placed.samples, want_samples=True)
     return float(found.value.sum()), placed.pull_back(found.weight_gradient, found.basis_gradient)
 
 
