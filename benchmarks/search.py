@@ -43,6 +43,8 @@ TELESCOPES = {
     "vlt": Telescope(diameter=8.2, central_obstruction=1.12, vane_width=0.05, vane_angles=(45.0, 135.0, 225.0, 315.0)),
 }
 
+_TRIAL = 0.05  # of the time of a search, which measures what the rest of it buys
+
 METHODS: dict[str, dict[str, Any]] = {
     "cma": {"method": "cma", "refine": False},
     "cma + gradient": {"method": "cma", "refine": True},
@@ -152,16 +154,18 @@ def main(config: Config) -> None:
 
 
 def affordable(case: Case, n: int, wanted: float, clock: Callable[[], float], options: dict[str, Any]) -> int:
-    """Evaluations that so many seconds buy, from the times of a small and a larger budget."""
-    times = []
-    small, large = 320, 1600
-    case.search(n, seed=0, budget=small, **options)  # first use of everything
-    for budget in (small, large):
+    """Evaluations that so many seconds buy, from the times of two budgets, the larger one long enough to tell."""
+    budget, before = 320, 0.0
+    case.search(n, seed=0, budget=budget, **options)  # first use of everything
+    while True:
         start = clock()
         case.search(n, seed=0, budget=budget, **options)
-        times.append(clock() - start)
-    rate = (large - small) / max(times[1] - times[0], 0.2 * times[1])
-    return max(small, int(large + rate * (wanted - times[1])))
+        spent = clock() - start
+        if spent > _TRIAL * wanted:
+            # what does not grow with the budget, as the refinement, is in both times
+            rate = 0.75 * budget / max(spent - before, 0.2 * spent)
+            return max(budget, int(budget + rate * (wanted - spent)))
+        budget, before = 4 * budget, spent
 
 
 if __name__ == "__main__":

@@ -211,15 +211,44 @@ def test_the_best_point_and_the_edges_of_the_map(plan):
     assert (best.n_subapertures, best.hole_diameter) == (3, 0.35)  # pistons alone: the most light wins
     assert plan.at_edge("hole_diameter")
     text = str(plan)
-    wider = "is the last that was tried: a larger one may be better, so give"
+    wider = "is the last on the map: a larger one may be better, so give"
     assert f"The best hole diameter, 0.35 m, {wider} hole_diameters above it too." in text
     assert f"The best exposure, 6 ms, {wider} exposures above it too." in text
     assert "The best number of holes" not in text  # of 0.35 m no more were tried than can be built
     least = dataclasses.replace(plan, choices=tuple(dataclasses.replace(c, blind_mse=c.exposure) for c in plan.choices))
-    smaller = "is the first that was tried: a smaller one may be better, so give"
+    smaller = "is the first on the map: a smaller one may be better, so give"
     assert f"The best exposure, 2 ms, {smaller} exposures below it too." in str(least)
     assert text.count("\n| 3 |") == 6
     assert "do not fit" in text
+
+
+def test_no_point_beyond_what_was_tried_is_the_best(monkeypatch, quick):
+    """Without turbulence in the prediction more light always wins, so the widest holes and longest exposures would."""
+    tried = SuccessMap((1, 1e6), (1, 1e12), (0.1, 1.0), *np.ones((3, 2, 2, 2)))
+    known = SmearingMap((1, 1e12), (0, 2.0), (0, 100), np.ones((2, 2)), np.ones((2, 2)))
+    monkeypatch.setattr(torchmask.planning.plan, "success_map", lambda: tried)
+    monkeypatch.setattr(torchmask.planning.plan, "smearing_map", lambda: known)
+    instrument, holes = make(), (0.09, 0.15, 0.35)
+    tau0 = instrument.seeing.tau0
+    exposures = (tau0, 2 * tau0, 9 * tau0)
+    with pytest.warns(UserWarning, match="no plan chooses such a point"):
+        found = plan_observation(instrument, n_subapertures=(3,), hole_diameters=holes, exposures=exposures, **TINY)
+    assert (found.best.hole_diameter, found.best.exposure) == (0.15, pytest.approx(2 * tau0))  # r0 is 0.15 m
+    least = min(found.choices, key=lambda choice: choice.blind_mse)
+    assert least.is_limit
+    assert least.blind_mse < found.best.blind_mse
+    assert set(least.blind.harder) == {"d_over_r0", "exposure"}
+    text = str(found)
+    assert "The best hole diameter, 0.15 m, is the largest on the map at which blind restorations were tried" in text
+    assert "they lose more beyond" in text
+    assert "give exposures above it" not in text
+    assert f"| > {least.blind_mse:.4f} | - |" in text
+    figure = plan_figure(found)
+    assert any(line.get_marker() == "^" for line in figure.axes[1].lines)
+    with pytest.warns(UserWarning, match="d/r0 from 0.1 to 1"):
+        beyond = plan_observation(instrument, n_subapertures=(3,), hole_diameters=(0.35,), exposures=(tau0,), **TINY)
+    assert beyond.best.is_limit
+    assert "At no point of the map were blind restorations tried" in str(beyond)
 
 
 def test_what_blind_restorations_lose_moves_the_best_point(monkeypatch, plan, quick):

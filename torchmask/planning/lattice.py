@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,6 +22,7 @@ class Axis:
     values : in rising order, at least two
     logarithmic : whether tables are interpolated evenly in its logarithm
     may_be_zero : whether 0 is a value of the quantity
+    harder : whether restorations lose more and more beyond the last value, so that its neighbour tells nothing there
 
     Raises ValueError if the values are too few, negative or out of order, or 0 where that is none.
 
@@ -35,6 +37,7 @@ class Axis:
     values: Sequence[float]
     logarithmic: bool = False
     may_be_zero: bool = False
+    harder: bool = False
 
     def __post_init__(self) -> None:
         if len(self.values) < 2 or not (np.diff(self.values) > 0).all() or not self._can_be(self.values[0]):
@@ -63,30 +66,43 @@ class Axis:
         """Return whether a value lies between the ends."""
         return self.values[0] * (1 - _ROUNDING) <= value <= self.values[-1] * (1 + _ROUNDING)
 
+    def is_harder(self, value: float) -> bool:
+        """Return whether restorations lose more at a value than at any that was tried, by an unknown amount."""
+        return self.harder and value > self.values[-1] * (1 + _ROUNDING)
 
-def locate(
-    axes: Sequence[Axis], point: Sequence[float], told: Collection[str] = ()
-) -> tuple[list[float], tuple[str, ...]]:
-    """Return the fractional indices of a point, and the names of the axes that do not hold it.
 
-    `told` names those of which a warning said so before.
+class Located(NamedTuple):
+    """A point of a lattice: its fractional indices, the names of the axes that do not hold it, and of those among them
+    along which restorations lose more than at any point that was tried."""
+
+    places: list[float]
+    outside: tuple[str, ...]
+    harder: tuple[str, ...]
+
+
+def locate(axes: Sequence[Axis], point: Sequence[float], told: Collection[str] = ()) -> Located:
+    """Find a point on a lattice; `told` names the axes of which a warning said before that they do not hold it.
 
     Raises ValueError for a value that cannot be.
 
     Warns
     -----
     UserWarning
-        For each of those axes that was not told before; its nearest end is taken.
+        For each axis that does not hold the point and was not told before; its nearest end is taken.
     """
-    places = [axis.place(value) for axis, value in zip(axes, point, strict=True)]
-    outside = [axis for axis, value in zip(axes, point, strict=True) if not axis.holds(value)]
+    known = list(zip(axes, point, strict=True))
+    places = [axis.place(value) for axis, value in known]
+    outside = [axis for axis, value in known if not axis.holds(value)]
+    harder = tuple(axis.name for axis, value in known if axis.is_harder(value))
     for axis in (axis for axis in outside if axis.name not in told):
+        then = "beyond, what they lose is taken to be that of the nearest tried"
+        if axis.name in harder:
+            then = "they lose more beyond the last, by how much is not known, so that no plan chooses such a point"
+        first, last = axis.values[0], axis.values[-1]
         warnings.warn(
-            f"blind restorations were tried for {axis.words} from {axis.values[0]:g} to {axis.values[-1]:g}: beyond, "
-            "what they lose is taken to be that of the nearest tried",
-            stacklevel=3,
+            f"blind restorations were tried for {axis.words} from {first:g} to {last:g}: {then}", stacklevel=3
         )
-    return places, tuple(axis.name for axis in outside)
+    return Located(places, tuple(axis.name for axis in outside), harder)
 
 
 def interpolate(table: np.ndarray, places: Sequence[float]) -> float:

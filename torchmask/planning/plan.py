@@ -5,17 +5,16 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 from torchmask.design.constraint_base import Constraint, Infeasible
 from torchmask.design.observed import change_light, instant_criterion, instrument_criterion
 from torchmask.design.rules import MaskRules
 from torchmask.design.search import search_mask
-from torchmask.grid import ARCSEC
 from torchmask.instrument.instrument import Instrument
 from torchmask.optics.packing import largest_fill_factor
 from torchmask.optics.pupil import Aperture
+from torchmask.planning.axes import at_exposures, bands_of, or_default, positive, sampled, whole
 from torchmask.planning.result import AXES, Choice, ObservationPlan
 from torchmask.planning.smearing import phase_spread, smearing_map
 from torchmask.planning.success import BlindOutlook, success_map
@@ -104,16 +103,16 @@ def plan_observation(
     >>> plan.best.frames
     7
     """
-    lengths = _positive("exposures", _default(exposures, _EXPOSURES, instrument.seeing.tau0), "s")
+    lengths = positive("exposures", or_default(exposures, _EXPOSURES, instrument.seeing.tau0), "s")
     left_out: list[str] = []
-    bands = [instrument] if widths is None else _bands(instrument, _positive("widths", tuple(widths), "m"))
-    bands = _sampled(bands, aperture, left_out)
-    exposed = [one for band in bands for one in _exposed(band, lengths, left_out)]
+    bands = [instrument] if widths is None else bands_of(instrument, positive("widths", tuple(widths), "m"))
+    bands = sampled(bands, aperture, left_out)
+    exposed = [one for band in bands for one in at_exposures(band, lengths, left_out)]
     if not exposed:
         raise ValueError(f"no exposure is short enough: {left_out[-1]}")
     if aperture is None:
-        numbers, sizes = _whole(n_subapertures), _default(hole_diameters, _HOLES, instrument.site.r0)
-        points = tuple(itertools.product(numbers, _positive("hole_diameters", sizes, "m")))
+        numbers, sizes = whole(n_subapertures), or_default(hole_diameters, _HOLES, instrument.site.r0)
+        points = tuple(itertools.product(numbers, positive("hole_diameters", sizes, "m")))
         settings = {"budget": budget, "seed": seed, "n_frequencies": n_frequencies}
         masks = _search(instrument, points, _rules(instrument, constraints), settings, left_out, callback)
     else:
@@ -121,64 +120,8 @@ def plan_observation(
     if not masks:
         raise ValueError(f"no point of the map can be built: {'; '.join(left_out)}")
     choices = tuple(_measure(exposed, masks, n_frequencies, callback))
-    return ObservationPlan(instrument, choices, masks, tuple(dict.fromkeys(left_out)))
-
-
-def _default(given: Sequence[float] | None, factors: Sequence[float], unit: float) -> tuple[float, ...]:
-    return tuple(factor * unit for factor in factors) if given is None else tuple(given)
-
-
-def _positive(name: str, values: tuple[float, ...], unit: str) -> tuple[float, ...]:
-    if not values or not all(math.isfinite(value) and value > 0 for value in values) or len(set(values)) < len(values):
-        raise ValueError(f"{name} are {values}: at least one is needed, none twice, all finite and positive, in {unit}")
-    return tuple(sorted(float(value) for value in values))
-
-
-def _whole(values: Sequence[int]) -> tuple[int, ...]:
-    if (
-        not values
-        or not all(float(value).is_integer() and value >= 2 for value in values)
-        or len(set(values)) < len(values)
-    ):
-        raise ValueError(f"n_subapertures are {tuple(values)}: at least one is needed, none twice, whole, at least 2")
-    return tuple(sorted(int(value) for value in values))
-
-
-def _bands(instrument: Instrument, widths: Sequence[float]) -> list[Instrument]:
-    """Return the instrument with each band, on one grid: errors on different pixels cannot be compared."""
-    scale = instrument.with_width(max(widths)).pixel_scale / ARCSEC
-    known = replace(instrument, camera=replace(instrument.camera, pixel_scale=scale))
-    return [known.with_width(width) for width in widths]
-
-
-def _exposed(instrument: Instrument, lengths: Sequence[float], left_out: list[str]) -> list[Instrument]:
-    """Return the instrument at each exposure for which there is time."""
-    found = []
-    for exposure in lengths:
-        try:
-            found.append(instrument.with_exposure(exposure))
-        except ValueError as error:
-            left_out.append(str(error))
-    return found
-
-
-def _sampled(bands: Sequence[Instrument], aperture: Aperture | None, left_out: list[str]) -> list[Instrument]:
-    """Return the bands, from narrow to wide, in which pixels sample the image of the aperture, or of the telescope;
-    ValueError if there is none."""
-    found: list[Instrument] = []
-    for instrument in bands:
-        diameter = instrument.telescope.diameter  # which some real masks reach beyond
-        extent = diameter if aperture is None else min(diameter, float(aperture.extent))
-        try:
-            replace(instrument.grid(), wavelength=instrument.band.shortest).require_sampling(extent)
-        except ValueError as error:
-            if not found:  # wider ones are undersampled even more
-                raise
-            assert instrument.width is not None  # a filter has no others beside it
-            left_out.append(f"a band of {1e9 * instrument.width:.4g} nm is left out: {error}")
-        else:
-            found.append(instrument)
-    return found
+    known = {} if aperture is not None and aperture.is_full else _tried_up_to(instrument)
+    return ObservationPlan(instrument, choices, masks, tuple(dict.fromkeys(left_out)), known)
 
 
 def _rules(instrument: Instrument, constraints: Sequence[Constraint]) -> tuple[Constraint, ...]:
@@ -286,6 +229,19 @@ def _blind_outlook(instrument: Instrument, hole: float, area: float) -> BlindOut
     spread = phase_spread(instrument.band.relative_width, diameter / r0)
     exposure = instrument.exposure / instrument.seeing.tau0
     return smearing_map().outlook(instants, n_photons=photons, exposure=exposure, spread=spread)
+
+
+def _tried_up_to(instrument: Instrument) -> dict[str, float]:
+    """Return the largest hole diameter [m], exposure [s] and band [m] at which blind restorations were tried."""
+    site, smearing = instrument.site, smearing_map()
+    most = {
+        "hole_diameter": success_map().d_over_r0[-1] * site.r0,
+        "exposure": smearing.exposures[-1] * instrument.seeing.tau0,
+    }
+    spread = phase_spread(instrument.band.relative_width, instrument.telescope.diameter / site.r0)
+    if instrument.width is not None and spread > 0:  # a single wavelength stands for a band without spread
+        most["width"] = smearing.spreads[-1] / spread * instrument.width
+    return most
 
 
 def _tell(callback: Callback | None, stage: str, step: int, n_steps: int, relative_mse: float) -> None:

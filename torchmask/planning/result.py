@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +24,8 @@ class Choice:
     electrons per frame (of the sky, per pixel)
     relative_mse, above_floor : predicted for a linear estimate that knows the PSFs, and that less what no mask of this
         diameter can avoid
-    blind_mse : expected where the aberrations have to be found; `relative_mse` for a full pupil
+    blind_mse : expected where the aberrations have to be found, at least so much where that was not tried;
+        `relative_mse` for a full pupil
     blind : what was measured of such restorations; None for a full pupil, of which no map is known
     """
 
@@ -39,6 +41,11 @@ class Choice:
     blind_mse: float
     blind: BlindOutlook | None = None
 
+    @property
+    def is_limit(self) -> bool:
+        """Whether `blind_mse` is only a lower limit, since blind restorations were tried under easier conditions."""
+        return self.blind is not None and bool(self.blind.harder)
+
 
 @dataclass(frozen=True)
 class ObservationPlan:
@@ -48,6 +55,7 @@ class ObservationPlan:
     choices : every point that can be built
     masks : by number of holes and hole diameter [m]
     left_out : why points of the axes are missing
+    tried_up_to : the largest value of an axis at which blind restorations were tried; empty for a full pupil
 
     Examples
     --------
@@ -73,11 +81,14 @@ class ObservationPlan:
     choices: tuple[Choice, ...]
     masks: dict[tuple[int, float], Aperture]
     left_out: tuple[str, ...] = ()
+    tried_up_to: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def best(self) -> Choice:
-        """Where the predicted error of a blind restoration is least."""
-        return min(self.choices, key=lambda choice: choice.blind_mse)
+        """Where the predicted error of a blind restoration is least: of the points where more than a limit is known, if
+        there are any."""
+        known = [choice for choice in self.choices if not choice.is_limit]
+        return min(known or self.choices, key=lambda choice: choice.blind_mse)
 
     @property
     def best_known(self) -> Choice:
@@ -103,9 +114,16 @@ class ObservationPlan:
         return found if best.width in (None, found.width) else found.with_width(best.width)
 
     def at_edge(self, name: str) -> bool:
-        """Return whether the best point is the first or last along an axis, so that the optimum may lie beyond."""
-        line = self.axis(name)
-        return len(line) > 1 and getattr(self.best, name) in (getattr(line[0], name), getattr(line[-1], name))
+        """Return whether the best point is the first or last along an axis, so that the optimum may lie beyond.
+
+        Points of which only a limit is known are not counted beside others.
+        """
+        line = self._known(name)
+        return len(self.axis(name)) > 1 and self.best in (line[0], line[-1])
+
+    def _known(self, name: str) -> list[Choice]:
+        """Return the points along an axis of which as much is known as of the best one."""
+        return [choice for choice in self.axis(name) if choice.is_limit == self.best.is_limit]
 
     @property
     def best_exposure(self) -> float:
@@ -121,7 +139,7 @@ class ObservationPlan:
         return None if self.best.width is None else self._between("width")
 
     def _between(self, name: str) -> float:
-        line, best = self.axis(name), getattr(self.best, name)
+        line, best = self._known(name), getattr(self.best, name)
         place = line.index(self.best)
         if place in (0, len(line) - 1):
             return best
@@ -132,12 +150,16 @@ class ObservationPlan:
     def _edge(self, name: str) -> str:
         """Return a sentence on an axis along which the best point is the first or last."""
         axis, best = _WORDS[name], getattr(self.best, name)
-        first = self.best is self.axis(name)[0]
+        told = f"The best {axis.words}, {axis.scale * best:.4g}{axis.unit}, is the"
+        first = self.best is self._known(name)[0]
+        limit = self.tried_up_to.get(name, math.inf)
+        if not first and (self.best is not self.axis(name)[-1] or best > 0.999 * limit):
+            return (
+                f"{told} largest on the map at which blind restorations were tried, up to "
+                f"{axis.scale * limit:.4g}{axis.unit}: they lose more beyond, by how much is not known."
+            )
         place, beyond, side = ("first", "a smaller", "below") if first else ("last", "a larger", "above")
-        return (
-            f"The best {axis.words}, {axis.scale * best:.4g}{axis.unit}, is the {place} that was tried: {beyond} one "
-            f"may be better, so give {axis.parameter} {side} it too."
-        )
+        return f"{told} {place} on the map: {beyond} one may be better, so give {axis.parameter} {side} it too."
 
     def __str__(self) -> str:
         best, told = self.best, self.best_instrument
@@ -150,6 +172,7 @@ class ObservationPlan:
             f"{best.relative_mse - best.above_floor:.4g}, with {_point(best)} "
             f"({best.hole_diameter / told.site.r0:.2g} r0, {best.exposure / told.seeing.tau0:.2g} tau0){band} and "
             f"{best.photons:.4g} photons in each.",
+            *_limit_line(best),
             _blind_line(best.blind),
             f"Predicted for a linear estimate that knows the PSFs: {best.relative_mse:.4g}; the least would be "
             f"{self.best_known.relative_mse:.4g}, with {_point(self.best_known)}.",
@@ -168,6 +191,15 @@ def _point(choice: Choice) -> str:
         f"{choice.n_subapertures} holes of {choice.hole_diameter:.4g} m, {choice.frames} frames of "
         f"{1e3 * choice.exposure:.4g} ms"
     )
+
+
+def _limit_line(best: Choice) -> list[str]:
+    if not best.is_limit:
+        return []
+    return [
+        "At no point of the map were blind restorations tried: each of their errors is a lower limit, that of the "
+        "nearest conditions which were. Restore simulated frames before you trust this plan."
+    ]
 
 
 def _blind_line(blind: BlindOutlook | None) -> str:
@@ -222,6 +254,6 @@ def _cells(choice: Choice) -> list[str]:
         f"{choice.sky:.4g}",
         f"{choice.relative_mse:.4f}",
         f"{choice.above_floor:.4f}",
-        f"{choice.blind_mse:.4f}",
-        "-" if choice.blind is None else f"{100 * choice.blind.success:.0f} %",
+        f"{'> ' * choice.is_limit}{choice.blind_mse:.4f}",
+        "-" if choice.blind is None or choice.is_limit else f"{100 * choice.blind.success:.0f} %",
     ]

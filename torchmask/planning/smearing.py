@@ -70,8 +70,8 @@ class SmearingMap:
     def _axes(self) -> tuple[Axis, Axis, Axis]:
         return (
             Axis("n_photons", "photons per frame", self.n_photons, logarithmic=True),
-            Axis("exposure", "exposures over tau0", self.exposures, may_be_zero=True),
-            Axis("spread", "spreads of the phase across the band in rad", self.spreads, may_be_zero=True),
+            Axis("exposure", "exposures over tau0", self.exposures, may_be_zero=True, harder=True),
+            Axis("spread", "spreads of the phase across the band in rad", self.spreads, may_be_zero=True, harder=True),
         )
 
     def outlook(self, instants: BlindOutlook, *, n_photons: float, exposure: float, spread: float) -> BlindOutlook:
@@ -106,13 +106,12 @@ class SmearingMap:
             exposure = max(exposure, self.exposures[0])
         if spread >= 0:
             spread = max(spread, self.spreads[0])
-        (light, long, wide), outside = locate(self._axes, (n_photons, exposure, spread), instants.outside)
+        (light, long, wide), outside, harder = locate(self._axes, (n_photons, exposure, spread), instants.outside)
         logarithm = 0.0
         for ratio, place in ((self.exposure_ratio, long), (self.band_ratio, wide)):
             logarithm += interpolate(np.log(ratio), (light, place)) - interpolate(np.log(ratio), (light, 0)) / 2
-        return replace(
-            instants, restored=math.exp(logarithm), outside=tuple(dict.fromkeys((*instants.outside, *outside)))
-        )
+        outside = tuple(dict.fromkeys((*instants.outside, *outside)))
+        return replace(instants, restored=math.exp(logarithm), outside=outside, harder=(*instants.harder, *harder))
 
 
 @functools.cache

@@ -27,6 +27,7 @@ class BlindOutlook:
     success : chance that this ratio is within 1.3
     low, high : Wilson's interval of that chance at one standard error, from the number of restorations
     outside : names of what lies outside what was tried, for which its nearest edge was taken
+    harder : those of them that make restorations lose more than at any point that was tried: the rest is a lower limit
     restored : its score over cost times the one predicted for instants in narrow light: by how much restorations differ
         from the linear estimate that is predicted, and what exposure and band do to them
 
@@ -42,6 +43,7 @@ class BlindOutlook:
     high: float
     outside: tuple[str, ...] = ()
     restored: float = 1.0
+    harder: tuple[str, ...] = ()
 
     def mse(self, relative_mse: float, above_floor: float) -> float:
         """Return what a relative error predicted for known PSFs of instants in narrow light becomes.
@@ -92,7 +94,7 @@ class SuccessMap:
         return (
             Axis("n_frames", "numbers of frames", self.n_frames, logarithmic=True),
             Axis("n_photons", "photons per frame", self.n_photons, logarithmic=True),
-            Axis("d_over_r0", "d/r0", self.d_over_r0),
+            Axis("d_over_r0", "d/r0", self.d_over_r0, harder=True),
         )
 
     def outlook(self, d_over_r0: float, n_photons: float, n_frames: float) -> BlindOutlook:
@@ -120,7 +122,7 @@ class SuccessMap:
         UserWarning
             If the point lies outside the map, whose nearest edge is taken.
         """
-        places, outside = locate(self._axes, (n_frames, n_photons, d_over_r0))
+        places, outside, harder = locate(self._axes, (n_frames, n_photons, d_over_r0))
         chance = self.succeeded / self.tried
         middle, half = chance + 0.5 / self.tried, np.sqrt(chance * (1 - chance) / self.tried + 0.25 / self.tried**2)
         low, high = ((middle + side * half) / (1 + 1 / self.tried) for side in (-1, 1))
@@ -130,6 +132,7 @@ class SuccessMap:
             low=interpolate(low, places),
             high=interpolate(high, places),
             outside=outside,
+            harder=harder,
         )
 
 

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from torchmask.planning.result import ObservationPlan
+from torchmask.planning.result import Choice, ObservationPlan
 from torchmask.viz import style as drawing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+_RING: dict[str, Any] = {"markersize": 13, "fillstyle": "none", "color": drawing.COLORS[1]}
 
 
 @drawing.styled
@@ -19,7 +22,7 @@ def plan_figure(plan: ObservationPlan) -> Figure:
     """Draw the predicted error of blind restorations over number and size of holes, exposure and band width.
 
     The exposure has a curve for each number of holes. Each panel is at the best of all else; those of one mask or one
-    width are left out. A ring marks the best point.
+    width are left out. A ring marks the best point, an arrow upwards a lower limit, where nothing was tried.
     """
     several, widths = len(plan.masks) > 1, plan.axis("width")
     panels = [1.25] * several + [1.5] + [1.2] * (len(widths) > 1)
@@ -29,28 +32,38 @@ def plan_figure(plan: ObservationPlan) -> Figure:
     _draw_exposures(axes[int(several)], plan)
     if len(widths) > 1:
         ax, best = axes[-1], plan.best
-        points = [(1e9 * c.width, c.blind_mse) for c in (*widths, best) if c.width is not None]
-        ax.plot(*zip(*points[:-1], strict=True), "o-", color=drawing.COLORS[0], markersize=4)
-        ax.plot(*points[-1], "o", markersize=13, fillstyle="none", color=drawing.COLORS[1])
+        _draw_line(ax, widths, "width", 1e9, drawing.COLORS[0])
+        ax.plot(1e9 * (best.width or 0.0), best.blind_mse, "o", **_RING)
         ax.set(xlabel="width of the band [nm]", ylabel="relative MSE, blind", title=f"at {1e3 * best.exposure:.3g} ms")
     return figure
+
+
+def _draw_line(ax: Axes, line: Sequence[Choice], axis: str, scale: float, color: str, label: str | None = None) -> None:
+    """Draw the errors along an axis, with an arrow upwards at each that is a lower limit."""
+    for is_limit, style in ((False, {"marker": "o", "label": label}), (True, {"marker": "^", "linestyle": "none"})):
+        points = [(scale * getattr(c, axis), c.blind_mse) for c in line if c.is_limit == is_limit]
+        if points:
+            ax.plot(*zip(*points, strict=True), color=color, markersize=4 if not is_limit else 6, **style)
 
 
 def _draw_map(figure: Figure, ax: Axes, plan: ObservationPlan) -> None:
     best, r0 = plan.best, plan.instrument.site.r0
     numbers = sorted({n for n, _ in plan.masks})
     holes = sorted({hole for _, hole in plan.masks})
-    errors = np.full((len(numbers), len(holes)), np.nan)
+    errors, limits = np.full((len(numbers), len(holes)), np.nan), np.zeros((len(numbers), len(holes)), bool)
     for choice in plan.choices:
         if (choice.exposure, choice.width) == (best.exposure, best.width):
-            errors[numbers.index(choice.n_subapertures), holes.index(choice.hole_diameter)] = choice.blind_mse
+            cell = numbers.index(choice.n_subapertures), holes.index(choice.hole_diameter)
+            errors[cell], limits[cell] = choice.blind_mse, choice.is_limit
     ax.imshow(errors, origin="lower", cmap="viridis", aspect="auto")
     middle = (np.nanmin(errors) + np.nanmax(errors)) / 2
     for (row, column), error in np.ndenumerate(errors):
-        text, color = ("does not fit", drawing.FAINT) if np.isnan(error) else (f"{error:.3f}", "white")
+        text, color = f"> {error:.3f}" if limits[row, column] else f"{error:.3f}", "white"
+        if np.isnan(error):
+            text, color = "does not fit", drawing.FAINT
         ax.text(column, row, text, ha="center", va="center", fontsize=8, color="black" if error > middle else color)
     place = holes.index(best.hole_diameter), numbers.index(best.n_subapertures)
-    ax.plot(*place, "o", markersize=34, fillstyle="none", color=drawing.COLORS[1])
+    ax.plot(*place, "o", **(_RING | {"markersize": 34}))
     ax.set_xticks(range(len(holes)), [f"{hole:.3g}\n{hole / r0:.2g} r0" for hole in holes])
     ax.set_yticks(range(len(numbers)), [str(n) for n in numbers])
     ax.set(xlabel="hole diameter [m]", ylabel="number of holes", title=f"at {1e3 * best.exposure:.3g} ms")
@@ -66,16 +79,8 @@ def _draw_exposures(ax: Axes, plan: ObservationPlan) -> None:
             if c.n_subapertures == n and (c.hole_diameter, c.width) == (best.hole_diameter, best.width)
         ]
         line.sort(key=lambda choice: choice.exposure)
-        if line:
-            ax.plot(
-                [1e3 * c.exposure for c in line],
-                [c.blind_mse for c in line],
-                "o-",
-                color=color,
-                label=f"{n} holes",
-                markersize=4,
-            )
-    ax.plot(1e3 * best.exposure, best.blind_mse, "o", markersize=13, fillstyle="none", color=drawing.COLORS[1])
+        _draw_line(ax, line, "exposure", 1e3, color, f"{n} holes")
+    ax.plot(1e3 * best.exposure, best.blind_mse, "o", **_RING)
     tau0 = plan.instrument.with_exposure(best.exposure).seeing.tau0
     ax.axvline(1e3 * tau0, color=drawing.FAINT, linestyle="--", linewidth=1)
     ax.annotate("tau0", (1e3 * tau0, 1), xycoords=("data", "axes fraction"), fontsize=8, ha="left", va="top")
