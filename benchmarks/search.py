@@ -155,15 +155,14 @@ def main(config: Config) -> None:
 
 def affordable(case: Case, n: int, wanted: float, clock: Callable[[], float], options: dict[str, Any]) -> int:
     """Evaluations that so many seconds buy, from the times of two budgets, the larger one long enough to tell."""
-    budget, before = 320, 0.0
+    budget, before = 320, math.inf
     case.search(n, seed=0, budget=budget, **options)  # first use of everything
     while True:
         start = clock()
         case.search(n, seed=0, budget=budget, **options)
         spent = clock() - start
-        if spent > _TRIAL * wanted:
-            # what does not grow with the budget, as the refinement, is in both times
-            rate = 0.75 * budget / max(spent - before, 0.2 * spent)
+        if spent > max(_TRIAL * wanted, 1.5 * before):  # what does not grow with the budget is in both times
+            rate = 0.75 * budget / (spent - before)
             return max(budget, int(budget + rate * (wanted - spent)))
         budget, before = 4 * budget, spent
 

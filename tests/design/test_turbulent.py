@@ -48,6 +48,17 @@ def some_frequencies(mask, grid, count, lowest):
     return row, column, torch.stack([nu_x[row, column], nu_y[row, column]], -1)
 
 
+def test_baselines_that_only_meet_at_other_wavelengths_share_their_light():
+    """Two pairs of holes 2.4 holes apart in baseline, which a band of 20 % makes meet: up to 40 % of what is there."""
+    grid, band, seeing = Grid.nyquist(1.0, 550e-9, 160), Band.top_hat(550e-9, 110e-9, 3), Seeing(0.3)
+    mask = SparseAperture([[-0.3, 0.0], [0.3, 0.0], [-0.33, 0.06], [0.33, 0.06]], 0.025, 1.0)
+    criterion = criterion_of(grid, r0=0.3, wavelengths=band.wavelengths, weights=band.shares)
+    columns = torch.tensor([48, 53])
+    nu_x = grid.frequencies(torch.float64)[1].flatten()[columns]
+    expected = mean_square_otf(mask, grid, torch.stack([nu_x, torch.zeros_like(nu_x)], -1), seeing, band)
+    torch.testing.assert_close(criterion.expected_power(mask)[0, columns], expected, rtol=0.02, atol=0)
+
+
 @pytest.mark.parametrize(
     ("n", "ratio", "outer_scale", "tau", "wind", "shape"),
     [

@@ -20,7 +20,7 @@ from torchmask.optics.band import Band
 from torchmask.optics.shape_base import Shape
 
 _BASELINES = (16, 16)
-_STEPS = (0.4, 0.75, 1.0)  # fractions of the largest a - a' at which k is computed
+_STEPS = (0.15, 0.5, 1.0)  # fractions of the largest a - a' at which k is computed
 _PER_HOLE, _PER_R0 = 12, 6
 _THINNEST = 0.75  # of a hole's reach: thinner lenses, further out, transmit almost nothing
 _ASIDE = 0.45  # of a hole's reach, across the baseline: there k is about its mean over all places 0.3 of it away
@@ -42,7 +42,7 @@ class ColourCoherence:
         met = 2 * _THINNEST * shape.outer_diameter(diameter) / nodes.norm(dim=-1).clamp(min=1e-9)
         steps = torch.minimum(met, widest)[:, None] * torch.tensor(_STEPS, dtype=torch.float64)
         lost = torch.stack([_lost(shape, diameter, seeing, nodes, step) for step in steps.T], -1)
-        powers = torch.stack([steps**0, steps**2], -1)
+        powers = torch.stack([steps**0, steps], -1)
         factors = torch.linalg.lstsq(powers, (lost / steps**2)[..., None]).solution[..., 0].T
         factors = factors.unflatten(-1, (_BASELINES[0], -1))
         self.factors: PolarTable = PolarTable(factors.expand(-1, -1, _BASELINES[1]).contiguous(), longest, 2.0)
@@ -51,8 +51,8 @@ class ColourCoherence:
         """Return exp(-k) (P, W, W) for all pairs of wavelengths at baselines (P, 2) [m]."""
         one, other = self.scales[:, None], self.scales
         middle = baselines[:, None, None] / ((one + other) / 2)[..., None]  # of those of the two wavelengths
-        second, fourth = self.factors(middle.flatten(0, 2)).unflatten(1, middle.shape[:3])
-        return torch.exp(-colour_loss(second, fourth, one, other))
+        second, third = self.factors(middle.flatten(0, 2)).unflatten(1, middle.shape[:3])
+        return torch.exp(-colour_loss(second, third, one, other))
 
     def modes(self, baselines: Tensor) -> Tensor:
         """Return M modes (M, W, P) whose outer products in W, summed over M, approximate exp(-k)."""
@@ -65,13 +65,13 @@ class ColourCoherence:
         return modes.permute(2, 1, 0)
 
 
-def colour_loss(second: Tensor, fourth: Tensor, one: Tensor, other: Tensor) -> Tensor:
+def colour_loss(second: Tensor, third: Tensor, one: Tensor, other: Tensor) -> Tensor:
     """Return k (...) of light whose phases are `one` and `other` times those at the reference wavelength.
 
-    second, fourth : `ColourCoherence.factors` at the mean of the baselines of both, k for a + a' = 2 over (a - a')^2
+    second, third : `ColourCoherence.factors` at the mean of the baselines of both, k for a + a' = 2 over (a - a')^2
     """
-    step = (one - other) ** 2
-    return (second + fourth * step / ((one + other) / 2) ** 2).clamp(min=0) * step
+    step = (one - other).abs()
+    return (second + third * step / ((one + other) / 2)).clamp(min=0) * step**2
 
 
 def _lost(shape: Shape, diameter: float, seeing: Seeing, baselines: Tensor, step: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ them in one place.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -86,7 +87,8 @@ class LensPairs:
         # lenses at baseline 0 are their own opposites: what they share with another's opposite, they share with it
         for sign, allowed in ((1, one < other), (-1, one > 0)):
             i, j = one[allowed], other[allowed]
-            dx, dy = (sign * part.index_select(1, i) - part.index_select(1, j) for part in (x, y))
+            first, second = ([part.index_select(1, lens) for part in (x, y)] for lens in (i, j))
+            dx, dy = self._between([sign * part for part in first], second)
             mask, pair = (dx * dx + dy * dy < limit).nonzero().unbind(-1)
             found.append((mask, mask * count + i[pair], mask * count + j[pair], torch.full_like(mask, sign)))
         columns = [torch.cat(parts) for parts in zip(*found, strict=True)]
@@ -110,10 +112,25 @@ class LensPairs:
         middle = torch.where(central, centers.flatten(0, 1).index_select(0, entries.hole), middle)
         return [first, second * entries.sign[:, None], middle - other]
 
+    def _between(self, first: Sequence[Tensor], second: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+        """Return the difference (x, y) of two baselines (x, y) at the wavelengths of a band that bring them nearest.
+
+        Over the band a baseline moves along itself, by the spread of the phases.
+        """
+        x, y = (one - other for one, other in zip(first, second, strict=True))
+        spread = self.coherence.spread
+        if spread == 0:
+            return x, y
+        middle_x, middle_y = ((one + other) / 2 for one, other in zip(first, second, strict=True))
+        square = torch.addcmul(middle_x * middle_x, middle_y, middle_y).clamp(min=1e-9 * self.geometry.reach**2)
+        moved = ((x * middle_x + y * middle_y) / square).clamp(-spread, spread)
+        return x - moved * middle_x, y - moved * middle_y
+
     def _largest(self, first: Tensor, second: Tensor, separation: Tensor) -> Tensor:
         """Return about the most that lenses of each entry at these places (E, 2) [m] give anywhere (E,)."""
         reach = self.geometry.reach
-        lens = self.geometry.shape.otf((first - second) / 2, self.geometry.diameter) ** 2
+        between = torch.stack(self._between(first.unbind(-1), second.unbind(-1)), -1)
+        lens = self.geometry.shape.otf(between / 2, self.geometry.diameter) ** 2
         near = []
         for x, y in (((first + second) / 2).unbind(-1), separation.unbind(-1)):
             shrunk = (1 - reach / 2 * torch.rsqrt(x * x + y * y)).clamp(min=0)

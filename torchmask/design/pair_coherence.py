@@ -114,8 +114,8 @@ class PairCoherence:
             mean, half = (1 / one + 1 / other) / 2, (1 / one - 1 / other) / 2
             mx, my, hx, hy = bx * mean, by * mean, bx * half, by * half
             own = self.structure.at(mx + hx, my + hy) * one**2 + self.structure.at(mx - hx, my - hy) * other**2
-            second, fourth = self.colours(torch.stack([bx, by], -1)[None] / ((one + other) / 2)[:, None])[0].unbind(-1)
-            known = colour_loss(second, fourth, one, other) - own / 2
+            second, third = self.colours(torch.stack([bx, by], -1)[None] / ((one + other) / 2)[:, None])[0].unbind(-1)
+            known = colour_loss(second, third, one, other) - own / 2
             found = self._changing([separation, *axes, (mx, my), (hx, hy)]) * (one * other)
         return self.weights @ found.add_(known - _log_far(between)).exp_()
 
