@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
-import logging
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -13,18 +9,21 @@ from typing import Any
 
 import numpy as np
 import torch
+from peer_mfbd import MFBD_SETTINGS, best_start
+from scipy.optimize import minimize
 from torch import Tensor
 
 from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.observation import Observation
+from torchmask.restoration.background import Background
 from torchmask.restoration.baselines import average_psf, shift_and_add
 from torchmask.restoration.myopic import MyopicDeconvolution
+from torchmask.restoration.objective import MyopicObjective
+from torchmask.restoration.priors import TotalVariation
 from torchmask.restoration.wiener import multiframe_wiener
 from torchmask.spectra import NoisePSD, PowerLawPSD
 
 OURS, LIMIT = "torchmask", "multi-frame Wiener, true PSFs"
-_ARCSEC = 206265.0  # torchmfbd's own number of arc seconds in a radian
-_CUTOFFS = (0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95, 1.0)  # of torchmfbd's filter over the diffraction limit
 _PSF_SEED = 12345  # of the average PSF of shift-and-add
 
 
@@ -39,10 +38,15 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Effort:
-    """iterations : of this library and of Richardson-Lucy, None for what each needs; mfbd_iterations : of torchmfbd."""
+    """How long each method may work.
+
+    iterations : of this library, of plain L-BFGS-B and of Richardson-Lucy, None for what each needs
+    mfbd_iterations, mfbd_starts : of torchmfbd
+    """
 
     iterations: int | None = None
     mfbd_iterations: int = 500
+    mfbd_starts: int = 3
 
 
 Method = Callable[[Observation, Effort], Iterator[Candidate]]
@@ -56,103 +60,68 @@ def this_library(observation: Observation, effort: Effort) -> Iterator[Candidate
     yield Candidate("defaults", result.object, time.perf_counter() - started)
 
 
-@dataclass(frozen=True)
-class MFBDSettings:
-    """Settings of torchmfbd: Karhunen-Loeve modes without piston, step of Adam, noise that regularises its division."""
-
-    n_modes: int
-    step: float
-    noise: float
-
-
-# The best of those tried: 44 to 135 modes, steps of 0.02 to 0.1, noise of 1e-4 to 1e-2 and its own estimate, starts
-# of 0 to 0.3 rad rms, apodisation, slower schedules up to 1000 iterations and a joint estimation of the object.
-MFBD_SETTINGS = (
-    MFBDSettings(65, 0.1, 1e-3),
-    MFBDSettings(90, 0.05, 1e-3),
-    MFBDSettings(90, 0.05, 1e-4),
-    MFBDSettings(135, 0.05, 1e-3),
-)
-_MFBD_START = 0.1  # rms of the first coefficients [rad]
-
-
 def mfbd(observation: Observation, effort: Effort) -> Iterator[Candidate]:
     """torchmfbd, each setting with several cut-offs of its Fourier filter."""
     if not observation.aperture.is_full or len(set(observation.grid.shape)) > 1:
         return
     for settings in MFBD_SETTINGS:
         started = time.perf_counter()
-        with _quiet(), torch.random.fork_rng():
-            torch.manual_seed(0)
-            images = _run_mfbd(observation, settings, effort.mfbd_iterations)
+        kept = best_start(observation, settings, effort.mfbd_iterations, effort.mfbd_starts)
         seconds = time.perf_counter() - started
-        for cutoff, image in images.items():
-            text = f"{settings.n_modes} KL modes, step {settings.step:g}, noise {settings.noise:g}, cut-off {cutoff:g}"
+        for cutoff, image in kept.images.items():
+            text = (
+                f"{settings.n_modes} KL modes, step {settings.step:g}, noise {settings.noise:g}, cut-off {cutoff:g}; "
+                f"of {effort.mfbd_starts} starts that of the lowest loss"
+            )
             yield Candidate(text, image, seconds)
 
 
-def _run_mfbd(observation: Observation, settings: MFBDSettings, iterations: int) -> dict[float, Tensor]:
-    import torchmfbd  # pyright: ignore[reportMissingImports] -- only in the bench extra
-
-    aperture, grid = observation.aperture, observation.grid
-    deconvolution = torchmfbd.Deconvolution(
-        {
-            "telescope": {
-                "diameter": 100 * aperture.outer_diameter,  # [cm]
-                "central_obscuration": 100 * aperture.outer_diameter * aperture.shape.parameters.get("obstruction", 0),
-                "spider": 0,
-            },
-            "images": {
-                "n_pixel": grid.shape[0],
-                "pix_size": grid.pixel_scale * _ARCSEC,
-                "apodization_border": 0,
-                "remove_gradient_apodization": False,
-            },
-            "object1": {
-                "wavelength": 1e10 * grid.wavelength,  # [Angstrom]
-                "image_filter": "tophat",
-                "cutoff": [0.85, 0.9],
-            },
-            "optimization": {
-                "gpu": -1,
-                "transform": "none",
-                "softplus_scale": 1.0,
-                "lr_obj": settings.step,
-                "lr_modes": settings.step,
-            },
-            "regularization": {"iuwt1": {"variable": "object", "lambda": 0.0, "nbands": 5}},
-            "psf": {"model": "kl", "nmax_modes": settings.n_modes},
-            "initialization": {"object": "contrast", "modes_std": _MFBD_START},
-            "annealing": {"type": "linear", "start_pct": 0.0, "end_pct": 0.6},
-        }
-    )
-    frames = (observation.frames / observation.frames.mean()).float()[None]
-    deconvolution.add_frames(frames, sigma=torch.full(frames.shape[:2], settings.noise))
-    deconvolution.deconvolve(n_iterations=iterations)
-    images = {}
-    for cutoff in _CUTOFFS:
-        deconvolution.update_object(cutoffs=[[cutoff - 0.05, cutoff]])
-        images[cutoff] = deconvolution.obj[0][0].double().clone()
-    return images
+# Units of the object [mean pixels], which balance the steps of object and aberrations, and numbers of corrections. In
+# units of 1 it is far from its end after as many iterations.
+_PLAIN_SETTINGS = ((10.0, 10), (30.0, 10), (10.0, 20), (30.0, 20))
 
 
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """An empty working directory for the files that torchmfbd leaves, and none of its messages."""
-    disabled, dtype = logging.root.manager.disable, torch.get_default_dtype()
-    logging.disable(logging.CRITICAL)
-    silence = io.StringIO()
-    try:
-        with (
-            tempfile.TemporaryDirectory() as folder,
-            contextlib.chdir(folder),
-            contextlib.redirect_stderr(silence),
-            contextlib.redirect_stdout(silence),
-        ):
-            yield
-    finally:
-        logging.disable(disabled)
-        torch.set_default_dtype(dtype)
+def plain_lbfgs(observation: Observation, effort: Effort) -> Iterator[Candidate]:
+    """The seed method: SciPy's L-BFGS-B on this library's cost, from the mean frame and zero aberrations."""
+    is_full, iterations = observation.aperture.is_full, effort.iterations or 1000
+    n_modes, weight = (66, 3.0) if is_full else (6, 1.0)
+    for unit, corrections in _PLAIN_SETTINGS:
+        started = time.perf_counter()
+        method = MyopicDeconvolution(
+            observation.aperture,
+            observation.grid,
+            n_modes,
+            observation.r0,
+            observation.outer_scale,
+            observation.readout_noise,
+            background=Background.NONE,
+            prior=TotalVariation(weight),
+        )
+        image = _descend(method.objective(observation.frames), unit, corrections, iterations)
+        text = f"{n_modes} modes, mu = {weight:g}, {iterations} iterations, {corrections} corrections, unit {unit:g}"
+        yield Candidate(text, image, time.perf_counter() - started)
+
+
+def _descend(objective: MyopicObjective, unit: float, corrections: int, iterations: int) -> Tensor:
+    """Return the object (H, W) after that many iterations on object / unit >= 0 and whitened aberrations."""
+    window, evaluate = objective.model.window, objective.evaluator(objective.neutral_calibration())
+    image = window.embed(objective.frames.mean(0).clamp(min=0)).double()
+    shape, n = image.shape, image.numel()
+
+    def split(x: np.ndarray) -> tuple[Tensor, Tensor]:
+        vector = torch.from_numpy(x)
+        return unit * vector[:n].view(shape), vector[n:].view_as(objective.centre)
+
+    def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
+        value, by_image, by_z, _ = evaluate(*split(x))
+        return float(value), torch.cat([unit * by_image.flatten(), by_z.flatten()]).numpy()
+
+    start = torch.cat([image.flatten() / unit, torch.zeros_like(objective.centre).flatten()]).numpy()
+    bounds = [(0.0, None)] * n + [(None, None)] * (len(start) - n)
+    # Without tolerances all iterations are made.
+    options = {"maxiter": iterations, "maxfun": 10 * iterations, "maxcor": corrections, "ftol": 0.0, "gtol": 0.0}
+    found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+    return window.crop(split(found.x)[0]).clone()
 
 
 def average_star(observation: Observation) -> np.ndarray:
@@ -208,6 +177,7 @@ def known_psfs(observation: Observation, effort: Effort) -> Iterator[Candidate]:
 
 METHODS: dict[str, Method] = {
     OURS: this_library,
+    "plain joint L-BFGS-B": plain_lbfgs,
     "torchmfbd": mfbd,
     "Richardson-Lucy on shift-and-add": richardson_lucy,
     "unsupervised Wiener on shift-and-add": unsupervised_wiener,

@@ -6,8 +6,10 @@
 
 Needs the extra `torchmask[bench]`. This library runs once, with its defaults, and knows the frames and the instrument.
 Every peer may choose its settings, and whether to clip at 0, with the truth at hand, and is told r0: the table gives
-the best score it reaches, and the seconds of that one run. Peers: torchmfbd, which models a full pupil and nothing
-else; shift-and-add; and scikit-image's Richardson-Lucy and unsupervised Wiener on shift-and-add, with the PSF that
+the best score it reaches, and the seconds of that setting. Peers: the plain joint descent by SciPy's L-BFGS-B on this
+library's own cost, from zero aberrations; torchmfbd, which models a full pupil and nothing else, has as many modes as
+this library among its settings, and starts several times, of which it keeps the start of its own lowest loss;
+shift-and-add; and scikit-image's Richardson-Lucy and unsupervised Wiener on shift-and-add, with the PSF that
 shift-and-add has on average in such turbulence. The multi-frame Wiener estimate knows the true PSFs of all frames.
 The table, as markdown and JSON, goes to a new folder.
 """
@@ -53,6 +55,8 @@ class Options(ExperimentOptions):
     """Cut-off of the score, D pixel_scale / wavelength [cycles/pixel]."""
     mfbd_iterations: int = 500
     """Number of iterations of torchmfbd."""
+    mfbd_starts: int = 3
+    """Number of random starts of torchmfbd, of which that of the lowest loss is kept."""
 
 
 def best(name: str, candidates: Iterator[Candidate], truth: Tensor | None, cutoff: float) -> dict[str, Any] | None:
@@ -151,7 +155,8 @@ def run(options: Options) -> None:
     """Compare in a new folder."""
     used = versions()
     stacks = {path.stem: load(path) for path in options.stacks} or simulated(options.smoke)
-    effort = Effort(10 if options.smoke else None, 5 if options.smoke else options.mfbd_iterations)
+    mfbd = (5, 2) if options.smoke else (options.mfbd_iterations, options.mfbd_starts)
+    effort = Effort(10 if options.smoke else None, *mfbd)
     with new_run("peers", options) as output:
         rows = {name: compare(name, observation, options.cutoff, effort) for name, observation in stacks.items()}
         leads = [lead(own) for own in rows.values()]

@@ -5,7 +5,9 @@ import json
 import logging
 from importlib.metadata import PackageNotFoundError
 
+import numpy as np
 import peer_methods
+import peer_mfbd
 import peers
 import pytest
 import torch
@@ -13,6 +15,8 @@ import torch
 from torchmask.grid import Grid
 from torchmask.metrics import relative_error
 from torchmask.optics.aperture import FullAperture
+from torchmask.restoration.myopic import MyopicDeconvolution
+from torchmask.restoration.recipe import FULL_MODES
 from torchmask.simulation.scene import SceneOptions, make_scene
 
 GRID = Grid.nyquist(1.0, 550e-9, 48)
@@ -34,6 +38,17 @@ def test_each_deconvolution_improves_on_shift_and_add(observation, method):
     assert best_score(getattr(peer_methods, method)(observation, effort), observation) < 0.8 * before
 
 
+def test_plain_descent_improves_on_shift_and_add_with_its_iterations(observation, monkeypatch):
+    monkeypatch.setattr(peer_methods, "_PLAIN_SETTINGS", ((10.0, 10),))
+    before = best_score(peer_methods.added(observation, peer_methods.Effort()), observation)
+    few, more = (
+        best_score(peer_methods.plain_lbfgs(observation, peer_methods.Effort(iterations=count)), observation)
+        for count in (20, 100)
+    )
+    assert more < 0.8 * few
+    assert more < 0.8 * before
+
+
 def test_the_limit_is_ahead_of_every_peer(observation):
     effort = peer_methods.Effort()
     names = ("added", "richardson_lucy", "unsupervised_wiener")
@@ -45,9 +60,9 @@ def test_torchmfbd_restores_and_leaves_nothing_behind(observation, tmp_path, mon
     pytest.importorskip("torchmfbd")
     monkeypatch.chdir(tmp_path)
     state, disabled = torch.get_rng_state(), logging.root.manager.disable
-    monkeypatch.setattr(peer_methods, "MFBD_SETTINGS", (peer_methods.MFBDSettings(20, 0.1, 1e-3),))
-    candidates = list(peer_methods.mfbd(observation, peer_methods.Effort(mfbd_iterations=60)))
-    assert len(candidates) == len(peer_methods._CUTOFFS)
+    monkeypatch.setattr(peer_methods, "MFBD_SETTINGS", (peer_mfbd.MFBDSettings(20, 0.1, 1e-3),))
+    candidates = list(peer_methods.mfbd(observation, peer_methods.Effort(mfbd_iterations=60, mfbd_starts=1)))
+    assert len(candidates) == len(peer_mfbd.CUTOFFS)
     added = best_score(peer_methods.added(observation, peer_methods.Effort()), observation)
     assert best_score(candidates, observation) < 0.8 * added
     assert torch.equal(torch.get_rng_state(), state)
@@ -69,11 +84,77 @@ def test_torchmfbd_gets_the_telescope_in_its_own_units(observation, monkeypatch)
 
     monkeypatch.setattr(torchmfbd, "Deconvolution", look)
     with pytest.raises(Seen) as caught:
-        peer_methods._run_mfbd(observation, peer_methods.MFBD_SETTINGS[0], 1)
+        peer_mfbd.run_start(observation, peer_mfbd.MFBD_SETTINGS[0], 1)
     config = caught.value.args[0]
     scale = psf_scale(config["object1"]["wavelength"], config["telescope"]["diameter"], config["images"]["pix_size"])
     # How many times the diameter the pupil plane is wide: wavelength / (pixel_scale D), 2 / 0.95 here.
     assert scale == pytest.approx(2 / 0.95, rel=1e-12)
+
+
+def test_the_loss_of_torchmfbd_falls_as_it_iterates(observation):
+    pytest.importorskip("torchmfbd")
+    settings = peer_mfbd.MFBDSettings(20, 0.1, 1e-3)
+    short, long = (peer_mfbd.best_start(observation, settings, iterations, 1) for iterations in (10, 60))
+    assert 0 < long.loss < 0.5 * short.loss
+
+
+@pytest.mark.parametrize("n_starts", [1, 2, 4])
+def test_the_start_of_torchmfbd_is_kept_by_its_own_loss(observation, monkeypatch, n_starts):
+    """Also where the truth is found by the start of the highest loss."""
+    losses, drawn = [0.4, 0.3, 0.1, 0.2], []
+
+    def start(observation, settings, iterations):
+        drawn.append(float(torch.rand(())))
+        loss = losses[(len(drawn) - 1) % n_starts]
+        worse = torch.rand(observation.grid.shape, dtype=torch.float64)
+        return peer_mfbd.MFBDStart(loss, {0.9: observation.object if loss == 0.4 and n_starts > 1 else loss * worse})
+
+    monkeypatch.setattr(peer_mfbd, "run_start", start)
+    effort = peer_methods.Effort(mfbd_iterations=7, mfbd_starts=n_starts)
+    candidates = list(peer_methods.mfbd(observation, effort))
+    assert len(candidates) == len(peer_mfbd.MFBD_SETTINGS)
+    for candidate in candidates:
+        assert float(candidate.image.max()) == pytest.approx(min(losses[:n_starts]), rel=0.01)
+        assert f"of {n_starts} starts that of the lowest loss" in candidate.settings
+    assert len(drawn) == n_starts * len(peer_mfbd.MFBD_SETTINGS)
+    assert len(set(drawn)) == n_starts  # every start is another one, the same ones for all settings
+
+
+def test_torchmfbd_gets_as_many_modes_as_this_library():
+    assert FULL_MODES - 1 in {settings.n_modes for settings in peer_mfbd.MFBD_SETTINGS}  # its own are without piston
+
+
+@pytest.mark.parametrize("name", ["satellite_mask", "satellite_full"])
+def test_plain_descent_begins_at_the_mean_frame_with_zero_aberrations(monkeypatch, name):
+    class Seen(Exception):
+        pass
+
+    def look(cost, start, *, bounds, method, options, jac):
+        assert jac
+        raise Seen(cost, start, bounds, method, options)
+
+    monkeypatch.setattr(peer_methods, "minimize", look)
+    stack = peers.simulated(smoke=True)[name]
+    with pytest.raises(Seen) as caught:
+        list(peer_methods.plain_lbfgs(stack, peer_methods.Effort()))
+    cost, start, bounds, method, options = caught.value.args
+    assert method == "L-BFGS-B"
+    assert options["maxiter"] == 1000
+    n_modes = 66 if stack.aperture.is_full else 6 * stack.aperture.n_subapertures
+    n_aberrations = len(stack.frames) * (n_modes - 1)  # the piston of a whole frame does not show
+    n_pixels = len(start) - n_aberrations
+    assert bounds == [(0.0, None)] * n_pixels + [(None, None)] * n_aberrations
+    assert (start[n_pixels:] == 0).all()
+    window = MyopicDeconvolution(stack.aperture, stack.grid, 6).model.window
+    image = window.crop(torch.from_numpy(start[:n_pixels]).view(window.field.shape))
+    mean = stack.frames.double().mean(0).clamp(min=0)
+    assert float((image * mean).sum() / image.norm() / mean.norm()) > 0.999  # but for the frames' own light
+    # The gradient is that of the cost, in the very units of the minimiser.
+    rng = np.random.default_rng(0)
+    point = start + rng.random(start.shape) * np.where(np.arange(len(start)) < n_pixels, start.max(), 0.1)
+    way = rng.standard_normal(start.shape) * np.where(np.arange(len(start)) < n_pixels, start.max(), 1.0)
+    slope = (cost(point + 1e-5 * way)[0] - cost(point - 1e-5 * way)[0]) / 2e-5
+    assert slope == pytest.approx(cost(point)[1] @ way, rel=1e-5)
 
 
 def test_torchmfbd_is_not_asked_to_model_a_mask():
