@@ -80,6 +80,8 @@ def _draw_exposures(ax: Axes, plan: ObservationPlan) -> None:
         ]
         line.sort(key=lambda choice: choice.exposure)
         _draw_line(ax, line, "exposure", 1e3, color, f"{n} holes")
+    if any(choice.is_limit for choice in plan.choices):
+        ax.plot([], [], "^", color=drawing.FAINT, label="lower limit: not tried")
     ax.plot(1e3 * best.exposure, best.blind_mse, "o", **_RING)
     tau0 = plan.instrument.with_exposure(best.exposure).seeing.tau0
     ax.axvline(1e3 * tau0, color=drawing.FAINT, linestyle="--", linewidth=1)
