@@ -240,7 +240,12 @@ def test_no_point_beyond_what_was_tried_is_the_best(monkeypatch, quick):
     assert set(least.blind.harder) == {"d_over_r0", "exposure"}
     text = str(found)
     assert "The best hole diameter, 0.15 m, is the largest on the map at which blind restorations were tried" in text
-    assert "they lose more beyond" in text
+    assert "beyond they lose more" in text
+    assert "a larger one may be better" not in text  # both are where trials end
+    with pytest.warns(UserWarning, match="d/r0 from 0.1 to 1"):
+        axes = {"n_subapertures": (3,), "hole_diameters": (0.09, 0.35), "exposures": (tau0,)}
+        narrower = plan_observation(instrument, **axes, **TINY)
+    assert "tried: up to 0.15 m a larger one may be better, beyond they lose more" in str(narrower)
     assert "give exposures above it" not in text
     assert f"| > {least.blind_mse:.4f} | - |" in text
     figure = plan_figure(found)

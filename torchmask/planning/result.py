@@ -151,12 +151,18 @@ class ObservationPlan:
         """Return a sentence on an axis along which the best point is the first or last."""
         axis, best = _WORDS[name], getattr(self.best, name)
         told = f"The best {axis.words}, {axis.scale * best:.4g}{axis.unit}, is the"
-        first = self.best is self._known(name)[0]
+        known = self._known(name)
+        first = self.best is known[0] and len(known) > 1
         limit = self.tried_up_to.get(name, math.inf)
         if not first and (self.best is not self.axis(name)[-1] or best > 0.999 * limit):
+            room = (
+                f"up to {axis.scale * limit:.4g}{axis.unit} a larger one may be better, "
+                if best < 0.999 * limit
+                else ""
+            )
             return (
-                f"{told} largest on the map at which blind restorations were tried, up to "
-                f"{axis.scale * limit:.4g}{axis.unit}: they lose more beyond, by how much is not known."
+                f"{told} largest on the map at which blind restorations were tried: {room}beyond they lose more, by "
+                "how much is not known."
             )
         place, beyond, side = ("first", "a smaller", "below") if first else ("last", "a larger", "above")
         return f"{told} {place} on the map: {beyond} one may be better, so give {axis.parameter} {side} it too."
