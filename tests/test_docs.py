@@ -25,6 +25,16 @@ def test_every_convention_is_on_the_page_of_conventions():
         assert f"tests/conventions/{file.name}" in text
 
 
+def test_the_plan_is_the_second_thing_that_a_newcomer_meets():
+    index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
+    rows = [line for line in index.splitlines() if line.startswith("| ")][1:]
+    assert ["quickstart" in rows[0], "(planning.md)" in rows[1]] == [True, True]
+    start = index.split(":caption: Start\n\n")[1].splitlines()
+    assert start[:3] == ["install", "notebooks/1_quickstart", "planning"]
+    titles = re.findall(r"^## (.+)$", (ROOT / "README.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert titles[:2] == ["Two commands", "Plan an observation"]
+
+
 @pytest.mark.parametrize("name", torchmask.__all__)
 def test_the_reference_holds_every_public_name(name):
     path = f"{getattr(torchmask, name).__module__}.{name}"

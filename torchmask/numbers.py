@@ -1,4 +1,4 @@
-"""The check of a number that a user gives."""
+"""Checks of numbers that a user gives."""
 
 from __future__ import annotations
 
@@ -18,3 +18,43 @@ def require(name: str, value: float | None, unit: str = "", zero: bool = False, 
     raise ValueError(
         f"{name} is {value}: it must be finite and {least}{f', at most {most:g}' * (most < math.inf)}{unit}"
     )
+
+
+def require_within(name: str, value: float | None, least: float, most: float, unit: str, reason: str) -> None:
+    """Raise ValueError unless the number is None, or possible: from `least` to `most`.
+
+    >>> require_within("wind", 1e30, 0.01, 200.0, " m/s", "calm air to the fastest jet streams")
+    Traceback (most recent call last):
+    ValueError: wind is 1e+30: it must be from 0.01 to 200 m/s (calm air to the fastest jet streams); the nearest \
+possible is 200 m/s
+    """
+    if value is None or least <= value <= most:
+        return
+    nearest = "" if math.isnan(value) else f"; the nearest possible is {min(max(value, least), most):g}{unit}"
+    raise ValueError(f"{name} is {value}: it must be from {least:g} to {most:g}{unit} ({reason}){nearest}")
+
+
+def require_wavelength(name: str, metres: float | None, least: float = 1e-8, most: float = 1e-2) -> None:
+    """Raise ValueError unless this is None or a wavelength of light in metres; the message recognises other units.
+
+    >>> require_wavelength("wavelength", 550.0)
+    Traceback (most recent call last):
+    ValueError: wavelength is 550: it must be a wavelength of light in m, from 1e-08 to 0.01; 550 nm are 550e-9
+    """
+    if metres is None or least <= metres <= most:
+        return
+    meant = "550 nm are 550e-9"
+    for unit, power, low, high in (("nm", "e-9", 100, 1e5), ("micrometres", "e-6", 0.1, 100)):
+        if low <= metres < high:
+            meant = f"{metres:g} {unit} are {metres:g}{power}"
+    need = f"it must be a wavelength of light in m, from {least:g} to {most:g}"
+    raise ValueError(f"{name} is {metres:g}: {need}; {meant}")
+
+
+def require_r0(name: str, r0: float | None) -> None:
+    """Raise ValueError unless this is None or a Fried parameter [m] of air above a telescope.
+
+    From 1 mm, of visible light along the ground, to 20 m, of 40 micrometres on the best nights. What laboratories make
+    is not of this range; `TurbulencePhase` takes any.
+    """
+    require_within(name, r0, 1e-3, 20.0, " m", "visible light along the ground to 40 micrometres on the best nights")

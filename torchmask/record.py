@@ -18,7 +18,7 @@ class Record:
     n_steps : budget of iterations, for progress bars
     scalars : the quantity that is minimised, then any others worth plotting
     arrays : best state so far (centres, object, coefficients), detached; what is kept after an interruption
-    preparatory : whether the stage only prepares the run and has no result yet
+    preparatory : whether the stage has no result of its own: it prepares the run, or measures what was found
     """
 
     stage: str

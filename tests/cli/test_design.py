@@ -11,16 +11,16 @@ from ezdxf import readfile
 from torchmask.cli import design, rank, table
 from torchmask.cli.design import Options, warn_of_wide_holes
 from torchmask.cli.main import main
-from torchmask.cli.options import require_wavelength
 from torchmask.design.constraint_base import Infeasible
 from torchmask.design.constraints import KeepOutDisc, RimMargin, check_mask
 from torchmask.design.criterion import AsymptoticMSE
-from torchmask.design.manufacture import load_mask
+from torchmask.design.manufacture import load_mask, mask_wavelength
 from torchmask.design.space import DesignSpace
 from torchmask.design.table import design_table
 from torchmask.design.tolerance import machining_tolerance
 from torchmask.design.turbulent import TurbulentMSE
 from torchmask.grid import Grid
+from torchmask.numbers import require_wavelength
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.pixel import SquarePixel
 from torchmask.spectra import NoisePSD, PowerLawPSD
@@ -29,13 +29,16 @@ pytestmark = pytest.mark.usefixtures("coarse_figures")
 
 SMALL = ["design", "--n-subapertures", "4", "--fill-factor", "0.1", "--budget", "60", "--n-frequencies", "32"]
 ZONES = ["--rim-margin", "0.03", "--keep-out", "0.2", "0.1", "0.15", "-0.2", "0.1", "0.1"]
+SEEN = ["--r0", "0.2", "--wavelength", "550e-9"]
 NOISE = ["--n-photons", "1e5", "--readout-noise", "5", "--n-pixels", "48"]
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     out = tmp_path_factory.mktemp("runs") / "design"
-    assert main([*SMALL, *ZONES, *NOISE, "--r0", "0.5", "--scale", "10", "--out", str(out)]) == 0
+    assert (
+        main([*SMALL, *ZONES, *NOISE, "--r0", "0.5", "--wavelength", "550e-9", "--scale", "10", "--out", str(out)]) == 0
+    )
     return out
 
 
@@ -67,6 +70,8 @@ def test_metrics_are_of_the_detector_and_of_the_workshop(folder):
         "rms_error_tolerated": expected.rms,
         "rms_error_tolerated_standard_error": expected.error,
     }
+    field = 48 * 550e-9 / 2 * 180 * 3600 / math.pi  # arcsec, of pixels of wavelength / (2 D)
+    assert metrics["detector"] == {"n_pixels": 48, "field_arcsec": pytest.approx(field, rel=1e-12)}
     assert metrics["hole_over_r0"] == pytest.approx(math.sqrt(0.1 / 4) / 0.5, rel=1e-12)
 
 
@@ -115,18 +120,29 @@ def test_wide_holes_are_warned_of_with_the_number_that_is_enough(r0, enough):
     warn_of_wide_holes(Options(n_subapertures=enough), r0)  # as wide as r0: an error here would fail the test
 
 
-def test_an_impossible_r0_is_refused():
-    for r0 in (0.0, -1.0, math.nan):
-        with pytest.raises(ValueError, match="--r0 is"):
-            warn_of_wide_holes(Options(), r0)
+@pytest.mark.parametrize("command", [SMALL, ["rank", "golay6"], ["simulate", "--mask", "keck_nirc2_9"]])
+@pytest.mark.parametrize(
+    ("r0", "nearest"), [("0", "0.001 m"), ("-1", "0.001 m"), ("1e-5", "0.001 m"), ("120", "20 m"), ("nan", "")]
+)
+def test_an_impossible_r0_is_refused_with_the_nearest_possible(command, r0, nearest, tmp_path, capsys):
+    out = ["--wavelength", "2e-6", "--out", str(tmp_path / "new")]
+    assert main([*command, "--r0", r0, *out]) == 1
+    said = capsys.readouterr().err.strip()
+    assert "--r0 is" in said
+    assert "must be from 0.001 to 20 m" in said
+    assert said.endswith(f"the nearest possible is {nearest}") == bool(nearest)
+    assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ("550", r"--wavelength is 550: .* in m, .*\. 550 nm are 550e-9"),
-        ("2.2", r"--wavelength is 2\.2: .*\. 2\.2 micrometres are 2\.2e-6"),
-        ("-550e-9", r"--wavelength is -5\.5e-07: it must be a wavelength of light in m, such as 550e-9$"),
+        ("550", r"--wavelength is 550: .* in m, .*; 550 nm are 550e-9"),
+        ("2.2", r"--wavelength is 2\.2: .*; 2\.2 micrometres are 2\.2e-6"),
+        (
+            "-550e-9",
+            r"--wavelength is -5\.5e-07: it must be a wavelength of light in m, from 1e-08 to 0\.01; ",
+        ),
         ("0", "--wavelength is 0:"),
         ("nan", "--wavelength is nan:"),
     ],
@@ -138,9 +154,42 @@ def test_wavelengths_that_are_none_are_named(command, given, said, tmp_path, cap
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.parametrize("command", ["design", "rank", "table"])
+def test_what_holds_at_a_wavelength_only_needs_one(command, tmp_path, capsys):
+    """No default stands in for it: r0, pixels and bands of one wavelength are those of another at another."""
+    out = [str(tmp_path / "new")] if command == "table" else ["--out", str(tmp_path / "new")]
+    pixels = ["--pixel-scale", "2e-7"] if command == "table" else ["--pixel-scale-arcsec", "0.05"]
+    given = [pixels, ["--criterion", "turbulent", "--wavelengths", "500e-9", "600e-9"]]
+    for words in given if command == "table" else [*given, ["--r0", "0.1"]]:
+        assert main([command, *out, *words]) == 1
+        said = capsys.readouterr().err
+        assert "wavelength is missing" in said, words
+        assert words[-2 if words[0] != "--criterion" else 2] in said
+        assert not (tmp_path / "new").exists()
+
+
+def test_a_mask_for_no_wavelength_is_that_of_any_and_says_none(tmp_path, capsys):
+    few = [*SMALL, "--budget", "20", "--no-refine"]
+    assert main([*few, "--out", str(tmp_path / "none")]) == 0
+    assert main([*few, "--wavelength", "2.2e-6", "--out", str(tmp_path / "one")]) == 0
+    masks = [load_mask(tmp_path / name / "mask.json").centers for name in ("none", "one")]
+    torch.testing.assert_close(*masks, rtol=0, atol=1e-9)
+    assert [mask_wavelength(tmp_path / name / "mask.json") for name in ("none", "one")] == [None, 2.2e-6]
+    capsys.readouterr()
+    assert main(["simulate", "--mask", str(tmp_path / "none" / "mask.json")]) == 1
+    assert "--wavelength is missing" in capsys.readouterr().err
+
+
+def test_a_filter_tells_the_wavelength(tmp_path):
+    options = Options(filter="bessell-V", criterion="turbulent", r0=0.1)
+    assert options.observing_wavelength() == pytest.approx(550e-9, rel=0.02)
+    assert Options(filter="bessell-V", wavelength=540e-9).observing_wavelength() == 540e-9
+    assert options.observation(32, 1.5, 1 / 64, 0.1).grid.wavelength == options.observing_wavelength()
+
+
 @pytest.mark.parametrize("wavelength", [91e-9, 550e-9, 10.5e-6, 1.3e-3])
 def test_wavelengths_of_light_pass(wavelength):
-    require_wavelength(wavelength)
+    require_wavelength("--wavelength", wavelength)
 
 
 @pytest.mark.parametrize(
@@ -162,7 +211,7 @@ def test_what_cannot_be_is_refused_before_any_work(option, said, tmp_path, capsy
 def test_a_mask_is_searched_under_turbulence(tmp_path):
     out = tmp_path / "run"
     few = ["--no-refine", "--method", "cma", "--budget", "20", "--criterion", "turbulent"]
-    seeing = ["--r0", "0.2", "--outer-scale", "20", "--sky", "2", "--pixel-fill", "1"]
+    seeing = ["--wavelength", "550e-9", "--r0", "0.2", "--outer-scale", "20", "--sky", "2", "--pixel-fill", "1"]
     assert main([*SMALL, *NOISE, *few, *seeing, "--out", str(out)]) == 0
     grid, noise = Grid.nyquist(1.0, 550e-9, 32), NoisePSD(1e5, 5.0, 48**2)
     seen = {"r0": 0.2, "outer_scale": 20.0, "pixel": SquarePixel(1.0), "sky": 2.0}
@@ -187,9 +236,9 @@ def test_options_of_turbulence_are_those_of_the_criterion():
     [
         (["--criterion", "turbulent"], "needs --r0"),
         (["--sky", "3"], "--sky needs --criterion turbulent"),
-        (["--outer-scale", "20", "--r0", "0.2"], "--outer-scale needs --criterion turbulent"),
-        (["--criterion", "turbulent", "--r0", "0.2", "--wind", "1", "2", "3"], "--wind has 3 numbers"),
-        (["--criterion", "turbulent", "--r0", "0.2", "--exposure-time", "1e-3"], "without wind"),
+        (["--outer-scale", "20", *SEEN], "--outer-scale needs --criterion turbulent"),
+        (["--criterion", "turbulent", *SEEN, "--wind", "1", "2", "3"], "--wind has 3 numbers"),
+        (["--criterion", "turbulent", *SEEN, "--exposure-time", "1e-3"], "without wind"),
     ],
 )
 def test_turbulence_that_cannot_be_is_refused(given, said, tmp_path, capsys):

@@ -6,11 +6,14 @@ import math
 import pytest
 
 from torchmask.cli.main import main
-from torchmask.cli.rank import Options
+from torchmask.cli.rank import Options, name_masks, patterns
 from torchmask.design.manufacture import load_mask, save_json
+from torchmask.design.pattern import Pattern
+from torchmask.design.ranking import rank_masks
 from torchmask.design.turbulent import TurbulentMSE
 from torchmask.grid import ARCSEC, Grid
 from torchmask.optics.aperture import SparseAperture
+from torchmask.viz.ranking import ranking_figure
 
 TINY = ["--n-frequencies", "32", "--budget", "60"]
 
@@ -42,21 +45,56 @@ def test_masks_of_catalogue_files_and_searches_are_ranked(tmp_path, capsys):
     assert events == [tmp_path / "run"]  # one run in TensorBoard, in one folder
     said = capsys.readouterr().out
     assert "not ranked: keck_lws_pattern2a_9, as built: 3 pairs of holes overlap" in said
+    assert "not ranked: golay9, as built: it has no size of its own" in said
+
+
+def test_what_is_not_ranked_is_told_in_words_of_the_command_line(tmp_path, capsys):
+    words = ["golay6", "vlt_sphere_irdis_7", "vlt_naco_7", "--min-gap", "0.12", "--fill-factor", "0.03"]
+    assert main(["rank", *words, *TINY, "--out", str(tmp_path / "run")]) == 0
+    said = capsys.readouterr().out
+    assert "not ranked: vlt_sphere_irdis_7, as built: no source gives the diameter of its holes" in said
+    assert "not ranked: vlt_naco_7, as built: --min-gap 0.12 is broken by" in said
+    assert "as built: no source gives" in (tmp_path / "run/ranking.md").read_text()
+
+
+def test_masks_are_named_by_their_folders_where_their_files_are_named_alike(tmp_path):
+    files = ["one/mask.json", "other/mask.json", "a/other/mask.json", "mine.json", "golay6.json"]
+    for file in files:
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        save_json(tmp_path / file, SparseAperture.from_catalog("golay6", 2.0, 0.05))
+    paths = [str(tmp_path / file) for file in files]
+    named = name_masks([*paths, "golay-6"])
+    here = tmp_path.name
+    assert named == ["one/mask", f"{here}/other/mask", "a/other/mask", "mine", f"{here}/golay6", "golay6"]
+    found = patterns(Options(masks=tuple(paths[:2])))
+    assert [pattern.name for pattern in found] == ["one/mask", "other/mask"]
+
+
+def test_the_axis_of_numbers_of_holes_has_whole_ticks(tmp_path):
+    patterns = [Pattern.from_catalog("jwst_niriss_ami_7")]
+    light = observed(Options(n_frequencies=32, fill_factor=0.05)).criterion()
+    figure = ranking_figure(rank_masks(patterns, lambda _: light, 1.0, 0.05))
+    assert [tick for tick in figure.axes[1].get_xticks() if tick % 1] == []
 
 
 def test_two_masks_of_one_name_are_refused_before_any_search(tmp_path, capsys):
-    for folder in ("one", "other"):
-        (tmp_path / folder).mkdir()
-        save_json(tmp_path / folder / "mask.json", SparseAperture.from_catalog("golay6", 2.0, 0.05))
-    files = [str(tmp_path / folder / "mask.json") for folder in ("one", "other")]
-    for words, name in (([*files, "--search", "6"], "mask"), (["golay6", "--search", "6", "6"], "torchmask_6")):
+    file = str(tmp_path / "mask.json")
+    save_json(file, SparseAperture.from_catalog("golay6", 2.0, 0.05))
+    for words, name in (([file, file, "--search", "6"], "mask"), (["golay6", "--search", "6", "6"], "torchmask_6")):
         assert main(["rank", *words, *TINY, "--out", str(tmp_path / "run")]) == 1
         assert f"two masks are named {name}: leave one out" in capsys.readouterr().err
         assert not (tmp_path / "run").exists()
 
 
 def test_light_and_sky_are_in_proportion_to_the_area():
-    seen = {"criterion": "turbulent", "r0": 0.2, "outer_scale": 20.0, "sky": 3.0, "n_photons": 1e6}
+    seen = {
+        "criterion": "turbulent",
+        "wavelength": 550e-9,
+        "r0": 0.2,
+        "outer_scale": 20.0,
+        "sky": 3.0,
+        "n_photons": 1e6,
+    }
     whole = observed(Options(**seen, n_frequencies=32, readout_noise=2.0, n_pixels=64))
     assert whole.area == pytest.approx(0.15 * math.pi / 4, rel=1e-12)
     full, half = whole.criterion(), whole.through(whole.area / 2).criterion()
@@ -69,7 +107,7 @@ def test_light_and_sky_are_in_proportion_to_the_area():
 
 
 def test_pixels_may_be_finer_than_needed():
-    grid = observed(Options(pixel_scale_arcsec=0.02, n_frequencies=32)).grid
+    grid = observed(Options(wavelength=550e-9, pixel_scale_arcsec=0.02, n_frequencies=32)).grid
     assert grid == Grid(32, 0.02 * ARCSEC, 550e-9)
 
 
@@ -79,8 +117,8 @@ def test_pixels_may_be_finer_than_needed():
         (["golay"], "no mask is called 'golay'"),
         (["--fill-factor", "-0.15"], "--fill-factor is -0.15"),
         (["--wavelength", "550"], "550 nm are 550e-9"),
-        (["--pixel-scale-arcsec", "-1"], "--pixel-scale-arcsec is -1"),
-        (["--pixel-scale-arcsec", "0.5"], "undersamples"),
+        (["--pixel-scale-arcsec", "-1", "--wavelength", "550e-9"], "--pixel-scale-arcsec is -1"),
+        (["--pixel-scale-arcsec", "0.5", "--wavelength", "550e-9"], "undersamples"),
         (["--central-obstruction", "0.95"], "no mask is left to rank"),
         (["--search", "5", "1"], "--search is 1: masks of at least two holes can be ranked"),
         (["--wind", "3"], "--wind needs --criterion turbulent"),

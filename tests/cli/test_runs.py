@@ -405,7 +405,7 @@ def told(capsys):
 def test_a_restoration_ends_in_a_verdict(runs, tmp_path, capsys):
     """Few iterations explain nothing, and all is written all the same."""
     stack = runs / "simulate/stack.npz"
-    for name, arguments, expected in (("few", ["--max-iterations", "12"], 3), ("many", ["--max-iterations", "200"], 0)):
+    for name, arguments, expected in (("few", ["--max-iterations", "12"], 3), ("many", ["--max-iterations", "600"], 0)):
         folder = tmp_path / name
         assert main(["restore", str(stack), *arguments, "--out", str(folder)]) == expected
         verdict = json.loads((folder / "status.json").read_text())["verdict"]

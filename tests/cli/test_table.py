@@ -39,6 +39,7 @@ def test_rows_are_written_and_not_computed_twice(tmp_path, capsys):
     assert main(argv) == 0
     assert "d/r0 is 1.57, above 1.5" in capsys.readouterr().out  # three holes at D/r0 = 7
     found = json.loads((tmp_path / "table" / "table.json").read_text())["rows"]
+    assert "| N   | d [m]  | photons/frame |" in (tmp_path / "table" / "table.md").read_text()
     assert [row["infeasible"] is None for row in found] == [False, True]
     assert found[1]["wiener_mse"] > 0
     mask = SparseAperture(torch.tensor(found[1]["centers"]).double(), found[1]["subaperture_diameter"], 1.0)
@@ -103,6 +104,7 @@ def test_an_instrument_gives_all_but_the_axes(tmp_path, monkeypatch):
 
     def note(space, folder, **settings):
         asked.update(settings, space=space)
+        folder.mkdir()
         return "no table"
 
     monkeypatch.setattr(table, "design_table", note)

@@ -24,6 +24,8 @@ class Options:
     n_frequencies: int = 64
     n_pixels: int = 128
     min_gap: float = 0.0
+    central_obstruction: float = 0.0
+    keep_out: tuple[tuple[float, float, float], ...] = ()
     out: Path | None = None
     rim_margin: float = 0.0
     gain: float | None = None
@@ -62,6 +64,31 @@ class Options:
             "a.fits has no GAIN: give --gain [electrons per adu]",
         ),
         ("holes overlap: lower fill_factor or n_holes", {}, "holes overlap: lower --fill-factor or n_holes"),
+        (
+            "the band is missing: give filter, or weights and min_gap [m], not wide",
+            {},
+            "the band is missing: give filter, or --weights and --min-gap [m], not wide",
+        ),
+        (
+            "no mask that obeys MinimumGap(gap=0.1), RimMargin(margin=0.02): with a MinimumGap gap of at most 0.05 m",
+            {},
+            "no mask that obeys --min-gap 0.1, --rim-margin 0.02: with a --min-gap of at most 0.05 m",
+        ),
+        (
+            "no room beside KeepOutSegment(start=(0.0, -1e-05), end=(0.5, 0.0), width=0.9), a KeepOutSegment width",
+            {},
+            "no room beside --spiders 0.0 -1e-05 0.5 0.0 0.9, a --spiders width",
+        ),
+        (
+            "no room beside KeepOutDisc(diameter=0.2, center=(0.0, 0.0)), KeepOutDisc(diameter=0.1, center=(0.3, 0.0))",
+            {"central_obstruction": 0.2, "keep_out": ((0.3, 0.0, 0.1),)},
+            "no room beside --central-obstruction 0.2, --keep-out 0.3 0.0 0.1",
+        ),
+        (
+            "no room beside KeepOutDisc(diameter=0.1, center=(0.0, 0.0)), a KeepOutDisc diameter of 0.05 m",
+            {"keep_out": ((0.0, 0.0, 0.1),)},
+            "no room beside --keep-out 0.0 0.0 0.1, a --keep-out diameter of 0.05 m",
+        ),
         ("a.fits: refine is not positive at 1 pixel", {}, "a.fits: refine is not positive at 1 pixel"),
         ("there is no file /tmp/1/sky: give files", {"seed": 1}, "there is no file /tmp/1/sky: give files"),
         ("no fill_factor.npz in a/n_pixels/b", {}, "no fill_factor.npz in a/n_pixels/b"),

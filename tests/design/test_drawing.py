@@ -15,7 +15,7 @@ SVG = "{http://www.w3.org/2000/svg}"
 
 def masks():
     generator = torch.Generator().manual_seed(5)
-    uneven = (torch.rand(7, 2, generator=generator, dtype=torch.float64) - 0.5) / 3
+    uneven = SparseAperture.random(7, 1 / 3, 0.12, generator).centers  # farther apart than the corners of hexagons
     return {
         "discs": SparseAperture(uneven, 0.1 / 3, 1 / 3),
         "hexagons": SparseAperture(uneven, 0.1 / 3, 1 / 3, shape="hexagon", orientation=2.1),

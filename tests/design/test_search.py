@@ -93,10 +93,26 @@ def test_refinement_goes_downhill_and_stays_feasible():
 def test_records_lead_to_the_result():
     records = []
     found = search_mask(COARSE, 5, 1.0, 0.15, method="hybrid", budget=600, seed=0, callback=records.append)
-    assert {record.stage for record in records} == {"design/hybrid", "design/refine"}
     assert all(record.step <= record.n_steps for record in records)
+    records = [record for record in records if not record.preparatory]
+    assert {record.stage for record in records} == {"design/hybrid", "design/refine"}
     assert all(record.arrays["centers"].shape == (5, 2) for record in records)
     assert records[-1].scalars["relative_mse"] == pytest.approx(found.relative_mse, rel=1e-2)
+
+
+def test_what_a_search_does_after_its_evaluations_is_told():
+    """Projections and the errors of the history, which take minutes for many holes: every mask, and steps within."""
+    records = []
+    found = search_mask(COARSE, 12, 1.0, 0.5, budget=64, seed=0, callback=records.append)
+    after = [record for record in records if record.preparatory]
+    assert {record.stage for record in after} == {"design/hybrid/history", "design/project", "design/refine/history"}
+    for stage in ("design/hybrid/history", "design/refine/history"):
+        told = [record for record in after if record.stage == stage]
+        assert [record.step for record in told] == list(range(1, told[0].n_steps + 1))
+    steps = [record.step for record in after if record.stage == "design/project"]
+    assert steps == sorted(steps)
+    assert len(steps) > 2 * max(steps)  # several within each projection
+    assert records[-1].scalars["relative_mse"] == pytest.approx(found.relative_mse, rel=1e-9)
 
 
 @pytest.mark.parametrize("method", ["cma", "hybrid"])

@@ -226,3 +226,17 @@ def test_bad_requests_are_refused(mask, bowl, keywords, message):
 def test_a_population_is_refused(bowl):
     with pytest.raises(ValueError, match="one mask is needed"):
         machining_errors(bowl, SparseAperture(torch.zeros(2, 3, 2), 0.1, 1.0), 0.001)
+
+
+def test_every_evaluation_is_told(mask, bowl):
+    """With turbulence in the criterion each takes seconds."""
+    records, evaluations = [], []
+
+    def slow(aperture):
+        evaluations.append(aperture)
+        return bowl(aperture)
+
+    machining_tolerance(slow, mask, generator=torch.Generator().manual_seed(0), callback=records.append)
+    assert [record.step for record in records] == list(range(1, len(evaluations) + 1))
+    assert all(record.preparatory and record.step <= record.n_steps for record in records)
+    assert {record.stage for record in records} == {"design/tolerance"}

@@ -7,9 +7,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from torchmask.design.drawing import save_dxf, save_svg
+from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture, SparseAperture
-from torchmask.optics.overlaps import check_overlaps, find_overlaps, pair_clearances
+from torchmask.optics.detector import Detector
+from torchmask.optics.overlaps import check_overlaps, find_overlaps, pair_clearances, require_apart
 from torchmask.optics.shapes import Hexagon
+from torchmask.simulation.dataset import StackDataset
+from torchmask.simulation.exposures import simulate_observation
 
 
 @settings(deadline=None, max_examples=40)
@@ -53,6 +58,27 @@ def test_the_message_names_holes_and_metres():
     centers = [[0.0, 0.0], [0.3, 0.0], [0.0, -0.19], [0.31, 0.05]]
     with pytest.raises(ValueError, match=r"overlap: 1 and 3 by 0\.149 m, 0 and 2 by 0\.01 m"):
         check_overlaps(SparseAperture(centers, 0.2, 1.0))
+
+
+def test_masks_of_overlapping_holes_are_refused_unless_asked_for(tmp_path):
+    """In drawings for the workshop and in simulations, as on the command line; golay6 at 0.9 has six such pairs."""
+    mask, grid = SparseAperture.from_catalog("golay6", 1.0, 0.9), Grid.nyquist(1.0, 550e-9, 32)
+    scene = torch.ones(32, 32, dtype=torch.float64)
+    uses = [
+        lambda **how: save_dxf(tmp_path / "mask.dxf", mask, **how),
+        lambda **how: save_svg(tmp_path / "mask.svg", mask, **how),
+        lambda **how: simulate_observation(scene, mask, grid, None, Detector(), 1, **how),
+        lambda **how: StackDataset(mask, grid, 1, n_frames=1, **how),
+    ]
+    for use in uses:
+        with pytest.raises(ValueError, match=r"pairs of holes overlap: .*; give allow_overlap to accept it"):
+            use()
+        assert not list(tmp_path.iterdir())
+        use(allow_overlap=True)
+        for file in tmp_path.iterdir():
+            file.unlink()
+    for aperture in (SparseAperture.from_catalog("golay6", 1.0, 0.15), FullAperture(1.0)):
+        require_apart(aperture)
 
 
 def test_one_hole_and_a_full_pupil_overlap_with_nothing():

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from torchmask.cli.options import require_wavelength
 from torchmask.instrument.instrument import Instrument
+from torchmask.numbers import require_wavelength
 from torchmask.optics.band import Band
 from torchmask.optics.passband import Passband
 
@@ -22,6 +22,13 @@ class FilterOptions:
     temperature: float | None = None
     """Temperature of the source's black-body spectrum inside the filter [K]; None: equally many photons at each
     wavelength."""
+
+    def told_wavelength(self, given: float | None) -> float | None:
+        """Return the wavelength [m] that is given, or else the mean of the filter; None if there is neither."""
+        require_wavelength("--wavelength", given)
+        if given is not None:
+            return given
+        return None if self.filter is None else Passband.find(self.filter).mean_wavelength
 
     def filter_band(self, wavelength: float) -> Band | None:
         """Return the band of the filter, None without one. Raises ValueError if it does not pass `wavelength` [m]."""
@@ -60,7 +67,7 @@ class BandOptions(FilterOptions):
         if self.weights and not self.wavelengths:
             raise ValueError("--weights are those of --wavelengths: give both")
         for one in self.wavelengths:
-            require_wavelength(one, "--wavelengths")
+            require_wavelength("--wavelengths", one)
         band = self.filter_band(wavelength)
         if band is None:
             if self.temperature is not None:

@@ -16,7 +16,7 @@ from rich.table import Table
 
 from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.cli.design import search
-from torchmask.cli.options import ExperimentOptions, SearchOptions, require_wavelength
+from torchmask.cli.options import ExperimentOptions, SearchOptions
 from torchmask.cli.report import log_cost, log_design, log_observation
 from torchmask.cli.run import Run, new_run
 from torchmask.design.criterion import AsymptoticMSE
@@ -25,6 +25,7 @@ from torchmask.grid import Grid
 from torchmask.io import save_npz
 from torchmask.memory import require_memory
 from torchmask.metrics import relative_error, ssim
+from torchmask.numbers import require_wavelength
 from torchmask.observation import Observation
 from torchmask.optics.aperture import Aperture, FullAperture, SparseAperture
 from torchmask.optics.detector import Detector
@@ -153,7 +154,7 @@ def inversion(options: Options, aperture: Aperture, n_modes: int | None) -> Myop
 
 def check(options: Options) -> None:
     """Raise ValueError for options that stages after the search would reject, before that long search begins."""
-    require_wavelength(options.imaging.wavelength, "--imaging.wavelength")
+    require_wavelength("--imaging.wavelength", options.imaging.wavelength)
     outside(options)
     design, diameter = options.design, options.imaging.diameter
     size = hole_diameter(design.n_subapertures, diameter, design.fill_factor)
@@ -271,6 +272,10 @@ def run(options: Options) -> None:
     check(options)
     scene = make_scene(image_grid(options).shape, options.imaging.n_photons, options.scene)
     with new_run("codesign", options, options.seed) as output:
+        imaging = options.imaging
+        output.summary.append(
+            f"seen with D = {imaging.diameter:g} m at {1e9 * imaging.wavelength:g} nm, D / r0 = {imaging.d_over_r0:g}"
+        )
         output.summary.append(f"view it with: tensorboard --logdir {output.directory.parent}")
         table, verdicts = codesign(options, scene, output)
     print_table(table)

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Self
 
 from torchmask.cli.band_options import BandOptions, band_of_instrument
+from torchmask.cli.instrument_used import instrument_used
 from torchmask.cli.options import DEFAULT_PHOTONS, InstrumentOptions, pixel_angle
 from torchmask.design.conditions import ExposureConditions
 from torchmask.design.criterion import AsymptoticMSE
+from torchmask.design.space import ANY_WAVELENGTH
 from torchmask.design.turbulent import TurbulentMSE
 from torchmask.grid import ARCSEC, Grid
 from torchmask.instrument.instrument import Instrument
+from torchmask.numbers import require_r0
 from torchmask.spectra import NoisePSD, PowerLawPSD
 
 
@@ -31,6 +35,21 @@ class ExposureOptions(BandOptions, InstrumentOptions):
     """Sensitive fraction of the area of a pixel, 1 for pixels without gaps; 0: pixels are points."""
     sky: float | None = None
     """Electrons per pixel and frame from the sky; None: from --instrument, or else 0."""
+
+    def needed_wavelength(self, given: float | None, quoted: Mapping[str, bool]) -> float | None:
+        """Return the wavelength [m] that is given or the filter's; None if there is none and nothing depends on it.
+
+        `quoted` says which options that hold only at a wavelength are given. Raises ValueError if one of them is, and
+        no wavelength.
+        """
+        told = self.told_wavelength(given)
+        needing = [name for name, is_given in quoted.items() if is_given] + ["--wavelengths"] * bool(self.wavelengths)
+        if told is None and needing:
+            raise ValueError(
+                f"--wavelength is missing: give it in m, such as 550e-9, as {needing[0]} holds at a wavelength only; "
+                "--filter and --instrument tell it too"
+            )
+        return told
 
     def conditions(self, wavelength: float, area: float) -> ExposureConditions | None:
         """Return the conditions of an exposure through an open area [m^2], None for the asymptotic criterion.
@@ -96,8 +115,7 @@ class CriterionOptions(ExposureOptions):
         Raises ValueError as `conditions`, for turbulence without r0, an impossible r0, and an outer scale without
         turbulence.
         """
-        if self.r0 is not None and not (math.isfinite(self.r0) and self.r0 > 0):
-            raise ValueError(f"--r0 is {self.r0:g}: it must be finite and positive, in m at the wavelength")
+        require_r0("--r0", self.r0)
         conditions = self.conditions(wavelength, area)
         if conditions is None:
             if self.outer_scale is not None and self.instrument is None:
@@ -145,8 +163,9 @@ class ObservationOptions(CriterionOptions):
 
     mask_diameter: float = 1.0
     """Diameter of the pupil and of a mask that covers it, D [m]."""
-    wavelength: float = 550e-9
-    """Wavelength of the observation [m]."""
+    wavelength: float | None = None
+    """Wavelength of the observation [m], needed with --r0, --wavelengths and --pixel-scale-arcsec; None: the mean of
+    the filter, or, as errors with pixels of wavelength / (2 D) depend on no wavelength, none."""
     n_photons: float | None = None
     """Electrons per frame through holes of --fill-factor; None: from --instrument, or else 1e7."""
     n_frames: int = 20
@@ -158,24 +177,34 @@ class ObservationOptions(CriterionOptions):
     pixel_scale_arcsec: float | None = None
     """Angle on the sky of one pixel [arcsec]; None: the largest without aliasing at the shortest wavelength."""
 
+    def observing_wavelength(self) -> float | None:
+        """Return the wavelength [m]; None if none is told and nothing depends on it. ValueError if something does."""
+        quoted = {"--r0": self.r0 is not None, "--pixel-scale-arcsec": self.pixel_scale_arcsec is not None}
+        return self.needed_wavelength(self.wavelength, quoted)
+
     def observation(self, n_frequencies: int, exponent: float, knee: float, fill_factor: float) -> Observed:
         """Return the observation through holes of a fill factor N d^2 / D^2.
 
-        Raises ValueError for a fill factor, a number of pixels or a pixel scale that cannot be, and as `turbulence`.
+        Raises ValueError for a fill factor, a number of pixels or a pixel scale that cannot be, and as `turbulence` and
+        `observing_wavelength`.
         """
         if not (math.isfinite(fill_factor) and fill_factor > 0):
             raise ValueError(f"--fill-factor is {fill_factor:g}: it must be finite and positive")
         if self.n_pixels < 1:
             raise ValueError(f"--n-pixels is {self.n_pixels}: it must be at least 1")
-        self.require_its_wavelength(self.wavelength)
+        wavelength = self.observing_wavelength()
+        if wavelength is None:
+            wavelength = ANY_WAVELENGTH
+        else:
+            self.require_its_wavelength(wavelength)
         area = math.pi / 4 * fill_factor * self.mask_diameter**2
         photons = self.n_photons
         if photons is None:
             known = self.known_instrument()
             photons = DEFAULT_PHOTONS if known is None else known.photons(area)
-        turbulence = self.turbulence(self.wavelength, area)
+        turbulence = self.turbulence(wavelength, area)
         return Observed(
-            self._grid(n_frequencies, turbulence),
+            self._grid(n_frequencies, wavelength, turbulence),
             PowerLawPSD(exponent, photons, knee),
             NoisePSD(photons, self.readout_noise, self.n_pixels**2),
             self.n_frames,
@@ -183,15 +212,31 @@ class ObservationOptions(CriterionOptions):
             turbulence,
         )
 
-    def _grid(self, n_frequencies: int, turbulence: dict[str, Any] | None) -> Grid:
+    def used_instrument(self, observed: Observed, central_obstruction: float) -> Instrument | None:
+        """Return the instrument of an observation, with what was given beside its file; None without a file."""
+        known = self.known_instrument()
+        if known is None:
+            return None
+        names = ("mask_diameter", "r0", "outer_scale", "n_pixels", "readout_noise", "pixel_fill", "n_frames")
+        given = {name: getattr(self, name) for name in (*names, "n_photons", "sky")} | {
+            "central_obstruction": central_obstruction,
+            "wind": math.hypot(*self.wind) if self.wind else None,
+            "exposure": self.exposure_time,
+            "pixel_scale": self.pixel_scale_arcsec,
+            "exponent": observed.object_psd.exponent,
+            "knee": observed.object_psd.knee,
+        }
+        return instrument_used(known, observed.area, given)
+
+    def _grid(self, n_frequencies: int, wavelength: float, turbulence: dict[str, Any] | None) -> Grid:
         wavelengths = (turbulence or {}).get("wavelengths") or ()
-        shortest = min(self.wavelength, *wavelengths) if wavelengths else self.wavelength
+        shortest = min((wavelength, *wavelengths))
         finest = Grid.nyquist(self.mask_diameter, shortest, n_frequencies)
         scale = pixel_angle(self.pixel_scale_arcsec)
         if scale is not None:
             finest = replace(finest, pixel_scale=scale)
             finest.require_sampling(self.mask_diameter)
-        return replace(finest, wavelength=self.wavelength)
+        return replace(finest, wavelength=wavelength)
 
 
 def observation_options(known: Instrument) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from typing import Literal
 import torch
 
 from torchmask.cli.criterion_options import ObservationOptions, observation_options
-from torchmask.cli.options import RunOptions, SearchOptions, require_wavelength
+from torchmask.cli.options import RunOptions, SearchOptions
 from torchmask.cli.report import log_design
 from torchmask.cli.run import new_run
 from torchmask.design.constraint_base import Constraint, project
@@ -25,6 +25,7 @@ from torchmask.design.redundancy import analyse_redundancy
 from torchmask.design.rules import MaskRules
 from torchmask.design.search import SearchResult, search_mask
 from torchmask.design.tolerance import machining_tolerance
+from torchmask.grid import ARCSEC, Grid
 from torchmask.instrument.instrument import Instrument
 from torchmask.io import write_json
 from torchmask.optics.aperture import SparseAperture
@@ -81,7 +82,6 @@ def search(
 
 def run(options: Options) -> None:
     """Search, and write the mask, or the best one so far if interrupted."""
-    require_wavelength(options.wavelength)
     require_scale(options.scale)
     knee = PowerLawPSD.knee if options.knee is None else options.knee
     observed = options.observation(options.n_frequencies, options.exponent, knee, options.fill_factor)
@@ -89,8 +89,10 @@ def run(options: Options) -> None:
     rules = options.constraints()
     if options.r0 is not None and observed.turbulence is None:
         warn_of_wide_holes(options, options.r0)
+    used = options.used_instrument(observed, options.central_obstruction)
     last: list[Record] = []
     with new_run("design", options, options.seed) as output:
+        output.keep_instrument(used)
         started = time.perf_counter()
 
         def keep(record: Record) -> None:
@@ -108,7 +110,8 @@ def run(options: Options) -> None:
         _save_mask(output.directory, result.aperture, options)
         log_design(result, criterion.grid, output.logger, rules)
         table = metrics(result, criterion) | {"evaluations": result.evaluations, "seconds": seconds}
-        table["machining"] = machining(criterion, result.aperture, options.seed)
+        table["detector"] = detector(options.n_pixels, criterion.grid, options.observing_wavelength())
+        table["machining"] = machining(criterion, result.aperture, options.seed, output.callback)
         if options.r0 is not None:
             table["hole_over_r0"] = result.aperture.subaperture_diameter / options.r0
         write_json(output.directory / "metrics.json", table)
@@ -120,9 +123,7 @@ def run(options: Options) -> None:
 
 
 def warn_of_wide_holes(options: Options, r0: float) -> None:
-    """Warn if holes are wider than r0, whose aberrations the criterion ignores. Raises ValueError if r0 is invalid."""
-    if not (math.isfinite(r0) and r0 > 0):
-        raise ValueError(f"--r0 is {r0}: it must be finite and positive, in m")
+    """Warn if holes are wider than r0, whose aberrations the criterion ignores."""
     hole = hole_diameter(options.n_subapertures, options.mask_diameter, options.fill_factor)
     if hole <= r0 * (1 + 1e-9):
         return
@@ -134,10 +135,18 @@ def warn_of_wide_holes(options: Options, r0: float) -> None:
     )
 
 
-def machining(criterion: AsymptoticMSE, aperture: SparseAperture, seed: int) -> dict[str, float | str]:
+def detector(n_pixels: int, grid: Grid, wavelength: float | None) -> dict[str, float | None]:
+    """Return the size of the detector's field for metrics.json: pixels, and [arcsec] if there is a wavelength."""
+    field = None if wavelength is None else n_pixels * grid.pixel_scale / ARCSEC
+    return {"n_pixels": n_pixels, "field_arcsec": field}
+
+
+def machining(
+    criterion: AsymptoticMSE, aperture: SparseAperture, seed: int, callback: Callback
+) -> dict[str, float | str]:
     """Return the machining tolerance for metrics.json: the rms error [m] of positions and diameter."""
     generator = torch.Generator().manual_seed(seed)
-    found = machining_tolerance(criterion, aperture, _GROWTH, quantile=_SUCCESS, generator=generator)
+    found = machining_tolerance(criterion, aperture, _GROWTH, quantile=_SUCCESS, generator=generator, callback=callback)
     return {
         "error_of": found.kind,
         "growth_of_mse": _GROWTH,
@@ -163,7 +172,7 @@ def metrics(result: SearchResult, criterion: AsymptoticMSE) -> dict[str, object]
 
 
 def _save_mask(directory: Path, aperture: SparseAperture, options: Options) -> None:
-    save_json(directory / "mask.json", aperture, options.wavelength)
+    save_json(directory / "mask.json", aperture, options.observing_wavelength())
     save_fits(directory / "mask.fits", aperture, max(512, least_pixels(aperture)))
     save_svg(directory / "mask.svg", aperture, options.scale)
     save_dxf(directory / "mask.dxf", aperture, options.scale)

@@ -117,13 +117,13 @@ def describe(aperture: SparseAperture, mask: catalog.CatalogEntry | None = None)
 def write(path: Path, aperture: SparseAperture, scale: float | None = None, wavelength: float | None = None) -> None:
     """Write a mask, or its picture, to a new file whose suffix sets the format.
 
-    `scale` applies to drawings; a .json file contains the wavelength [m].
+    `scale` applies to drawings; a .json file contains the wavelength [m]. Whether holes overlap is not looked at.
     """
     drawings = {".dxf": save_dxf, ".svg": save_svg}
     others = {".json": partial(save_json, wavelength=wavelength), ".fits": save_fits, ".png": _save_png}
     kind = path.suffix.lower()
     if kind in drawings:
-        drawings[kind](path, aperture, LIFE_SIZE if scale is None else scale)
+        drawings[kind](path, aperture, LIFE_SIZE if scale is None else scale, allow_overlap=True)
     elif kind not in others:
         raise ValueError(f"{path} does not end in one of {', '.join([*drawings, *others])}")
     elif scale is not None:

@@ -13,9 +13,8 @@ from torchmask.design.manufacture import load_mask, mask_wavelength
 from torchmask.grid import ARCSEC
 from torchmask.instrument.instrument import Instrument
 from torchmask.instrument.parts import Telescope
-from torchmask.optics import catalog
+from torchmask.optics import catalog, overlaps
 from torchmask.optics.aperture import Aperture, FullAperture, SparseAperture
-from torchmask.optics.overlaps import check_overlaps
 from torchmask.record import Callback
 
 DEFAULT_PHOTONS = 1e7  # per frame, if neither an option nor an instrument says it
@@ -97,17 +96,6 @@ class SweepOptions(WorkerOptions, ExperimentOptions):
 
     sweep: Path = Path("runs/sweep")
     """Folder for finished tasks, from which an interrupted run continues and which other runs share."""
-
-
-def require_wavelength(metres: float, option: str = "--wavelength") -> None:
-    """Raise ValueError unless this is a wavelength of light in metres; the message recognises other units."""
-    if 1e-8 <= metres <= 1e-2:
-        return
-    meant = ""
-    for unit, power, least, below in (("nm", "e-9", 100, 1e5), ("micrometres", "e-6", 0.1, 100)):
-        if least <= metres < below:
-            meant = f". {metres:g} {unit} are {metres:g}{power}"
-    raise ValueError(f"{option} is {metres:g}: it must be a wavelength of light in m, such as 550e-9{meant}")
 
 
 def pixel_angle(arcsec: float | None) -> float | None:
@@ -240,7 +228,7 @@ def _full_pupil(options: MaskOptions, telescope: Telescope | None) -> FullApertu
     return replace(telescope, diameter=diameter, **told).pupil()
 
 
-def told_wavelength(options: MaskOptions) -> float | None:
+def mask_file_wavelength(options: MaskOptions) -> float | None:
     """Return the wavelength [m] in the file of the mask, or None if it has none."""
     return mask_wavelength(options.mask) if options.mask is not None and is_mask_file(options.mask) else None
 
@@ -261,9 +249,8 @@ def load_mask_file(path: str | Path, options: CatalogOptions) -> SparseAperture:
 
 def require_apart(name: str, mask: SparseAperture, allow_overlap: bool) -> SparseAperture:
     """Return the mask, or raise ValueError if its holes overlap, unless that is allowed."""
-    if not allow_overlap:
-        try:
-            check_overlaps(mask)
-        except ValueError as error:
-            raise ValueError(f"{name}: {error}; give --allow-overlap to accept it") from error
+    try:
+        overlaps.require_apart(mask, allow_overlap)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
     return mask

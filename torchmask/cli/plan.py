@@ -101,7 +101,7 @@ def run(options: Options) -> None:
         best = plan.best_instrument
         table = best.describe(float(plan.mask.area))
         output.report("plan", numbers(plan), f"{plan}\n\n{table}\n", plan_figure(plan))
-        best.save(output.directory / "instrument.json")
+        output.keep_instrument(best)
         if isinstance(plan.mask, SparseAperture):
             save_json(output.directory / "mask.json", plan.mask, best.mean_wavelength)
             output.logger.figure("plan_mask", mask_figure(plan.mask))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -9,8 +10,9 @@ from typing import Annotated
 import tyro
 
 from torchmask.cli.criterion_options import ObservationOptions, observation_options
-from torchmask.cli.options import RunOptions, is_mask_file, require_wavelength
+from torchmask.cli.options import RunOptions, is_mask_file
 from torchmask.cli.run import Run, new_run
+from torchmask.cli.wording import in_options
 from torchmask.design.criterion import AsymptoticMSE
 from torchmask.design.manufacture import load_mask, save_json
 from torchmask.design.pattern import Pattern
@@ -70,15 +72,38 @@ def patterns(options: Options) -> list[Pattern]:
     """
     if options.search and min(options.search) < 2:
         raise ValueError(f"--search is {min(options.search)}: masks of at least two holes can be ranked")
-    found = [
-        Pattern.of(Path(name).stem, load_mask(name)) if is_mask_file(Path(name)) else Pattern.from_catalog(name)
-        for name in options.masks or catalog.names()
-    ]
-    names = [pattern.name for pattern in found] + [_searched_name(n) for n in options.search]
-    twice = sorted({name for name in names if names.count(name) > 1})
+    searched = [_searched_name(n) for n in options.search]
+    asked = options.masks or catalog.names()
+    names = name_masks(asked, searched)
+    twice = sorted(_repeated([*names, *searched]))
     if twice:
-        raise ValueError(f"two masks are named {twice[0]}: leave one out, or copy its file to another name")
-    return found
+        raise ValueError(f"two masks are named {twice[0]}: leave one out")
+    return [
+        Pattern.of(name, load_mask(mask)) if is_mask_file(Path(mask)) else Pattern.from_catalog(mask)
+        for name, mask in zip(names, asked, strict=True)
+    ]
+
+
+def name_masks(masks: Sequence[str], others: Sequence[str] = ()) -> list[str]:
+    """Return a name for each mask: that of the catalogue, or that of its file, with its folders where others have it.
+
+    One mask that is given twice has one name.
+    """
+    paths = [Path(mask).absolute() if is_mask_file(Path(mask)) else Path(catalog.entry(mask).name) for mask in masks]
+    parts = [(*path.parts[:-1], path.stem) for path in paths]
+    depths = [1] * len(parts)
+    while True:
+        names = ["/".join(part[-depth:]) for part, depth in zip(parts, depths, strict=True)]
+        twice = _repeated([*(name for name, _ in set(zip(names, parts, strict=True))), *others])
+        longer = [i for i, name in enumerate(names) if name in twice and depths[i] < len(parts[i])]
+        if not longer:
+            return names
+        for i in longer:
+            depths[i] += 1
+
+
+def _repeated(names: Sequence[str]) -> set[str]:
+    return {name for name in names if names.count(name) > 1}
 
 
 def _searched_name(n: int) -> str:
@@ -101,7 +126,7 @@ def search_masks(options: Options, criterion: AsymptoticMSE, output: Run) -> dic
         )
         name = _searched_name(n)
         masks[name] = result.aperture
-        save_json(output.directory / f"{name}.json", result.aperture, options.wavelength)
+        save_json(output.directory / f"{name}.json", result.aperture, options.observing_wavelength())
     return masks
 
 
@@ -117,6 +142,7 @@ def ranking(options: Options, output: Run) -> Ranking:
     """Rank, and write everything to the folder of the run."""
     chosen = patterns(options)
     observed = options.observation(options.n_frequencies, options.exponent, options.knee, options.fill_factor)
+    output.keep_instrument(options.used_instrument(observed, options.central_obstruction))
     found = rank_masks(
         chosen,
         lambda area: observed.through(area).criterion(),
@@ -127,6 +153,7 @@ def ranking(options: Options, output: Run) -> Ranking:
         allow_overlap=options.allow_overlap,
         callback=output.callback,
     )
+    found = replace(found, left_out={name: in_options(why, options) for name, why in found.left_out.items()})
     with atomic_write(output.directory / "ranking.csv") as file:
         file.write(found.csv().encode())
     rows = [asdict(row) | {"layout": row.layout.value} for row in found.rows]
@@ -138,9 +165,11 @@ def ranking(options: Options, output: Run) -> Ranking:
 def heading(options: Options) -> str:
     """Return what stands above the table."""
     air = "independent pistons" if options.criterion == "asymptotic" else f"turbulence of r0 = {options.r0:g} m"
+    wavelength = options.observing_wavelength()
+    light = "" if wavelength is None else f"{1e9 * wavelength:g} nm, "
     return (
         f"# Masks ranked by the error of the restored image\n\nD = {options.mask_diameter:g} m, "
-        f"{1e9 * options.wavelength:g} nm, {air}, K = {options.n_frames}, p = {options.exponent:g}. The common "
+        f"{light}{air}, K = {options.n_frames}, p = {options.exponent:g}. The common "
         f"collecting area is N d^2 / D^2 = {options.fill_factor:g} of round holes. The floor is the part no mask can "
         "change; torchmask_N are searched masks, with which `over our best` compares those of the same N and area."
     )
@@ -148,7 +177,6 @@ def heading(options: Options) -> str:
 
 def run(options: Options) -> None:
     """Rank, and name the best."""
-    require_wavelength(options.wavelength)
     with new_run("rank", options, options.seed) as output:
         found = ranking(options, output)
         for title, layouts in (

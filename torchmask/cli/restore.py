@@ -18,7 +18,7 @@ from torchmask.cli.band_options import BandOptions, band_of_instrument
 from torchmask.cli.calibrate import read_star, require_one_pixel, write_calibration
 from torchmask.cli.config import stored
 from torchmask.cli.oifits import OIFITSOptions, measure_frames, write_frames
-from torchmask.cli.options import RunOptions, WorkerOptions, require_wavelength
+from torchmask.cli.options import RunOptions, WorkerOptions
 from torchmask.cli.outcome import log_outcome, pixel_text, summarise_outcome, write_outcome
 from torchmask.cli.program import NOT_EXPLAINED
 from torchmask.cli.run import CHECKPOINT, new_run
@@ -27,6 +27,7 @@ from torchmask.instrument.instrument import Instrument
 from torchmask.interferometry.calibration import MaskCalibration
 from torchmask.interferometry.observables import Observables
 from torchmask.io import new_folder, require_new, write_json
+from torchmask.numbers import require_wavelength
 from torchmask.observation import Observation
 from torchmask.restoration.background import Background
 from torchmask.restoration.many import restore_in_turn
@@ -120,7 +121,7 @@ def run(options: Options) -> int:
     if options.resume is not None and len(stacks) > 1:
         raise ValueError(f"--resume continues one stack, but {len(stacks)} are given")
     if options.wavelength is not None:
-        require_wavelength(options.wavelength)
+        require_wavelength("--wavelength", options.wavelength)
         options.require_its_wavelength(options.wavelength)
     if options.oifits and options.bandwidth is None:
         options = replace(options, bandwidth=options.told_width())

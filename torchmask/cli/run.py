@@ -13,7 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchmask.cli.config import CONFIG, save_config, stored
+from torchmask.cli.instrument_used import INSTRUMENT
 from torchmask.cli.options import RunOptions, SweepOptions
+from torchmask.instrument.instrument import Instrument
 from torchmask.io import atomic_write, free_name, write_json
 from torchmask.progress import Progress
 from torchmask.record import Callback, Record, fan_out
@@ -39,6 +41,11 @@ class Run:
     logger: RunLogger
     callback: Callback
     summary: list[str] = field(default_factory=list)
+
+    def keep_instrument(self, instrument: Instrument | None) -> None:
+        """Write the instrument of the run, if there is one, for other commands."""
+        if instrument is not None:
+            instrument.save(self.directory / INSTRUMENT)
 
     def report(self, name: str, numbers: Mapping[str, Any], text: str, figure: Figure | None = None) -> None:
         """Write NAME.json for programs, NAME.md for readers, and NAME.png; the last two for TensorBoard too."""

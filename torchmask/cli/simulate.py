@@ -11,20 +11,21 @@ from torchmask.atmosphere.layers import Layers
 from torchmask.atmosphere.phase import LayeredPhase, TurbulencePhase
 from torchmask.atmosphere.profiles import named_layers
 from torchmask.cli.band_options import FilterOptions
+from torchmask.cli.instrument_used import instrument_used
 from torchmask.cli.options import (
     DEFAULT_PHOTONS,
     InstrumentOptions,
     MaskOptions,
     RunOptions,
     load_aperture,
+    mask_file_wavelength,
     pixel_angle,
-    require_wavelength,
-    told_wavelength,
 )
 from torchmask.cli.report import log_observation
 from torchmask.cli.run import new_run
 from torchmask.grid import ARCSEC, Grid
 from torchmask.instrument.instrument import Instrument
+from torchmask.numbers import require_r0
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.band import Band
 from torchmask.optics.detector import Detector
@@ -59,6 +60,7 @@ class TurbulenceOptions:
         """Return the turbulence with Fried parameter `r0` [m], of which the option tells what None and inf mean."""
         if r0 == math.inf:
             return None
+        require_r0("--r0", r0)
         if self.profile is not None:
             layers = named_layers(self.profile, self.layers)
             if r0 is not None or self.wind is not None:
@@ -204,18 +206,31 @@ class Options(InstrumentOptions, MaskOptions, RunOptions):
 
 def observing_wavelength(options: Options) -> float:
     """Return the wavelength [m]: --wavelength, else that of the filter or the mask; ValueError if none is known."""
-    if options.wavelength is not None:
-        require_wavelength(options.wavelength)
-        return options.wavelength
-    if options.conditions.filter is not None:
-        return Passband.find(options.conditions.filter).mean_wavelength
-    told = told_wavelength(options)
+    told = options.conditions.told_wavelength(options.wavelength)
+    if told is None:
+        told = mask_file_wavelength(options)
     if told is None:
         raise ValueError(
             f"--wavelength is missing: give it in m, such as 550e-9. --mask {options.mask} has none, "
             "unlike the mask.json of `torchmask design`"
         )
     return told
+
+
+def used_instrument(known: Instrument, area: float, options: Options) -> Instrument:
+    """Return the instrument of these options, with what was given beside its file; its light is that through `area`."""
+    turbulence = options.turbulence
+    given = {
+        name: getattr(options, name) for name in ("r0", "outer_scale", "n_pixels", "readout_noise", "pixel_fill")
+    } | {
+        "wind": None if turbulence.wind is None else math.hypot(*turbulence.wind),
+        "exposure": turbulence.exposure_time,
+        "pixel_scale": options.pixel_scale_arcsec,
+        "n_frames": options.n_frames,
+        "n_photons": options.n_photons,
+        "sky": options.conditions.sky,
+    }
+    return instrument_used(known, area, given)
 
 
 def run(options: Options) -> None:
@@ -241,12 +256,15 @@ def run(options: Options) -> None:
         grid = Grid(options.n_pixels, pixel_scale, wavelength)
     detector = Detector(options.readout_noise, pixel=jittered(square_pixel(options.pixel_fill), options.jitter))
     scene = make_scene(grid.shape, n_photons, options.scene)
+    used = None if known is None else used_instrument(known, float(told.area), options)
     with new_run("simulate", options, options.seed) as output:
+        output.keep_instrument(used)
         generator = torch.Generator().manual_seed(options.seed)
         observation = simulate_observation(
             *(scene, aperture, grid, turbulence, detector, options.n_frames, generator),
             conditions=conditions,
             told=None if true is None else told,
+            allow_overlap=options.allow_overlap,
             callback=output.callback,
         )
         observation.save(output.directory / "stack.npz")

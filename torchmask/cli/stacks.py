@@ -15,14 +15,14 @@ from torchmask.cli.options import (
     InstrumentOptions,
     MaskOptions,
     load_aperture,
+    mask_file_wavelength,
     pixel_angle,
-    require_wavelength,
-    told_wavelength,
 )
 from torchmask.data.light import usable_frames
 from torchmask.data.observe import read_observation
 from torchmask.grid import Grid
 from torchmask.instrument.instrument import Instrument
+from torchmask.numbers import require_wavelength
 from torchmask.observation import Observation, check_frames
 from torchmask.optics.pixel import jittered, square_pixel
 from torchmask.restoration.noise import check_errors
@@ -95,7 +95,7 @@ def group_files(files: Sequence[Path], join: bool) -> dict[str, list[Path]]:
 def read_stack(files: Sequence[Path], options: StackOptions) -> Observation:
     """Read one stack: an .npz file, or FITS files that belong together. Raises ValueError if it cannot be used."""
     if options.wavelength is not None:
-        require_wavelength(options.wavelength)
+        require_wavelength("--wavelength", options.wavelength)
     pixel = None if options.pixel_fill is None else square_pixel(options.pixel_fill)
     known = options.known_instrument()
     observation = _read(files, options, known)
@@ -173,7 +173,7 @@ def _from_fits(files: Sequence[Path], options: StackOptions, known: Instrument |
     given = {item.name: getattr(options, item.name) for item in dataclasses.fields(FITSOptions)}
     given |= {"wavelength": options.wavelength, "readout_noise": options.readout_noise}
     given |= {"skip": options.skip, "exposure_time": options.exposure_time}
-    given["design_wavelength"] = told_wavelength(options) if known is None else known.mean_wavelength
+    given["design_wavelength"] = mask_file_wavelength(options) if known is None else known.mean_wavelength
     given["design_pixel_scale"] = None if known is None else planned_scale(known)
     try:
         return read_observation(files, aperture, pixel_scale=scale, **given)

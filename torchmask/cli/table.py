@@ -7,11 +7,13 @@ import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import tyro
 
 from torchmask.cli.criterion_options import ExposureOptions, exposure_options
-from torchmask.cli.options import DebugOptions, WorkerOptions, require_wavelength
+from torchmask.cli.instrument_used import INSTRUMENT
+from torchmask.cli.options import DebugOptions, WorkerOptions
 from torchmask.design.space import DesignSpace
 from torchmask.design.table import design_table
 from torchmask.instrument.instrument import Instrument
@@ -23,8 +25,8 @@ class Options(ExposureOptions, DesignSpace, WorkerOptions, DebugOptions):
     """Compare numbers of holes, hole sizes, numbers of photons and frames, and turbulence, in one table.
 
     Each combination is a row, with a mask of its own, searched as by `torchmask design`, and its error. Writes one file
-    for each search, table.csv, and table.json with the positions of the holes to the folder. The same command again
-    goes on where it was stopped, and a longer list only computes what is new.
+    for each search, table.md, table.csv, table.json with the positions of the holes, and what --instrument says to the
+    folder. The same command again goes on where it was stopped, and a longer list only computes what is new.
     """
 
     folder: tyro.conf.Positional[Path]
@@ -54,15 +56,21 @@ class Options(ExposureOptions, DesignSpace, WorkerOptions, DebugOptions):
 
 def run(options: Options) -> None:
     """Fill the table, or go on with it."""
-    require_wavelength(options.wavelength)
-    options.require_its_wavelength(options.wavelength)
-    space = DesignSpace(**{item.name: getattr(options, item.name) for item in dataclasses.fields(DesignSpace)})
+    wavelength = options.needed_wavelength(options.wavelength, {"--pixel-scale": options.pixel_scale is not None})
+    if wavelength is not None:
+        options.require_its_wavelength(wavelength)
+    values: dict[str, Any] = {item.name: getattr(options, item.name) for item in dataclasses.fields(DesignSpace)}
+    values["wavelength"] = wavelength
+    space = DesignSpace(**values)
     area = math.pi / 4 * space.reference_fill_factor * space.mask_diameter**2
-    conditions = options.conditions(space.wavelength, area)
+    conditions = options.conditions(space.grid.wavelength, area)
     try:
         with Progress() as progress:
             table = design_table(space, options.folder, conditions=conditions, **options.keywords(progress))
     except KeyboardInterrupt:
         print(f"\ncall again with {options.folder} to go on", file=sys.stderr)
         raise
+    known = options.known_instrument()
+    if known is not None:
+        known.save(options.folder / INSTRUMENT, replace=True)
     print(table, f"\nwritten to {options.folder}", sep="\n")

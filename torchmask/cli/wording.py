@@ -14,7 +14,15 @@ from typing import Any
 _START = r"(?:^|(?<=: ))"  # of a message, or of its part after the name of a file
 _VALUE = re.compile(_START + r"(?P<name>[\w.]+) (?:is|are) (?P<value>[-+]?(?:\d[-+\w.]*|nan|inf)|[(\[][^)\]]*)")
 _SUBJECT = re.compile(_START + r"(?P<name>[a-z]\w*) (?=(?:is|are|has|have|holds|names|leaves) )")
-_ADVICE = re.compile(r"(?<=give )(?P<name>[a-z]\w*)\b|(?<![-\w./'\"`])(?P<word>[a-z]\w*_\w+)\b(?![./(=])")
+_ADVICE = re.compile(
+    r"(?<=give )(?P<names>[a-z]\w*(?:(?:, or|, and|,| or| and) [a-z]\w*)*)\b"
+    r"|(?<![-\w./'\"`])(?P<word>[a-z]\w*_\w+)\b(?![./(=])"
+)
+_RULE = re.compile(  # a constraint as it prints itself, and as advice calls it
+    r"(?P<kind>KeepOutSegment|KeepOutDisc|MinimumGap|RimMargin)"
+    r"(?:\((?P<numbers>(?:[^()]|\([^()]*\))*)\)| (?P<length>gap|margin|width|diameter)\b)"
+)
+_FLAGS = {"KeepOutSegment": "--spiders", "MinimumGap": "--min-gap", "RimMargin": "--rim-margin"}
 _ANGLE = re.compile(r"[\d.e+-]+ rad \((?P<arcsec>[\d.e+-]+ arcsec)\)")  # options are in arcsec
 _NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*(?:e[-+]?\d+)?|nan|inf)\b")
 
@@ -61,10 +69,13 @@ def in_options(message: str, options: Any) -> str:
     '--pixel-fill is 2.0: it must be a fraction'
     >>> in_options("these holes overlap: lower fill_factor", Options())
     'these holes overlap: lower --fill-factor'
+    >>> in_options("no mask obeys MinimumGap(gap=0.1)", Options())
+    'no mask obeys --min-gap 0.1'
     >>> in_options("pixel_scale 4.848e-06 rad (1 arcsec) undersamples an aperture", Options())
     'pixel_scale 1 arcsec undersamples an aperture'
     """
     known, message = list(_flatten(options)), _ANGLE.sub(r"\g<arcsec>", message)
+    message = _RULE.sub(lambda found: _rule(found, known), message)
     told = _VALUE.search(message)
     head = told or _SUBJECT.search(message)
     if head is None:
@@ -93,7 +104,28 @@ def _by_name(name: str, known: list[Option]) -> str | None:
 
 def _advise(text: str, known: list[Option]) -> str:
     """Replace names of parameters that are also those of options."""
-    return _ADVICE.sub(lambda found: _by_name(found[0], known) or found[0], text)
+
+    def flags(found: re.Match[str]) -> str:
+        return re.sub(r"\w+", lambda word: _by_name(word[0], known) or word[0], found[0])
+
+    return _ADVICE.sub(flags, text)
+
+
+def _rule(found: re.Match[str], known: list[Option]) -> str:
+    """Return a constraint as the options that make it, with its numbers in their order."""
+    kind, numbers, length = found["kind"], _NUMBER.findall(found["numbers"] or ""), found["length"]
+    if kind == "KeepOutDisc":  # the central obstruction, or one of the discs
+        given = [option for option in known if option.name in ("central_obstruction", "keep_out") and option.is_given]
+        if numbers:
+            diameter, *center = numbers
+            alone = [option.flag for option in given if option.numbers == [float(diameter)]]
+            central = alone and not any(map(float, center))
+            return f"{alone[0]} {diameter}" if central else f"--keep-out {' '.join([*center, diameter])}"
+        flags = [option.flag + " diameter" * (option.name == "keep_out") for option in given]
+        return " or ".join(flags) or found[0]
+    if numbers:
+        return f"{_FLAGS[kind]} {' '.join(numbers)}"
+    return _FLAGS[kind] + " width" * (length == "width")
 
 
 def _flatten(options: Any, prefix: str = "--") -> Iterator[Option]:

@@ -148,11 +148,14 @@ def all_margins(aperture: SparseAperture, constraints: Sequence[Constraint]) -> 
 
 
 @torch.inference_mode(False)  # it differentiates, whatever the caller does
-def project(aperture: SparseAperture, constraints: Sequence[Constraint]) -> SparseAperture:
+def project(
+    aperture: SparseAperture, constraints: Sequence[Constraint], tick: Callable[[], None] | None = None
+) -> SparseAperture:
     """Return the mask nearest to `aperture` that satisfies all `constraints`, to rounding.
 
     Nearest means the smallest sum of squared shifts, found by sequential quadratic programming. Masks of a population
-    are projected one by one. The result has no gradient.
+    are projected one by one. The result has no gradient. `tick` is called at every step of the optimisation, which for
+    masks of many holes takes up to half a minute.
 
     Raises
     ------
@@ -166,14 +169,18 @@ def project(aperture: SparseAperture, constraints: Sequence[Constraint]) -> Spar
     # The result is rounded to the dtype of the aperture and must still satisfy the constraints.
     slack = aperture.mask_diameter * (1e-12 if centers.dtype == torch.float64 else 8 * torch.finfo(centers.dtype).eps)
     masks = [
-        _project_one(double.replace(centers=one), subspace, constraints, slack)
+        _project_one(double.replace(centers=one), subspace, constraints, slack, tick)
         for one in double.centers.reshape(-1, *centers.shape[-2:])
     ]
     return aperture.replace(centers=torch.stack(masks).reshape(centers.shape).to(centers))
 
 
 def _project_one(
-    aperture: SparseAperture, subspace: Subspace, constraints: Sequence[Constraint], slack: float
+    aperture: SparseAperture,
+    subspace: Subspace,
+    constraints: Sequence[Constraint],
+    slack: float,
+    tick: Callable[[], None] | None,
 ) -> Tensor:
     scale = aperture.mask_diameter
     slack = slack / scale
@@ -196,11 +203,13 @@ def _project_one(
         rows = np.flatnonzero(relevant)
         # From far away the nearest mask takes an optimisation; Newton's method removes the remaining shortfall.
         if shortfall > 1e-3:
-            z = _nearest_point(nearest, z + nudge, margins, rows, slack)
+            z = _nearest_point(nearest, z + nudge, margins, rows, slack, tick)
         z = _onto(z, margins, rows, slack)
 
 
-def _nearest_point(target: Array, start: Array, margins: _Margins, rows: Array, slack: float) -> Array:
+def _nearest_point(
+    target: Array, start: Array, margins: _Margins, rows: Array, slack: float, tick: Callable[[], None] | None
+) -> Array:
     """Return argmin |z - target|^2 subject to margins >= slack."""
     result = minimize(
         lambda z: (0.5 * ((z - target) ** 2).sum(), z - target),
@@ -213,6 +222,7 @@ def _nearest_point(target: Array, start: Array, margins: _Margins, rows: Array, 
             "jac": lambda z: margins.jacobian(z, rows),
         },
         options={"maxiter": 60, "ftol": 1e-12},
+        callback=None if tick is None else lambda _: tick(),
     )
     return result.x if np.isfinite(result.x).all() else start
 

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from torchmask.io import atomic_write, extra
 from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.overlaps import require_apart
 from torchmask.optics.shape_base import Array, Circle, Contour, Corners, Shape
 from torchmask.optics.shapes import outlined_shape
 
@@ -26,7 +27,9 @@ _SCALE = "torchmask mm per m"
 _NANOMETRE = 1e-6  # [mm], tolerance for rounding
 
 
-def save_dxf(path: str | Path, aperture: SparseAperture, scale: float = LIFE_SIZE) -> None:
+def save_dxf(
+    path: str | Path, aperture: SparseAperture, scale: float = LIFE_SIZE, *, allow_overlap: bool = False
+) -> None:
     """Write a DXF drawing, with holes as circles or closed polylines on layer HOLES and the rim on layer OUTLINE.
 
     Parameters
@@ -37,18 +40,21 @@ def save_dxf(path: str | Path, aperture: SparseAperture, scale: float = LIFE_SIZ
         One mask.
     scale : float
         Millimetres on the plate for one metre of the pupil; stored in the drawing for `load_mask`.
+    allow_overlap : bool
+        Whether holes may overlap, which are one hole on the plate.
 
     Raises
     ------
     ValueError
-        If `path` exists, its folder does not, the aperture is a population of masks, or `scale` is not finite and
-        positive.
+        If `path` exists, its folder does not, the aperture is a population of masks, its holes overlap by more than a
+        millionth of its diameter and `allow_overlap` is not given, or `scale` is not finite and positive.
     """
     with extra("design"):
         import ezdxf
         import ezdxf.units
 
     centers = require_one_mask(aperture).double() * require_scale(scale)
+    require_apart(aperture, allow_overlap)
     drawing = ezdxf.new("R2010", units=ezdxf.units.MM)  # pyright: ignore[reportPrivateImportUsage]
     drawing.header.custom_vars.append(_SCALE, repr(float(scale)))
     for layer in ("HOLES", "OUTLINE"):
@@ -67,13 +73,16 @@ def save_dxf(path: str | Path, aperture: SparseAperture, scale: float = LIFE_SIZ
         file.write(text.getvalue().encode(drawing.output_encoding))
 
 
-def save_svg(path: str | Path, aperture: SparseAperture, scale: float = LIFE_SIZE) -> None:
+def save_svg(
+    path: str | Path, aperture: SparseAperture, scale: float = LIFE_SIZE, *, allow_overlap: bool = False
+) -> None:
     """Write an SVG drawing in true size, with the rim and the holes as hairlines. Its unit is the millimetre.
 
     SVG's y axis points down, so y is written with its sign reversed, and the picture shows y up. Arguments and errors
     are those of `save_dxf`.
     """
     centers = require_one_mask(aperture).double() * require_scale(scale)
+    require_apart(aperture, allow_overlap)
     width = 1.02 * scale * max(aperture.mask_diameter, 2 * aperture.reach)
     svg = ElementTree.Element(
         "svg",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
 import torch
@@ -75,9 +75,12 @@ class Holes:
         """Return x (..., F) with one hole, and those tied to it, moved to `position` (..., 2) [mask diameters]."""
         return self.subspace.place(x, hole, self._unroll(position.to(x), 1.0))
 
-    def feasible(self, x: Tensor) -> SparseAperture:
-        """Return the mask nearest to x (F,) that satisfies all constraints. Raises `Infeasible` if none is found."""
-        return project(self.aperture(x.detach()), self.constraints)
+    def feasible(self, x: Tensor, tick: Callable[[], None] | None = None) -> SparseAperture:
+        """Return the mask nearest to x (F,) that satisfies all constraints; for `tick` see `project`.
+
+        Raises `Infeasible` if none is found.
+        """
+        return project(self.aperture(x.detach()), self.constraints, tick)
 
 
 class Evaluation(NamedTuple):

@@ -21,6 +21,7 @@ class Pattern:
     centers : (N, 2) in any unit
     shape : of the holes
     built : the mask as built, of any diameter; None if it has no size of its own
+    unbuilt : why it has none
 
     Raises ValueError for anything but one mask of at least two holes: a single one has no pattern.
     """
@@ -29,6 +30,7 @@ class Pattern:
     centers: np.ndarray
     shape: Shape
     built: SparseAperture | None
+    unbuilt: str = "it has no size of its own"
 
     def __post_init__(self) -> None:
         if self.centers.ndim != 2 or len(self.centers) < 2:
@@ -42,7 +44,8 @@ class Pattern:
         """Return a mask of the catalogue. Raises ValueError for an unknown name."""
         entry = catalog.entry(name)
         built = SparseAperture.from_catalog(entry.name) if entry.as_built else None
-        return cls(entry.name, np.array(entry.centers), entry.shape, built)
+        unbuilt = cls.unbuilt if entry.pupil_diameter is None else "no source gives the diameter of its holes"
+        return cls(entry.name, np.array(entry.centers), entry.shape, built, unbuilt)
 
     @classmethod
     def of(cls, name: str, aperture: SparseAperture) -> Pattern:

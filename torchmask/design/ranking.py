@@ -203,7 +203,9 @@ def _lay_out(
     masks, left_out, constraints = [], {}, rules.constraints()
     for pattern in patterns:
         built = pattern.scaled(mask_diameter)
-        if built is not None:
+        if built is None:
+            left_out[f"{pattern.name}, {Layout.AS_BUILT.value}"] = pattern.unbuilt
+        else:
             try:
                 if not allow_overlap:
                     check_overlaps(built)

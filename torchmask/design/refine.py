@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -88,12 +89,18 @@ class Monitor:
             step, scalars = min(evaluations, self.budget), {"relative_mse": relative_mse}
             self.callback(Record(self.stage, step, self.budget, scalars, {"centers": centers.detach().clone()}))
 
+    def tell_after(self, stage: str, step: int, n_steps: int, scalars: dict[str, float]) -> None:
+        """Report work on what the stage found, which takes half a second for each mask of 60 holes."""
+        if self.callback is not None:
+            self.callback(Record(stage, step, n_steps, scalars, preparatory=True))
+
     def history(self, criterion: Criterion) -> dict[str, Tensor]:
         """Return the entry of the stage in `SearchResult.history`."""
-        measured: dict[int, float] = {}  # by identity of the centres, because a mask is the best for many rows
-        for _, centers in self.rows:
-            if id(centers) not in measured:
-                measured[id(centers)] = self._measure(criterion, centers)
+        distinct = {id(centers): centers for _, centers in self.rows}  # a mask is the best for many rows
+        measured: dict[int, float] = {}
+        for step, (key, centers) in enumerate(distinct.items(), 1):
+            measured[key] = self._measure(criterion, centers)
+            self.tell_after(f"{self.stage}/history", step, len(distinct), {"relative_mse": measured[key]})
         rows = [(evaluations, measured[id(centers)]) for evaluations, centers in self.rows]
         found = [row for row in rows if row[1] < float("inf")]
         return {self.stage: torch.tensor(found, dtype=torch.float64, device="cpu").reshape(-1, 2)}
@@ -200,7 +207,7 @@ def polish(
                 break
             multipliers = update
             descent.restart(slice(None), descent.points.clone())
-    candidates, failure = _feasible(holes, descent.points)
+    candidates, failure = _feasible(holes, descent.points, monitor)
     if not candidates:
         if fallback is None:
             raise failure
@@ -212,14 +219,16 @@ def polish(
     return candidates[best], merit.evaluations + len(candidates)
 
 
-def _feasible(holes: Holes, x: Tensor) -> tuple[list[SparseAperture], Infeasible]:
+def _feasible(holes: Holes, x: Tensor, monitor: Monitor) -> tuple[list[SparseAperture], Infeasible]:
     """Return the masks at x (P, F) that could be projected onto the constraints, and the error of another one."""
     masks, failure = [], Infeasible("no mask to project")
-    for point in x:
+    for step, point in enumerate(x, 1):
+        tell = partial(monitor.tell_after, "design/project", step, len(x), {})
         try:
-            masks.append(holes.feasible(point))
+            masks.append(holes.feasible(point, tell))
         except Infeasible as error:
             failure = error
+        tell()
     return masks, failure
 
 

@@ -14,6 +14,7 @@ from torchmask.grid import Grid
 from torchmask.optics.packing import hole_diameter
 
 AXES = ("n_subapertures", "fill_factor", "n_photons", "n_frames", "diameter_over_r0", "seed")
+ANY_WAVELENGTH = 550e-9  # [m] for pixels of wavelength / (2 D), whose frequencies are the same at every wavelength
 _WHOLE = ("n_subapertures", "n_frames", "seed", "n_pixels", "n_frequencies", "n_draws")
 _SAMPLES = 512  # minimum across the pupil raster for turbulence, where the sampled OTF biases the error by 0.1 %
 _MAY_BE_ZERO = ("seed", "exponent", "readout_noise")
@@ -47,8 +48,9 @@ class DesignSpace(MaskRules):
     """Largest hole diameter, in units of r0."""
     mask_diameter: float = 1.0
     """Diameter of the mask, D [m]."""
-    wavelength: float = 550e-9
-    """Wavelength of the observation [m]."""
+    wavelength: float | None = None
+    """Wavelength of the observation [m], needed with a pixel scale; None: errors with pixels of wavelength / (2 D)
+    depend on no wavelength."""
     n_pixels: int = 128
     """Pixels per side of the detector's field, which sets the total read-out noise; the criterion has its own grid."""
     n_frequencies: int = 256
@@ -77,21 +79,26 @@ class DesignSpace(MaskRules):
             _number("budget", self.budget, whole=True)
         for name in (field.name for field in fields(DesignSpace) if field.name not in _NOT_NUMBERS):
             given = getattr(self, name)
+            if name == "wavelength" and given is None:
+                continue
             values = tuple(_number(name, v, name in _WHOLE) for v in (given if name in AXES else (given,)))
             if len(set(values)) < len(values) or not (values or name == "diameter_over_r0"):
                 raise ValueError(f"{name} is {given}: it must hold at least one value, and none twice")
             object.__setattr__(self, name, values if name in AXES else values[0])
         if self.n_draws < 2:
             raise ValueError(f"n_draws is {self.n_draws}: a standard error needs at least 2")
+        if self.pixel_scale is not None and self.wavelength is None:
+            raise ValueError(f"pixel_scale is {self.pixel_scale} rad: the wavelength is missing, give it in m")
         self.constraints()
         self.grid.require_sampling(self.mask_diameter)
 
     @property
     def grid(self) -> Grid:
         """Grid of the criterion's frequencies."""
+        wavelength = ANY_WAVELENGTH if self.wavelength is None else self.wavelength
         if self.pixel_scale is None:
-            return Grid.nyquist(self.mask_diameter, self.wavelength, self.n_frequencies)
-        return Grid(self.n_frequencies, self.pixel_scale, self.wavelength)
+            return Grid.nyquist(self.mask_diameter, wavelength, self.n_frequencies)
+        return Grid(self.n_frequencies, self.pixel_scale, wavelength)
 
     @property
     def oversampling(self) -> int:
@@ -166,7 +173,7 @@ class Design:
 
 def _number(name: str, value: Any, whole: bool) -> int | float:
     """Return `value` as int or float, so that equal tasks have equal files."""
-    unit = {"mask_diameter": ", in m", "wavelength": ", in m", "outer_scale": ", in m"}.get(name, "")
+    unit = {"mask_diameter": ", in m", "wavelength": ", in m, such as 550e-9", "outer_scale": ", in m"}.get(name, "")
     least = "not negative" if name in _MAY_BE_ZERO else "positive"
     fits = math.isfinite(value) and (value > 0 or (value == 0 and name in _MAY_BE_ZERO))
     if not fits or (whole and not float(value).is_integer()):

@@ -103,8 +103,8 @@ def design_table(
     space : DesignSpace
         Parameters of the table.
     folder : path
-        Folder for the files of the tasks and of the table: table.csv, and table.json with the centres, which are
-        written last and replace those of an earlier call.
+        Folder for the files of the tasks and of the table: table.md, table.csv, and table.json with the centres, which
+        are written last and replace those of an earlier call.
     conditions : ExposureConditions, optional
         Exposure, band, pixels and sky, the sky at the reference fill factor: masks are then searched and measured by
         `TurbulentMSE` at the r0 of the row, without screens. None: by `AsymptoticMSE`.
@@ -155,13 +155,16 @@ def design_table(
     write_json(Path(folder) / "table.json", table, replace=True)
     with atomic_write(Path(folder) / "table.csv", replace=True) as file:
         file.write(table.csv().encode())
+    with atomic_write(Path(folder) / "table.md", replace=True) as file:
+        file.write(f"{table}\n".encode())
     return table
 
 
 def _scene(space: DesignSpace, row: Design) -> dict[str, Any]:
     """Return the values on which searches and measurements depend besides the mask."""
-    names = ("mask_diameter", "wavelength", "n_pixels", "n_frequencies", "exponent", "knee", "readout_noise")
+    names = ("mask_diameter", "n_pixels", "n_frequencies", "exponent", "knee", "readout_noise")
     return {name: getattr(space, name) for name in names} | {
+        "wavelength": space.grid.wavelength,
         "pixel_scale": space.grid.pixel_scale,
         "photons_per_frame": row.photons_per_frame,
         "n_frames": row.n_frames,

@@ -21,9 +21,11 @@ from scipy.optimize import brentq
 from torch import Tensor
 
 from torchmask.optics.aperture import Aperture, SparseAperture
+from torchmask.record import Callback, Record
 
 Criterion = Callable[[Aperture], Tensor]
 Kind = Literal["position", "diameter", "both"]
+_USUAL = 25  # evaluations of the criterion that a tolerance takes
 # Relative errors of the diameter at which the criterion is evaluated: closer to each other where errors are small.
 _DIAMETERS = np.array([-0.3, -0.08, -0.02, 0.0, 0.02, 0.08, 0.3])
 
@@ -145,6 +147,7 @@ def machining_tolerance(
     quantile: float | None = None,
     n_draws: int = 128,
     generator: torch.Generator | None = None,
+    callback: Callback | None = None,
 ) -> MachiningTolerance:
     """Return the rms machining error at which the MSE has grown by `growth`.
 
@@ -159,6 +162,8 @@ def machining_tolerance(
         Quantity with errors: each coordinate of the positions, the common diameter, or both with the same rms.
     quantile : float, optional
         Fraction of the masks, in (0, 1), that must stay below `growth`. By default their mean must.
+    callback : callable, optional
+        Receives a preparatory `Record` of stage "design/tolerance" after each evaluation of the criterion.
 
     Raises
     ------
@@ -176,7 +181,7 @@ def machining_tolerance(
     >>> 0 < tolerance.error < tolerance.rms < 0.1 * mask.subaperture_diameter
     True
     """
-    workshop = _Workshop(criterion, aperture, n_draws, generator)
+    workshop = _Workshop(criterion, aperture, n_draws, generator, callback)
     if kind not in get_args(Kind):
         raise ValueError(f"kind is {kind!r}: known kinds are {', '.join(get_args(Kind))}")
     if not (math.isfinite(growth) and growth > 0):
@@ -208,7 +213,12 @@ class _Workshop:
     """
 
     def __init__(
-        self, criterion: Criterion, aperture: SparseAperture, n_draws: int, generator: torch.Generator | None
+        self,
+        criterion: Criterion,
+        aperture: SparseAperture,
+        n_draws: int,
+        generator: torch.Generator | None,
+        callback: Callback | None = None,
     ) -> None:
         if aperture.centers.ndim != 2:
             shape = tuple(aperture.centers.shape)
@@ -218,6 +228,8 @@ class _Workshop:
                 f"n_draws is {n_draws}: it must be an even number of at least 16, since draws come in pairs"
             )
         self.criterion: Criterion = criterion
+        self.callback: Callback | None = callback
+        self.evaluations: int = 0
         self.aperture: SparseAperture = aperture
         like = {"dtype": aperture.centers.dtype, "device": aperture.centers.device, "generator": generator}
         position = torch.randn(n_draws // 2, *aperture.centers.shape, **like)
@@ -230,16 +242,25 @@ class _Workshop:
         """Return the distribution of the MSE at this size of the errors [m]."""
         centers = self.aperture.centers + position_rms * self.position
         if diameter_rms == 0:
-            mse = self.criterion(self.aperture.replace(centers=centers))
+            mse = self._measure(self.aperture.replace(centers=centers))
         else:
             relative = (diameter_rms / self.aperture.subaperture_diameter * self.diameter).cpu().double().numpy()
             nearest = np.abs(relative[:, None] - _DIAMETERS).argmin(1)
             mse = torch.from_numpy(self._of_diameter(relative)).to(centers)
             for node in np.unique(nearest) if position_rms > 0 else ():
                 own = torch.from_numpy(nearest == node).to(centers.device)
-                moved = self.criterion(self._of_size(node).replace(centers=centers[own]))
+                moved = self._measure(self._of_size(node).replace(centers=centers[own]))
                 mse[own] *= moved / float(self._of_diameter(_DIAMETERS[node]))
         return MachiningErrors(position_rms, diameter_rms, self._nominal, mse)
+
+    def _measure(self, aperture: SparseAperture) -> Tensor:
+        """Return the MSE of masks (...), and report how many times that was done."""
+        mse = self.criterion(aperture)
+        self.evaluations += 1
+        if self.callback is not None:
+            budget, scalars = max(_USUAL, self.evaluations), {"mse": float(mse.mean())}
+            self.callback(Record("design/tolerance", self.evaluations, budget, scalars, preparatory=True))
+        return mse
 
     def _of_size(self, node: int) -> SparseAperture:
         diameter = self.aperture.subaperture_diameter * (1 + float(_DIAMETERS[node]))
@@ -248,10 +269,10 @@ class _Workshop:
     @cached_property
     def _nominal(self) -> float:
         """The MSE of the mask as designed."""
-        return float(self.criterion(self.aperture))
+        return float(self._measure(self.aperture))
 
     @cached_property
     def _of_diameter(self) -> CubicSpline:
         """The MSE at the nominal positions over the relative error of the diameter."""
-        values = [float(self.criterion(self._of_size(node))) for node in range(len(_DIAMETERS))]
+        values = [float(self._measure(self._of_size(node))) for node in range(len(_DIAMETERS))]
         return CubicSpline(_DIAMETERS, values)

@@ -14,12 +14,14 @@ from torchmask.atmosphere.seeing import Seeing
 from torchmask.grid import ARCSEC, Grid
 from torchmask.instrument.parts import Camera, Site, Source, Telescope
 from torchmask.io import extra, from_json, read_json, to_json, write_json
-from torchmask.numbers import require
+from torchmask.numbers import require, require_wavelength, require_within
 from torchmask.optics.band import Band
 from torchmask.optics.passband import Passband
 from torchmask.spectra import NoisePSD, PowerLawPSD
 
 _FORMAT = "torchmask instrument, version 1"
+
+_THROUGH_AIR = 1e-7, 5e-5  # [m], from the ultraviolet to beyond the last window of the infrared
 
 # AB - Vega magnitudes: Blanton & Roweis, Astron. J. 133, 734 (2007), table 1.
 VEGA_IN_AB = {
@@ -80,12 +82,12 @@ class Instrument:
     """Number of frames, instead of the observing time."""
 
     def __post_init__(self) -> None:
-        require("wavelength", self.wavelength, ", in m", most=1e-2)
+        require_wavelength("wavelength", self.wavelength, *_THROUGH_AIR)
         require("width", self.width, ", in m")
-        require("exposure", self.exposure, ", in s")
+        require_within("exposure", self.exposure, 1e-6, 1e5, " s", "the fastest shutters to a day")
         require("observing_time", self.observing_time, ", in s")
         if (self.width is None) == (self.filter is None):
-            raise ValueError("the band is missing or given twice: give a filter, or wavelength and width [m]")
+            raise ValueError("the band is missing or given twice: give filter, or wavelength and width [m]")
         if self.wavelength is None and self.filter is None:
             raise ValueError("wavelength is missing: give it in m, such as 550e-9")
         if (self.observing_time is None) == (self.n_frames is None):
@@ -99,7 +101,7 @@ class Instrument:
         if self.observing_time is not None and self.frames < 1:
             raise ValueError(
                 f"observing_time is {self.observing_time:g} s, but one frame takes {self._cadence:g} s: observe for at "
-                "least that, or expose for less"
+                f"least that, or expose for {self._longest_exposure}"
             )
 
     def _check_band(self) -> None:
@@ -137,6 +139,13 @@ class Instrument:
     @property
     def _cadence(self) -> float:
         return self.exposure + self.camera.readout_time
+
+    @property
+    def _longest_exposure(self) -> str:
+        """What of the observing time is left beside one read-out."""
+        assert self.observing_time is not None
+        longest = self.observing_time - self.camera.readout_time
+        return f"at most {longest:g} s" if longest > 0 else "any time with a faster read-out"
 
     @property
     def frames(self) -> int:
@@ -242,9 +251,12 @@ class Instrument:
         ]
         return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
-    def save(self, path: str | Path) -> None:
-        """Write a new JSON file that `load` reads back exactly. Raises ValueError as `write_json` does."""
-        write_json(path, {"format": _FORMAT} | to_json(self))
+    def save(self, path: str | Path, replace: bool = False) -> None:
+        """Write a JSON file that `load` reads back exactly: a new one, or in place of one that exists (`replace`).
+
+        Raises ValueError as `write_json` does.
+        """
+        write_json(path, {"format": _FORMAT} | to_json(self), replace=replace)
 
     @classmethod
     def load(cls, path: str | Path) -> Instrument:

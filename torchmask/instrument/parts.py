@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from torchmask.numbers import require
+from torchmask.numbers import require, require_r0, require_within
 from torchmask.optics.aperture import FullAperture
 from torchmask.optics.detector import Detector
 from torchmask.optics.pixel import PixelResponse, square_pixel
@@ -100,9 +100,13 @@ class Source:
             raise ValueError("source: give either its magnitude or its photon_rate [1 / (s m^2)], and not both")
         if self.system not in get_args(System):
             raise ValueError(f"source.system is {self.system!r}: known systems are {' and '.join(get_args(System))}")
-        if self.magnitude is not None and not math.isfinite(self.magnitude):
-            raise ValueError(f"source.magnitude is {self.magnitude}: it must be finite")
-        require("source.photon_rate", self.photon_rate, ", in photons / (s m^2)")
+        require_within(
+            *("source.magnitude", self.magnitude, -30.0, 40.0, ""),
+            "brighter than the Sun to fainter than any telescope sees",
+        )
+        require(
+            "source.photon_rate", self.photon_rate, ", in photons / (s m^2), 1e22 being those of the Sun", most=1e22
+        )
         require("source.temperature", self.temperature, ", in K")
         require("source.size", self.size, ", in arcsec")
         require("source.exponent", self.exponent, "", zero=True)
@@ -130,10 +134,13 @@ class Site:
     """Brightness of the sky in the band [magnitudes per square arcsec], in the system of the source; None: black."""
 
     def __post_init__(self) -> None:
-        for name, unit in (("r0", "m"), ("wind", "m/s"), ("outer_scale", "m")):
-            require(f"site.{name}", getattr(self, name), f", in {unit}")
-        if self.sky is not None and not math.isfinite(self.sky):
-            raise ValueError(f"site.sky is {self.sky}: it must be finite, in magnitudes per square arcsec")
+        require_r0("site.r0", self.r0)
+        require_within("site.wind", self.wind, 0.01, 200.0, " m/s", "calm air to the fastest jet streams")
+        require_within("site.outer_scale", self.outer_scale, 0.1, 1e5, " m", "beyond, it makes no difference")
+        require_within(
+            *("site.sky", self.sky, -5.0, 30.0, " magnitudes per square arcsec"),
+            "the thermal infrared to darker than any sky",
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

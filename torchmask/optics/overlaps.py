@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.aperture import Aperture, SparseAperture
 
 _SHOWN = 3  # largest number of pairs in a message
 
@@ -67,6 +67,18 @@ def check_overlaps(aperture: SparseAperture, tolerance: float = 1e-6) -> None:
     pairs = find_overlaps(aperture, tolerance)
     if pairs:
         raise ValueError(describe_overlaps(aperture, pairs))
+
+
+def require_apart(aperture: Aperture, allow_overlap: bool = False) -> None:
+    """Raise ValueError as `check_overlaps` if an aperture is a mask whose holes overlap, unless that is allowed.
+
+    Drawings for a workshop and simulations ask for it.
+    """
+    if isinstance(aperture, SparseAperture) and not allow_overlap:
+        try:
+            check_overlaps(aperture)
+        except ValueError as error:
+            raise ValueError(f"{error}; give allow_overlap to accept it") from error
 
 
 def describe_overlaps(aperture: SparseAperture, pairs: list[Overlap]) -> str:

@@ -113,12 +113,14 @@ def plan_observation(
     if aperture is None:
         numbers, sizes = whole(n_subapertures), or_default(hole_diameters, _HOLES, instrument.site.r0)
         points = tuple(itertools.product(numbers, positive("hole_diameters", sizes, "m")))
-        settings = {"budget": budget, "seed": seed, "n_frequencies": n_frequencies}
+        settings, n_known = {"budget": budget, "seed": seed, "n_frequencies": n_frequencies}, len(left_out)
         masks = _search(instrument, points, _rules(instrument, constraints), settings, left_out, callback)
+        if not masks:  # the first has the fewest and smallest holes, the nearest to what can be built
+            reason, *others = left_out[n_known:]
+            more = f"; nor can the other {len(others)}, of more or wider holes" if others else ""
+            raise ValueError(f"no point of the map can be built: {reason}{more}")
     else:
         masks = {(aperture.n_subapertures, aperture.subaperture_diameter): aperture}
-    if not masks:
-        raise ValueError(f"no point of the map can be built: {'; '.join(left_out)}")
     choices = tuple(_measure(exposed, masks, n_frequencies, callback))
     known = {} if aperture is not None and aperture.is_full else _tried_up_to(instrument)
     return ObservationPlan(instrument, choices, masks, tuple(dict.fromkeys(left_out)), known)

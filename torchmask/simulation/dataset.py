@@ -98,6 +98,8 @@ class StackDataset(Dataset[dict[str, Tensor]]):
         Seed of all stacks, at least 0.
     dtype : torch.dtype
         Type of the simulation and of the tensors it returns.
+    allow_overlap : bool
+        Whether holes of the mask may overlap, as of `simulate_observation`.
 
     Raises
     ------
@@ -159,6 +161,7 @@ class StackDataset(Dataset[dict[str, Tensor]]):
         readout_noise: float = 1.5,
         seed: int = 0,
         dtype: torch.dtype = torch.float32,
+        allow_overlap: bool = False,
     ) -> None:
         if not float(length).is_integer() or length < 1:
             raise ValueError(f"length is {length}: it must be a whole number of at least 1")
@@ -178,6 +181,7 @@ class StackDataset(Dataset[dict[str, Tensor]]):
         self.detector: Detector = Detector(readout_noise)
         self.seed: int = int(seed)
         self.dtype = dtype
+        self.allow_overlap = allow_overlap
         self.scene = scene
         self._mesh = None if scene is not None else satellite_mesh() if path is None else load_mesh(path)
         self[0]  # raises errors here rather than in a worker
@@ -199,6 +203,7 @@ class StackDataset(Dataset[dict[str, Tensor]]):
             self.detector,
             self.n_frames,
             _seeded(random),
+            allow_overlap=self.allow_overlap,
         )
         assert observation.object is not None
         assert observation.psfs is not None

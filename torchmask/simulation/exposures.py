@@ -20,6 +20,7 @@ from torchmask.memory import require_memory
 from torchmask.observation import Observation
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.detector import Detector, image_formation
+from torchmask.optics.overlaps import require_apart
 from torchmask.record import Callback, Record
 from torchmask.simulation.conditions import Conditions
 from torchmask.simulation.exposed_psf import ExposedPSF
@@ -49,6 +50,7 @@ def simulate_observation(
     conditions: Conditions | None = None,
     told: Aperture | None = None,
     keep_phases: bool = False,
+    allow_overlap: bool = False,
     callback: Callback | None = None,
 ) -> Observation:
     """Simulate short exposures of a scene, end to end.
@@ -79,6 +81,8 @@ def simulate_observation(
     keep_phases : bool
         Whether the observation keeps the phase of every frame in the middle of the field (`Observation.phases`), for
         comparison with a restored one. Only for monochromatic snapshots.
+    allow_overlap : bool
+        Whether holes of the mask may overlap, as in some real masks; light in overlaps counts twice.
     callback : callable, optional
         Receives a `Record` of stage "simulation" after each chunk of frames, with the frames so far.
 
@@ -90,10 +94,11 @@ def simulate_observation(
     Raises
     ------
     ValueError
-        If the scene does not fit the grid or is negative, black or not finite; the aperture is a population;
-        `n_frames` is below 1; the grid samples the aperture too coarsely at the shortest wavelength; `exposure_time`
-        is given but the turbulence has no wind, or it exceeds the time between frames; or `keep_phases` is combined
-        with `exposure_time`, `band` or `told`.
+        If the scene does not fit the grid or is negative, black or not finite; the aperture is a population; its holes
+        overlap by more than a millionth of its diameter and `allow_overlap` is not given; `n_frames` is below 1; the
+        grid samples the aperture too coarsely at the shortest wavelength; `exposure_time` is given but the turbulence
+        has no wind, or it exceeds the time between frames; or `keep_phases` is combined with `exposure_time`, `band` or
+        `told`.
 
     Examples
     --------
@@ -127,6 +132,7 @@ def simulate_observation(
     conditions = conditions or Conditions()
     scene = scene.detach()
     _check(scene, aperture, grid, n_frames)
+    require_apart(aperture, allow_overlap)
     require_memory("n_frames", n_frames, 2.0 * n_frames * scene.numel() * scene.element_size())  # frames and PSFs
     turbulence = with_layers(turbulence, grid.wavelength)
     delays = exposure_delays(turbulence, conditions.exposure_time)

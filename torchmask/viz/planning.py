@@ -40,10 +40,12 @@ def plan_figure(plan: ObservationPlan) -> Figure:
 
 def _draw_line(ax: Axes, line: Sequence[Choice], axis: str, scale: float, color: str, label: str | None = None) -> None:
     """Draw the errors along an axis, with an arrow upwards at each that is a lower limit."""
-    for is_limit, style in ((False, {"marker": "o", "label": label}), (True, {"marker": "^", "linestyle": "none"})):
-        points = [(scale * getattr(c, axis), c.blind_mse) for c in line if c.is_limit == is_limit]
-        if points:
-            ax.plot(*zip(*points, strict=True), color=color, markersize=4 if not is_limit else 6, **style)
+    known, limits = (
+        np.array([(scale * getattr(c, axis), c.blind_mse) for c in line if c.is_limit == is_limit]).reshape(-1, 2)
+        for is_limit in (False, True)
+    )
+    ax.plot(*known.T, "o-", color=color, markersize=4, label=label)
+    ax.plot(*limits.T, "^", color=color)
 
 
 def _draw_map(figure: Figure, ax: Axes, plan: ObservationPlan) -> None:
@@ -63,7 +65,7 @@ def _draw_map(figure: Figure, ax: Axes, plan: ObservationPlan) -> None:
             text, color = "does not fit", drawing.FAINT
         ax.text(column, row, text, ha="center", va="center", fontsize=8, color="black" if error > middle else color)
     place = holes.index(best.hole_diameter), numbers.index(best.n_subapertures)
-    ax.plot(*place, "o", **(_RING | {"markersize": 34}))
+    ax.plot(*place, "o", markersize=34, fillstyle="none", color=drawing.COLORS[1])
     ax.set_xticks(range(len(holes)), [f"{hole:.3g}\n{hole / r0:.2g} r0" for hole in holes])
     ax.set_yticks(range(len(numbers)), [str(n) for n in numbers])
     ax.set(xlabel="hole diameter [m]", ylabel="number of holes", title=f"at {1e3 * best.exposure:.3g} ms")

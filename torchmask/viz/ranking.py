@@ -21,6 +21,8 @@ _MARKS = {
 @drawing.styled
 def ranking_figure(ranking: Ranking) -> Figure:
     """Draw the masks in order, each as built and laid afresh on one line, and their error over the number of holes."""
+    from matplotlib.ticker import MaxNLocator
+
     best: dict[str, float] = {}
     for row in ranking.rows:
         best[row.mask] = min(row.relative_mse, best.get(row.mask, row.relative_mse))
@@ -46,6 +48,7 @@ def ranking_figure(ranking: Ranking) -> Figure:
     listing.set_xlabel("relative MSE (dashed: what no mask can change)")
     against.set(xlabel="number of holes", ylabel="relative MSE", title="Against the number of holes")
     against.set_ylim(0)
+    against.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
     figure.legend(*listing.get_legend_handles_labels(), loc="outside upper left", ncols=1)
     return figure
 
