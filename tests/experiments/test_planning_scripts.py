@@ -1,7 +1,9 @@
-"""The maps of success and of smearing and the number of holes: their tables, and tiny runs."""
+"""The maps of success, of smearing and of the bound, and the number of holes: their tables, and tiny runs."""
 
 import json
+import statistics
 
+import bound_map
 import number_of_holes
 import numpy as np
 import pytest
@@ -103,6 +105,18 @@ def test_the_best_number_of_holes_and_those_that_are_as_good():
     assert number_of_holes.ranges([3, 5, 6, 7, 9]) == "3, 5-7, 9"
 
 
+def test_the_best_mask_of_any_search_counts_at_each_flux():
+    line = [[-0.35, 0.0], [0.0, 0.0], [0.35, 0.0]]  # with its empty directions, worse than a triangle
+    common = {"photons": [1e5, 1e7], "n_frames": 5, "n_pixels": 32, "exponent": 1.5, "strength": 5.0}
+    common["subaperture_diameter"] = THREE.subaperture_diameter
+    worse, better, both = (
+        number_of_holes.predict(common | {"masks": masks})
+        for masks in ([line], [THREE.centers.tolist()], [THREE.centers.tolist(), line])
+    )
+    assert both == better
+    assert all(high > low > floor for high, low, floor in zip(worse["errors"], *better.values(), strict=True))
+
+
 def test_a_tiny_choice_of_the_number_of_holes(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert number_of_holes.main(["--smoke", "--workers", "1", "--out", "run"]) == 0
@@ -110,3 +124,45 @@ def test_a_tiny_choice_of_the_number_of_holes(tmp_path, monkeypatch, capsys):
     assert [row["n_subapertures"] for row in rows] == [5, 8]
     assert all(row["blind"] >= row["known"] > 0 for row in rows)
     assert "| 5 | 1e6 |" in capsys.readouterr().out
+
+
+def test_bounds_are_averaged_over_draws_and_told_over_what_can_be_avoided():
+    rows = [
+        {"n_modes": 6, "n_frames": 2, "n_photons": photons, "known": known, "unknown": unknown, "floor": 0.05}
+        | {"excess": unknown / known - 1}
+        for photons, known, unknown in ((1e6, 0.1, 0.104), (1e6, 0.2, 0.202), (1e7, 0.15, 0.15003))
+    ]
+    dim, bright = bound_map.summarise(rows)
+    assert (dim["draws"], bright["draws"]) == (2, 1)
+    assert [dim[name] for name in ("least", "excess", "most")] == pytest.approx([0.01, 0.025, 0.04])
+    assert dim["avoidable"] == pytest.approx(0.003 / 0.1)
+    (line,) = bound_map.markdown(bound_map.Options(), [dim, bright]).splitlines()[-1:]
+    assert line == "| 6 | 2 | 2 | 2.5 (3.0) | 0.020 (0.030) |"
+    assert [bound_map.percent(share) for share in (0.0996, 0.123, 0.00999)] == ["10", "12", "1.0"]
+
+
+def test_a_tiny_map_of_the_bound(tmp_path, monkeypatch, capsys):
+    """More frames and fewer modes cost less; every flux sees the same aberrations."""
+    monkeypatch.chdir(tmp_path)
+    assert bound_map.main(["--smoke", "--workers", "1", "--out", "run"]) == 0
+    result = json.loads((tmp_path / "run/bound_map.json").read_text())
+    found = {tuple(cell[key] for key in bound_map.KEYS): cell for cell in result["cells"]}
+    for photons in (1e5, 1e6):
+        few, many = (found[3, n_frames, photons]["excess"] for n_frames in (1, 2))
+        assert few > many > 0
+        assert found[6, 2, photons]["excess"] > many
+        assert found[6, 2, photons]["avoidable"] > found[6, 2, photons]["excess"]
+    assert found[3, 1, 1e5]["known"] > found[3, 1, 1e6]["known"]
+    draws = [
+        row["excess"] for row in result["rows"] if (row["n_modes"], row["n_frames"], row["n_photons"]) == (3, 1, 1e6)
+    ]
+    assert len(set(draws)) == 2
+    assert statistics.mean(draws) == pytest.approx(found[3, 1, 1e6]["excess"])
+    assert (tmp_path / "run/bound_map.png").read_bytes().startswith(b"\x89PNG")
+    assert "| 6 | 2 | 1 |" in capsys.readouterr().out
+
+
+def test_each_number_of_frames_needs_its_number_of_draws(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert bound_map.main(["--frames", "1", "2", "--workers", "1", "--out", "run"]) == 1
+    assert "draws is (8, 6, 4, 2, 2): one number is needed for each of frames, (1, 2)" in capsys.readouterr().err
