@@ -83,7 +83,8 @@ def myopic_bound(
     r0, outer_scale : float
         Fried parameter, at the wavelength of the grid, and outer scale of the turbulence [m], the aberrations' prior.
     oversampling : int
-        Oversampling of the pupil.
+        Oversampling of the pupil. Holes 4 samples wide make the excess over known aberrations 10 to 30 % too small: use
+        4 where they are narrower than 8.
     generator : torch.Generator, optional
         Source of the random aberrations.
 
