@@ -1,5 +1,6 @@
 import contextlib
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,12 @@ from torchmask.design.drawing import save_dxf, save_svg
 from torchmask.design.manufacture import amplitude_map, load_mask, mask_wavelength, save_fits, save_json
 from torchmask.optics.aperture import FullAperture, SparseAperture
 
-SAVE = {".json": save_json, ".dxf": save_dxf, ".svg": save_svg, ".fits": save_fits}
+SAVE = {
+    ".json": save_json,
+    ".dxf": partial(save_dxf, allow_overlap=True),
+    ".svg": partial(save_svg, allow_overlap=True),
+    ".fits": save_fits,
+}
 READABLE = [".json", ".dxf", ".fits"]
 SVG = "{http://www.w3.org/2000/svg}"
 

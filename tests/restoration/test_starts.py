@@ -192,7 +192,7 @@ def test_new_frames_are_fitted_to_the_object(rms, explained):
     evaluations = []
 
     def counting(cost, start, lower, *, max_iterations, callback):
-        n_each = (len(start) - state.image.numel()) // state.z.shape[1]
+        n_each = len(start) // state.z.shape[1]  # the object is known, and no part of what is sought
         found = ProjectedLBFGS()(cost, start, lower, max_iterations=max_iterations, callback=callback)
         evaluations.append(n_each * found.n_evaluations)
         return found
