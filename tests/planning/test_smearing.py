@@ -64,6 +64,7 @@ def test_beyond_it_warns_and_takes_the_edge(point, edge, name, said):
     with pytest.warns(UserWarning, match=said):
         outlook = MAP.outlook(INSTANTS, **dict(zip(("n_photons", "exposure", "spread"), point, strict=True)))
     assert outlook.outside == (name,)
+    assert outlook.harder == ((name,) if name != "n_photons" else ())
     assert outlook.restored == ratio(*edge)
     assert (outlook.cost, outlook.success) == (INSTANTS.cost, INSTANTS.success)
 

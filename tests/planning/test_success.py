@@ -72,6 +72,7 @@ def test_beyond_it_warns_and_takes_the_edge(name, value, edge, said):
     with pytest.warns(UserWarning, match=said):
         outlook = MAP.outlook(**(inside | {name: value}))
     assert outlook.outside == (name,)
+    assert outlook.harder == ((name,) if name == "d_over_r0" else ())  # more light and frames lose no more
     within = MAP.outlook(**(inside | {name: edge}))
     assert (outlook.success, outlook.cost) == (within.success, within.cost)
 
