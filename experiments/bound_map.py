@@ -21,15 +21,14 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
+from searched_masks import search_masks
 from success_map import DIAMETER, FILL_FACTOR, OUTER_SCALE, READOUT_NOISE, WAVELENGTH, of_mask
 
 from torchmask.cli.options import SweepOptions
 from torchmask.cli.program import run_script
 from torchmask.cli.run import new_run
 from torchmask.design.criterion import AsymptoticMSE
-from torchmask.design.space import DesignSpace
 from torchmask.design.sweep import run_tasks
-from torchmask.design.table import design_table
 from torchmask.grid import Grid
 from torchmask.optics.aperture import SparseAperture
 from torchmask.planning.bounds import myopic_bound
@@ -62,20 +61,6 @@ class Options(SweepOptions):
     """Strength of the turbulence, D / r0."""
     n_pixels: int = 64
     """Number of pixels per side of the image."""
-
-
-def choose_mask(options: Options, callback: Callback) -> SparseAperture:
-    """Return a searched mask."""
-    space = DesignSpace(
-        n_subapertures=(N_HOLES,),
-        fill_factor=(FILL_FACTOR,),
-        reference_fill_factor=FILL_FACTOR,
-        diameter_over_r0=(),
-        n_frequencies=64 if options.smoke else 128,
-        budget=100 if options.smoke else 2000,
-    )
-    table = design_table(space, options.sweep, **options.keywords(callback))
-    return table.aperture(table.rows[0])
 
 
 def bound(task: Mapping[str, Any]) -> dict[str, Any]:
@@ -194,7 +179,8 @@ def run(options: Options) -> None:
     if len(options.draws) != len(options.frames):
         raise ValueError(f"draws is {options.draws}: one number is needed for each of frames, {options.frames}")
     with new_run("bound_map", options) as output:
-        rows = measure(options, choose_mask(options, output.callback), output.callback)
+        mask = search_masks([N_HOLES], FILL_FACTOR, options, output.callback)[N_HOLES]
+        rows = measure(options, mask, output.callback)
         cells = summarise(rows)
         text = markdown(options, cells)
         output.report("bound_map", {"cells": cells, "rows": rows}, text, figure(rows, cells))

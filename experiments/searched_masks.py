@@ -1,12 +1,16 @@
-"""One search for each number of holes and seed, shared by the gallery of masks and the curve over N."""
+"""Searches shared by several scripts: the gallery of masks and the curve over N, and the masks of planning scripts."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 from torchmask.cli.options import SweepOptions
 from torchmask.design.space import Design, DesignSpace
+from torchmask.design.table import design_table
+from torchmask.optics.aperture import SparseAperture
+from torchmask.record import Callback
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,3 +57,19 @@ def error(row: Design) -> float:
     if row.relative_mse is None:
         raise ValueError(f"no mask of {row.n_subapertures} holes: {row.infeasible}")
     return row.relative_mse
+
+
+def search_masks(
+    holes: Iterable[int], fill_factor: float, options: SweepOptions, callback: Callback
+) -> dict[int, SparseAperture]:
+    """Return a mask for each number of holes, by a short search without turbulence."""
+    space = DesignSpace(
+        n_subapertures=tuple(sorted(set(holes))),
+        fill_factor=(fill_factor,),
+        reference_fill_factor=fill_factor,
+        diameter_over_r0=(),
+        n_frequencies=64 if options.smoke else 128,
+        budget=100 if options.smoke else 2000,
+    )
+    table = design_table(space, options.sweep, **options.keywords(callback))
+    return {row.n_subapertures: table.aperture(row) for row in table.rows}

@@ -28,6 +28,7 @@ import numpy as np
 import torch
 from mask_vs_full import fit_modes
 from scipy.optimize import minimize
+from searched_masks import search_masks
 from success_map_report import KEYS, figure, markdown, summarise
 from torch import Tensor
 
@@ -37,9 +38,7 @@ from torchmask.cli.options import SweepOptions
 from torchmask.cli.program import run_script
 from torchmask.cli.run import new_run
 from torchmask.design.criterion import AsymptoticMSE
-from torchmask.design.space import DesignSpace
 from torchmask.design.sweep import run_tasks
-from torchmask.design.table import design_table
 from torchmask.grid import Grid
 from torchmask.io import write_json
 from torchmask.metrics import relative_error
@@ -187,16 +186,7 @@ def restore_known(observation: Observation) -> Tensor:
 def choose_masks(n_draws: int, options: SweepOptions, callback: Callback) -> list[SparseAperture]:
     """Return a searched mask for each draw."""
     holes = [HOLES[draw % len(HOLES)] for draw in range(n_draws)]
-    space = DesignSpace(
-        n_subapertures=tuple(sorted(set(holes))),
-        fill_factor=(FILL_FACTOR,),
-        reference_fill_factor=FILL_FACTOR,
-        diameter_over_r0=(),
-        n_frequencies=64 if options.smoke else 128,
-        budget=100 if options.smoke else 2000,
-    )
-    table = design_table(space, options.sweep, **options.keywords(callback))
-    masks = {row.n_subapertures: table.aperture(row) for row in table.rows}
+    masks = search_masks(holes, FILL_FACTOR, options, callback)
     return [masks[n] for n in holes]
 
 

@@ -14,50 +14,30 @@ from torchmask.cli.main import main
 from torchmask.cli.options import MaskOptions, load_aperture
 from torchmask.cli.program import parse
 from torchmask.cli.stacks import StackOptions, read_stack
-from torchmask.design.manufacture import load_mask, mask_wavelength, save_json
+from torchmask.design.manufacture import load_mask, mask_wavelength
 from torchmask.design.observed import instrument_criterion
 from torchmask.grid import ARCSEC, Grid
 from torchmask.instrument.instrument import Instrument
-from torchmask.instrument.parts import Camera, Site, Source, Telescope
+from torchmask.instrument.parts import Telescope
 from torchmask.observation import Observation
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.pixel import SquarePixel
 
 pytestmark = pytest.mark.usefixtures("coarse_figures")
 
-MASK = SparseAperture.from_catalog("golay6", 1.2, 0.1)
-KNOWN = Instrument(
-    telescope=Telescope(diameter=1.2, central_obstruction=0.2, throughput=0.5),
-    source=Source(magnitude=2.0, size=3.0, exponent=2.0, temperature=3000.0),
-    site=Site(r0=0.3, wind=5.0, sky=4.0, outer_scale=30.0),
-    camera=Camera(n_pixels=24, readout_noise=2.5, pixel_fill=0.9),
-    wavelength=700e-9,
-    width=20e-9,
-    n_wavelengths=2,
-    exposure=3e-3,
-    n_frames=2,
-)
 
-
-@pytest.fixture
-def folder(tmp_path):
-    KNOWN.save(tmp_path / "instrument.json")
-    save_json(tmp_path / "mask.json", MASK)
-    return tmp_path
-
-
-def test_frames_are_simulated_as_the_instrument_takes_them(folder, capsys):
+def test_frames_are_simulated_as_the_instrument_takes_them(folder, capsys, recorded, golay):
     told = ["--mask", folder / "mask.json", "--instrument", folder / "instrument.json", "--out", folder / "run"]
     assert main(["simulate", *map(str, told), "--scene.size", "0.4", "--r0", "0.2"]) == 0
     stack = Observation.load(folder / "run/stack.npz")
     assert stack.grid.shape == (24, 24)
     assert len(stack.frames) == 2
     assert (stack.grid.wavelength, stack.readout_noise, stack.outer_scale) == (700e-9, 2.5, 30.0)
-    assert stack.grid.pixel_scale == pytest.approx(KNOWN.pixel_scale, rel=1e-12)
-    assert stack.background == pytest.approx(KNOWN.sky(float(MASK.area)), rel=1e-12)
+    assert stack.grid.pixel_scale == pytest.approx(recorded.pixel_scale, rel=1e-12)
+    assert stack.background == pytest.approx(recorded.sky(float(golay.area)), rel=1e-12)
     assert (stack.pixel, stack.exposure_time) == (SquarePixel(0.9), 3e-3)
     assert stack.r0 == pytest.approx(0.2)  # given beside it
-    assert f"{KNOWN.photons(float(MASK.area)):.4g} photons in each" in capsys.readouterr().out
+    assert f"{recorded.photons(float(golay.area)):.4g} photons in each" in capsys.readouterr().out
     config = yaml.safe_load((folder / "run/config.yaml").read_text())
     assert config["turbulence"]["exposure_time"] == 3e-3
     assert config["turbulence"]["wind"] == [5.0, 0.0]
@@ -70,20 +50,21 @@ def test_frames_are_simulated_as_the_instrument_takes_them(folder, capsys):
 
 def stack_of(folder, **changes):
     """Frames as the instrument takes them, in a file, but for some changes."""
+    recorded, golay = Instrument.load(folder / "instrument.json"), load_mask(folder / "mask.json")
     generator = torch.Generator().manual_seed(0)
     frames = 50 + 5 * torch.rand(2, 32, 32, dtype=torch.float64, generator=generator)
     frames[:, 12:20, 12:20] += 1000
-    seen = Observation(frames, MASK, KNOWN.grid(32), 2.5, pixel=KNOWN.camera.pixel, header={"XPOSURE": 3e-3})
+    seen = Observation(frames, golay, recorded.grid(32), 2.5, pixel=recorded.camera.pixel, header={"XPOSURE": 3e-3})
     dataclasses.replace(seen, **changes).save(folder / "stack.npz")
     return [folder / "stack.npz"]
 
 
-def test_an_instrument_fills_in_what_a_stack_lacks_and_what_is_given_wins(folder):
+def test_an_instrument_fills_in_what_a_stack_lacks_and_what_is_given_wins(folder, recorded):
     told = {"instrument": folder / "instrument.json"}
     bare = read_stack(stack_of(folder, readout_noise=None, pixel=None), StackOptions(**told))
     assert (bare.readout_noise, bare.pixel) == (2.5, SquarePixel(0.9))
     (folder / "stack.npz").unlink()
-    other = {"readout_noise": 4.0, "pixel": SquarePixel(0.5), "grid": Grid(32, KNOWN.pixel_scale, 550e-9)}
+    other = {"readout_noise": 4.0, "pixel": SquarePixel(0.5), "grid": Grid(32, recorded.pixel_scale, 550e-9)}
     files = stack_of(folder, **other)
     with pytest.raises(
         ValueError, match=r"wavelength \(5.5e-07 against 7e-07 m\) and --readout-noise \(4 against 2.5 "
@@ -98,10 +79,10 @@ def test_an_instrument_fills_in_what_a_stack_lacks_and_what_is_given_wins(folder
         read_stack(files, StackOptions(exposure_time=-1.0))
 
 
-def test_headers_without_grid_are_completed(folder, write_fits, fits_cube):
+def test_headers_without_grid_are_completed(folder, write_fits, fits_cube, recorded):
     files = [write_fits("bare.fits", fits_cube, WAVELEN=None, PIXELSCL=None)]
-    camera = dataclasses.replace(KNOWN.camera, pixel_scale=0.03)
-    dataclasses.replace(KNOWN, camera=camera).save(folder / "scaled.json")
+    camera = dataclasses.replace(recorded.camera, pixel_scale=0.03)
+    dataclasses.replace(recorded, camera=camera).save(folder / "scaled.json")
     seen = read_stack(
         files, StackOptions(mask=folder / "mask.json", instrument=folder / "scaled.json", readout_noise=1.0)
     )
@@ -109,12 +90,12 @@ def test_headers_without_grid_are_completed(folder, write_fits, fits_cube):
     assert seen.grid.pixel_scale == pytest.approx(0.03 * ARCSEC, rel=1e-12)
 
 
-def test_a_restoration_is_told_band_pixels_noise_and_motion_of_an_instrument(folder):
-    told = dataclasses.replace(restore.Options.of_instrument(KNOWN), instrument=folder / "instrument.json")
+def test_a_restoration_is_told_band_pixels_noise_and_motion_of_an_instrument(folder, recorded):
+    told = dataclasses.replace(restore.Options.of_instrument(recorded), instrument=folder / "instrument.json")
     seen = read_stack(stack_of(folder), told)
     method = restore.deconvolution(seen, told)
-    tau0 = KNOWN.seeing.tau0
-    assert method.recipe.band == KNOWN.band
+    tau0 = recorded.seeing.tau0
+    assert method.recipe.band == recorded.band
     assert (method.recipe.pixel, method.readout_noise, method.known_r0) == (SquarePixel(0.9), 2.5, False)
     assert method.recipe.exposure_tau0 == pytest.approx(3e-3 / tau0, rel=1e-12)
     faster = dataclasses.replace(told, wind=10.0, r0=0.15)
@@ -136,11 +117,11 @@ def test_a_restoration_is_told_band_pixels_noise_and_motion_of_an_instrument(fol
         restore.motion(dataclasses.replace(seen, aperture=FullAperture(1.2)), restore.Options(wind=5.0, r0=0.1))
 
 
-def test_a_restoration_is_not_told_the_turbulence_of_a_simulated_stack(folder):
+def test_a_restoration_is_not_told_the_turbulence_of_a_simulated_stack(folder, golay):
     seen = read_stack(stack_of(folder, r0=0.2, outer_scale=7.0), StackOptions())
     method = restore.deconvolution(seen, restore.Options())
     assert not method.known_r0
-    assert method.recipe.outer_scale == 20 * MASK.mask_diameter
+    assert method.recipe.outer_scale == 20 * golay.mask_diameter
     told = restore.deconvolution(seen, restore.Options(r0=0.2, outer_scale=7.0))
     assert (told.known_r0, told.recipe.r0, told.recipe.outer_scale) == (True, 0.2, 7.0)
 
@@ -163,17 +144,17 @@ def test_another_wavelength_than_that_of_r0_and_light_is_refused(command, folder
     assert "are those at 7e-07 m: change the wavelength there" in told
 
 
-def test_a_mask_wider_than_the_telescope_is_refused():
+def test_a_mask_wider_than_the_telescope_is_refused(recorded):
     wide = MaskOptions(mask=Path("jwst_niriss_ami_7"))
     with pytest.raises(ValueError, match=r"for a pupil of 6.559 m, but the telescope has 1.2 m: .* --mask-diameter"):
-        load_aperture(wide, KNOWN.telescope)
-    assert load_aperture(dataclasses.replace(wide, mask_diameter=1.2), KNOWN.telescope).mask_diameter == 1.2
+        load_aperture(wide, recorded.telescope)
+    assert load_aperture(dataclasses.replace(wide, mask_diameter=1.2), recorded.telescope).mask_diameter == 1.2
     assert load_aperture(wide, Telescope(diameter=6.5)).mask_diameter == 6.559  # as telescopes are rounded
 
 
-def test_a_full_pupil_is_that_of_the_telescope(folder, capsys):
-    telescope = dataclasses.replace(KNOWN.telescope, vane_width=0.05, vane_angles=(0.0, 90.0))
-    vaned = dataclasses.replace(KNOWN, telescope=telescope)
+def test_a_full_pupil_is_that_of_the_telescope(folder, capsys, recorded):
+    telescope = dataclasses.replace(recorded.telescope, vane_width=0.05, vane_angles=(0.0, 90.0))
+    vaned = dataclasses.replace(recorded, telescope=telescope)
     vaned.save(folder / "vaned.json")
     told = ["simulate", "--instrument", folder / "vaned.json", "--mask", "full", "--scene.size", "0.4"]
     assert main([*map(str, told), "--out", str(folder / "run")]) == 0
@@ -184,8 +165,8 @@ def test_a_full_pupil_is_that_of_the_telescope(folder, capsys):
     assert f"{vaned.photons(float(expected.area)):.4g} photons in each" in capsys.readouterr().out
 
 
-def test_what_is_given_of_a_full_pupil_wins():
-    telescope = dataclasses.replace(KNOWN.telescope, vane_width=0.05, vane_angles=(0.0, 90.0))
+def test_what_is_given_of_a_full_pupil_wins(recorded):
+    telescope = dataclasses.replace(recorded.telescope, vane_width=0.05, vane_angles=(0.0, 90.0))
     own = MaskOptions(mask=Path("full"), mask_diameter=1.0, central_obstruction=0.1, vane_angles=(30.0, 210.0))
     expected = FullAperture(1.0, 0.1, 0.05, [math.radians(30), math.radians(210)])
     assert load_aperture(own, telescope).area == expected.area
@@ -193,14 +174,14 @@ def test_what_is_given_of_a_full_pupil_wins():
         load_aperture(MaskOptions(mask=Path("full"), mask_diameter=0.1), telescope)
 
 
-def test_patterns_without_a_size_are_as_wide_as_the_telescope():
-    golay = load_aperture(MaskOptions(mask=Path("golay6"), fill_factor=0.1), KNOWN.telescope)
-    assert golay.mask_diameter == 1.2
+def test_patterns_without_a_size_are_as_wide_as_the_telescope(recorded):
+    laid = load_aperture(MaskOptions(mask=Path("golay6"), fill_factor=0.1), recorded.telescope)
+    assert laid.mask_diameter == 1.2
     built = load_aperture(MaskOptions(mask=Path("niriss"), allow_overlap=True), Telescope(diameter=8.0))
     assert built.mask_diameter == SparseAperture.from_catalog("niriss").mask_diameter
 
 
-def test_a_mask_is_designed_for_the_instrument(folder):
+def test_a_mask_is_designed_for_the_instrument(folder, recorded):
     options = [
         "--n-subapertures",
         "4",
@@ -221,18 +202,18 @@ def test_a_mask_is_designed_for_the_instrument(folder):
     assert float(mask.centers.norm(dim=-1).min()) >= (0.2 + mask.subaperture_diameter) / 2 - 1e-9
     config = yaml.safe_load((folder / "run/config.yaml").read_text())
     assert (config["n_frames"], config["readout_noise"], config["r0"], config["exponent"]) == (9, 2.5, 0.3, 2.0)
-    assert config["knee"] == pytest.approx(KNOWN.pixel_scale / (3.0 * ARCSEC))
+    assert config["knee"] == pytest.approx(recorded.pixel_scale / (3.0 * ARCSEC))
     metrics = json.loads((folder / "run/metrics.json").read_text())
-    photons = KNOWN.photons(math.pi / 4 * 0.1 * 1.2**2)
+    photons = recorded.photons(math.pi / 4 * 0.1 * 1.2**2)
     # of any criterion the error is at most 1, and its scale is the object's power, photons^2 times the mean spectrum
-    psd = KNOWN.object_psd(1.0)(KNOWN.grid(32)).mean() / KNOWN.photons(1.0) ** 2
+    psd = recorded.object_psd(1.0)(recorded.grid(32)).mean() / recorded.photons(1.0) ** 2
     assert metrics["mse"] / metrics["relative_mse"] == pytest.approx(photons**2 * float(psd), rel=0.02)
 
 
 @pytest.mark.parametrize("module", [design, rank])
 @pytest.mark.parametrize("pixel_scale", [None, 0.03])  # arcsec
-def test_the_criterion_of_an_instrument_is_the_same_in_every_command(module, pixel_scale, tmp_path):
-    instrument = dataclasses.replace(KNOWN, camera=dataclasses.replace(KNOWN.camera, pixel_scale=pixel_scale))
+def test_the_criterion_of_an_instrument_is_the_same_in_every_command(module, pixel_scale, tmp_path, recorded):
+    instrument = dataclasses.replace(recorded, camera=dataclasses.replace(recorded.camera, pixel_scale=pixel_scale))
     instrument.save(tmp_path / "instrument.json")
     options = dataclasses.replace(module.Options.of_instrument(instrument), instrument=tmp_path / "instrument.json")
     area = math.pi / 4 * 0.1 * 1.2**2
@@ -252,24 +233,24 @@ def test_the_criterion_of_an_instrument_is_the_same_in_every_command(module, pix
         torch.testing.assert_close(found, getattr(half, name), rtol=1e-12, atol=0)
 
 
-def test_what_is_given_beside_an_instrument_wins(folder):
-    options = dataclasses.replace(design.Options.of_instrument(KNOWN), instrument=folder / "instrument.json")
+def test_what_is_given_beside_an_instrument_wins(folder, recorded):
+    options = dataclasses.replace(design.Options.of_instrument(recorded), instrument=folder / "instrument.json")
     assert dataclasses.replace(options, sky=9.0).turbulence(700e-9, 0.1)["sky"] == 9.0
     assert dataclasses.replace(options, criterion="asymptotic").turbulence(700e-9, 0.1) is None
     assert dataclasses.replace(options, n_photons=3e4).observation(32, 1.5, 1 / 64, 0.1).noise_psd.n_photons == 3e4
 
 
-def test_a_filter_stays_a_filter_with_the_light_of_the_source():
-    filtered = dataclasses.replace(KNOWN, filter="bessell-R", wavelength=None, width=None)
+def test_a_filter_stays_a_filter_with_the_light_of_the_source(recorded):
+    filtered = dataclasses.replace(recorded, filter="bessell-R", wavelength=None, width=None)
     options = design.Options.of_instrument(filtered)
     found = options.turbulence(filtered.mean_wavelength, 0.1)
     assert (options.filter, options.wavelengths) == ("bessell-R", ())
     assert (found["wavelengths"], found["weights"]) == (filtered.band.wavelengths, filtered.band.shares)
 
 
-def test_a_plan_is_made_of_the_whole_file(folder):
+def test_a_plan_is_made_of_the_whole_file(folder, recorded):
     parsed = parse(plan.Options, "plan", ["--instrument", str(folder / "instrument.json"), "--site.wind", "7"], prog="")
-    expected = dataclasses.replace(KNOWN, site=dataclasses.replace(KNOWN.site, wind=7.0))
+    expected = dataclasses.replace(recorded, site=dataclasses.replace(recorded.site, wind=7.0))
     assert plan.instrument_of(parsed) == expected
 
 

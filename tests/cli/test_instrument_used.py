@@ -8,35 +8,12 @@ import pytest
 from torchmask.cli import table
 from torchmask.cli.instrument_used import instrument_used
 from torchmask.cli.main import main
-from torchmask.design.manufacture import save_json
 from torchmask.instrument.instrument import Instrument
-from torchmask.instrument.parts import Camera, Site, Source, Telescope
-from torchmask.optics.aperture import SparseAperture
 
 pytestmark = pytest.mark.usefixtures("coarse_figures")
 
-MASK = SparseAperture.from_catalog("golay6", 1.2, 0.1)
-KNOWN = Instrument(
-    telescope=Telescope(diameter=1.2, central_obstruction=0.2, throughput=0.5),
-    source=Source(magnitude=2.0, size=3.0, exponent=2.0, temperature=3000.0),
-    site=Site(r0=0.3, wind=5.0, sky=4.0, outer_scale=30.0),
-    camera=Camera(n_pixels=24, readout_noise=2.5, pixel_fill=0.9),
-    wavelength=700e-9,
-    width=20e-9,
-    n_wavelengths=2,
-    exposure=3e-3,
-    n_frames=2,
-)
 
-
-@pytest.fixture
-def folder(tmp_path):
-    KNOWN.save(tmp_path / "instrument.json")
-    save_json(tmp_path / "mask.json", MASK)
-    return tmp_path
-
-
-def test_every_command_writes_the_instrument_it_used(folder, monkeypatch):
+def test_every_command_writes_the_instrument_it_used(folder, monkeypatch, recorded, golay):
     """As values: the file may be gone, and what was given beside it counts."""
     told = ["--instrument", str(folder / "instrument.json")]
     tiny = ["--n-frequencies", "32", "--budget", "20", "--criterion", "asymptotic"]
@@ -53,27 +30,27 @@ def test_every_command_writes_the_instrument_it_used(folder, monkeypatch):
     for name, words in runs.items():
         assert main([*words, *told, "--out", str(folder / name)]) == 0
         found[name] = Instrument.load(folder / name / "instrument.json")
-    assert found["design"] == found["same"] == KNOWN
-    changed = dataclasses.replace(KNOWN.camera, readout_noise=4.0)
+    assert found["design"] == found["same"] == recorded
+    changed = dataclasses.replace(recorded.camera, readout_noise=4.0)
     assert found["simulate"].camera == changed
     assert found["simulate"].site.wind == 10.0
-    assert found["simulate"].sky(float(MASK.area)) == pytest.approx(6.0, rel=1e-12)
+    assert found["simulate"].sky(float(golay.area)) == pytest.approx(6.0, rel=1e-12)
     assert (found["rank"].frames, found["rank"].site.r0) == (9, 0.2)
     assert found["rank"].photons(math.pi / 4 * 0.1 * 1.2**2) == pytest.approx(1e5, rel=1e-12)
     monkeypatch.setattr(table, "design_table", lambda space, where, **_: where.mkdir(exist_ok=True))
     for _ in range(2):  # the same folder goes on
         assert main(["table", str(folder / "table"), *told]) == 0
-        assert Instrument.load(folder / "table" / "instrument.json") == KNOWN
+        assert Instrument.load(folder / "table" / "instrument.json") == recorded
 
 
-def test_what_is_given_is_in_the_place_that_it_has():
-    scale = KNOWN.pixel_scale * 0.8 * 180 * 3600 / math.pi  # arcsec
-    given = {"exposure": 5e-3, "n_frames": 2, "pixel_scale": scale, "knee": KNOWN.knee, "n_photons": 3e4, "sky": 0.0}
-    found = instrument_used(KNOWN, 0.1, given | {"mask_diameter": 1.1, "exponent": 1.5, "pixel_fill": None})
+def test_what_is_given_is_in_the_place_that_it_has(recorded):
+    scale = recorded.pixel_scale * 0.8 * 180 * 3600 / math.pi  # arcsec
+    given = {"exposure": 5e-3, "n_frames": 2, "pixel_scale": scale, "knee": recorded.knee, "n_photons": 3e4, "sky": 0.0}
+    found = instrument_used(recorded, 0.1, given | {"mask_diameter": 1.1, "exponent": 1.5, "pixel_fill": None})
     assert (found.telescope.diameter, found.exposure, found.frames, found.source.exponent) == (1.1, 5e-3, 2, 1.5)
-    assert found.pixel_scale == pytest.approx(0.8 * KNOWN.pixel_scale, rel=1e-12)
-    assert found.knee == pytest.approx(KNOWN.knee, rel=1e-12)
+    assert found.pixel_scale == pytest.approx(0.8 * recorded.pixel_scale, rel=1e-12)
+    assert found.knee == pytest.approx(recorded.knee, rel=1e-12)
     assert found.photons(0.1) == pytest.approx(3e4, rel=1e-12)
-    assert (found.sky(0.1), found.camera.pixel_fill, found.band.wavelengths) == (0.0, 0.9, KNOWN.band.wavelengths)
+    assert (found.sky(0.1), found.camera.pixel_fill, found.band.wavelengths) == (0.0, 0.9, recorded.band.wavelengths)
     still = {"exposure": 0.0, "n_frames": 2, "r0": math.inf, "outer_scale": math.inf, "wind": 0.0}
-    assert instrument_used(KNOWN, 0.1, still) == KNOWN
+    assert instrument_used(recorded, 0.1, still) == recorded
