@@ -234,6 +234,9 @@ def test_no_point_beyond_what_was_tried_is_the_best(monkeypatch, quick):
     with pytest.warns(UserWarning, match="no plan chooses such a point"):
         found = plan_observation(instrument, n_subapertures=(3,), hole_diameters=holes, exposures=exposures, **TINY)
     assert (found.best.hole_diameter, found.best.exposure) == (0.15, pytest.approx(2 * tau0))  # r0 is 0.15 m
+    spread = phase_spread(instrument.band.relative_width, 1.0 / 0.15)  # 100 rad were tried
+    limits = {"hole_diameter": 0.15, "exposure": 2 * tau0, "width": instrument.width * 100 / spread}
+    assert found.tried_up_to == pytest.approx(limits, rel=1e-12)
     least = min(found.choices, key=lambda choice: choice.blind_mse)
     assert least.is_limit
     assert least.blind_mse < found.best.blind_mse
