@@ -76,6 +76,17 @@ def test_the_sum_over_samples_tends_to_the_integral(width, n_instants):
         assert ((found / exact - 1).abs() < sample + 0.005 + excess).all()
 
 
+def test_a_mask_turned_by_half_a_turn_is_the_same_to_any_wind():
+    """Of two instants either may be the later one, for the light of two wavelengths from different holes as well."""
+    centers = torch.tensor([[0.0, 0.3], [0.25, -0.1], [-0.3, -0.1], [-0.1, 0.05]], dtype=torch.float64)
+    masks = [SparseAperture(sign * centers, 0.2, 1.0) for sign in (1, -1)]
+    band, seeing = Band.top_hat(550e-9, 110e-9, 3), Seeing(0.4, 5.0, exposure=0.02, wind=(8.0, 6.0))
+    nu = torch.tensor([[0.12, 0.22], [0.13, 0.2], [-0.15, 0.19]], dtype=torch.float64)
+    one, other = (mean_square_otf(mask, NYQUIST, nu, seeing, band) for mask in masks)
+    assert (one > 0.01).all()
+    torch.testing.assert_close(one, other, rtol=1e-9, atol=0)
+
+
 def test_a_point_far_from_all_baselines_carries_nothing():
     mask = SparseAperture([[0.4, 0.0], [-0.4, 0.0]], 0.1, 1.0)
     assert float(mean_square_otf(mask, NYQUIST, torch.tensor([[0.0, 0.2]]), Seeing(0.1))) == 0

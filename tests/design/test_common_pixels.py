@@ -20,7 +20,7 @@ PAIRS = [(0, 0, 1, 1), (0, 1, 3, -1), (0, 2, 3, 1), (1, 0, 2, 1), (1, 1, 2, -1),
 
 def case(most=0.0):
     """Lenses of two masks, pairs of them, and coefficients of the logarithm up to about `most` on their rows."""
-    patches = LensPatches(GEOMETRY, Band.of([550e-9]), 550e-9, None, torch.float64, torch.device("cpu"))
+    patches = LensPatches(GEOMETRY, Band.of([550e-9]), 550e-9, None, None, torch.float64, torch.device("cpu"))
     lenses = patches(torch.tensor(CENTERS, dtype=torch.float64))
     mask, first, second, sign = torch.tensor(PAIRS).T
     pixels = CommonPixels.of(lenses, patches.plane, mask, 4 * mask + first, 4 * mask + second, sign)

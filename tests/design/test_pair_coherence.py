@@ -9,7 +9,7 @@ from torchmask.atmosphere.colour_coherence import ColourCoherence, colour_loss
 from torchmask.atmosphere.seeing import Seeing
 from torchmask.atmosphere.transfer import difference_variance
 from torchmask.design.overlap import Geometry
-from torchmask.design.pair_coherence import _POINTS, PairCoherence
+from torchmask.design.pair_coherence import _POINTS, PairCoherence, _shared_phases
 from torchmask.optics.band import Band
 from torchmask.optics.shapes import Disc
 
@@ -93,3 +93,17 @@ def test_two_colours_are_the_mean_over_pairs_of_points_beside_what_they_keep_in_
     kept = math.log(mean_over_points(seeing, (first, second), (float(one), float(other)), separation))
     expected = kept + float(colour_loss(*factors, one, other))
     assert float((found * coherence.far(*BASELINE[0])).log()) == pytest.approx(expected, abs=tolerance(ratio))
+
+
+def test_lenses_share_the_colours_in_which_they_are_alike():
+    """The means of a and a' under their normal distributions times exp(-loss (a - a')^2), by quadrature."""
+    mean, variance = torch.tensor([[1.06], [0.95]]).double(), torch.tensor([[1.2e-3], [7e-4]]).double()
+    second, third = torch.tensor([150.0]).double(), torch.tensor([90.0]).double()
+    loss = float(second + third * 0.11 / 1.005)
+    phases = torch.linspace(0.7, 1.3, 1201, dtype=torch.float64)
+    own = torch.exp(-((phases - mean) ** 2) / (2 * variance))
+    joint = own[0][:, None] * own[1] * torch.exp(-loss * (phases[:, None] - phases) ** 2)
+    expected = torch.stack([(joint.sum(1) * phases).sum(), (joint.sum(0) * phases).sum()]) / joint.sum()
+    found = _shared_phases(mean, variance, second, third)
+    torch.testing.assert_close(found[:, 0], expected, rtol=1e-6, atol=0)
+    assert float(found[0] - found[1]) < 0.7 * 0.11  # nearer than those of all their light

@@ -7,8 +7,8 @@ lens, wherever the holes are. Turbulence and exposure leave the fraction
 
 of its |OTF|^2, the mean over pairs of points of the lens, of separation s. The length of a thin lens is proportional to
 the cube root of its transmission T(u), and its loss to about (length / r0)^(5/3), or T^(5/9). Hence c is nearly linear
-in T^(1/2), and a parabola in it with terms for the direction of u approximates c to one or two per cent. Phases that
-are scaled, as those of a band's other wavelengths, change both of its powers in proportion.
+in T^(1/2), and so is its root, the fraction of the amplitude: a parabola in T^(1/2) with terms for the direction of u
+approximates it to about half a per cent. Amplitudes add up where several wavelengths of a band meet.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _BASELINES = (16, 16)  # the same for the baselines b
 _SHARED_BASELINES = (9, 12)  # the same for baselines within a hole, of lenses of holes with themselves
 _SEPARATIONS = (28, 12)  # the same for the separations of these holes
 _TOLERANCE = 1e-3  # of the table of lenses of holes with themselves, in its norm
-_FAINT = 0.05  # errors of c are weighted by T^(1/2) plus this: thin lenses transmit little
+_FAINT = 0.05  # errors of c^(1/2) are weighted by T^(1/2) plus this: thin lenses transmit little
 
 
 class PolarTable:
@@ -79,32 +79,24 @@ class SharedCoherence(NamedTuple):
     by_place: PolarTable
 
 
-def lens_sum(factors: Iterable[Tensor], root: Tensor, x: Tensor, y: Tensor, scale: Tensor | None = None) -> Tensor:
-    """Return c, of the shape of the arguments, by the factors of `lens_coherence`.
+def lens_sum(factors: Iterable[Tensor], root: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Return the amplitude c^(1/2), of the shape of the arguments, by the factors of `lens_amplitude`.
 
-    `root` is the square root of T; x and y are u over the holes' outer diameter. In a band, `scale` is that of the
-    phases, which c falls with, and two factors more are for it.
+    `root` is the square root of T; x and y are u over the holes' outer diameter.
     """
-    constant, linear, square, along, skew, *by_scale = factors
+    constant, linear, square, along, skew = factors
     slope = torch.addcmul(linear, root, square)
     slope.addcmul_(x * x - y * y, along).addcmul_(2 * x * y, skew)
-    if scale is not None:
-        slope.addcmul_(scale - 1, torch.addcmul(by_scale[0], root, by_scale[1]))
     return torch.addcmul(constant, root, slope)
 
 
-def lens_coherence(
-    shape: Shape,
-    diameter: float,
-    seeing: Seeing,
-    longest: float,
-    scales: tuple[float, ...] | None = None,
-    steady: bool = False,
+def lens_amplitude(
+    shape: Shape, diameter: float, seeing: Seeing, longest: float, scale: float = 1.0, steady: bool = False
 ) -> PolarTable:
-    """Tabulate the factors of c against the baseline, up to `longest` [m], for holes of one shape.
+    """Tabulate the factors of c^(1/2) against the baseline, up to `longest` [m], for holes of one shape.
 
-    `scales` are those of the phases of a band, relative to the seeing. With `steady` it is exp(-<Q>) instead, the
-    square of the fraction of |OTF|^2 that an amplitude keeps which does not fluctuate.
+    Phases are `scale` times those of the seeing. With `steady` it is exp(-<Q> / 4) instead, what remains of an
+    amplitude that does not fluctuate.
     """
     reach = shape.outer_diameter(diameter)
     nodes = PolarTable.nodes(_PLACES, reach, 1.0)
@@ -115,26 +107,20 @@ def lens_coherence(
     separations, densities = lens_densities(shape, diameter, places, per_hole)
     structure = seeing.structure(longest + 2 * reach + float(drift.norm(dim=-1).max()))
     baselines = PolarTable.nodes(_BASELINES, longest, 2.0)
+
+    def amplitude(baselines: Tensor) -> Tensor:
+        total = torch.zeros(len(baselines), len(separations), dtype=torch.float64)
+        for step, share in zip(drift, shares, strict=True):
+            exponent = scale**2 * _exponent(structure, baselines[:, None], separations + step)
+            total += share * (exponent if steady else exponent.exp())
+        kept = total @ densities.T
+        return (kept / 2).exp() if steady else kept.sqrt()
+
     root = shape.otf(places, diameter).sqrt()
     weight = root + _FAINT
-    rows, tables = [], []
-    for scale in scales or (1.0,):
-
-        def coherence(baselines: Tensor, scale: float = scale) -> Tensor:
-            total = torch.zeros(len(baselines), len(separations), dtype=torch.float64)
-            for step, share in zip(drift, shares, strict=True):
-                exponent = scale**2 * _exponent(structure, baselines[:, None], separations + step)
-                total += share * (exponent if steady else exponent.exp())
-            return (2 * total @ densities.T).exp() if steady else total @ densities.T
-
-        x, y = (places / reach).unbind(-1)
-        stretch = torch.full_like(root, scale) if scales else None
-        units = torch.eye(7 if scales else 5, dtype=torch.float64)
-        functions = torch.stack([lens_sum(unit, root, x, y, stretch) for unit in units], -1)
-        rows.append(functions * weight[:, None])
-        tables.append(_table(coherence, baselines, _PLACES, shape.is_round and seeing.is_isotropic) * weight)
-    # in a narrow band some functions are nearly multiples of others, which "gelsy" may leave out wrongly
-    factors = torch.linalg.lstsq(torch.cat(rows), torch.cat(tables, -1).T, driver="gelsd").solution
+    functions = torch.stack([lens_sum(one, root, *(places / reach).unbind(-1)) for one in torch.eye(5).double()], -1)
+    table = _table(amplitude, baselines, _PLACES, shape.is_round and seeing.is_isotropic) * weight
+    factors = torch.linalg.lstsq(functions * weight[:, None], table.T, driver="gelsd").solution
     return PolarTable(factors.unflatten(-1, _BASELINES), longest, 2.0)
 
 

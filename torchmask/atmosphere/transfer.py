@@ -187,8 +187,11 @@ class OverlapRaster:
         return transfer, torch.fft.rfft2(samples, s=self.padded)
 
     def density(self, one: Tensor, other: Tensor) -> Tensor:
-        """Return the density (S,) of separations between points of two overlaps, on the lattice, of unit sum."""
-        return torch.fft.irfft2(one.conj() * other, s=self.padded).flatten()
+        """Return the density (S,) of separations between points of two overlaps, on the lattice, of unit sum.
+
+        It is even, the mean over either order of the two: each of the two instants may be the later one.
+        """
+        return torch.fft.irfft2((one.conj() * other).real, s=self.padded).flatten()
 
     def variance(self, points: Tensor, baseline: Tensor, other: Tensor, scale: float, other_scale: float) -> Tensor:
         """Return Q (S,) at separations (S, 2) of the middles, averaged over the exposure."""

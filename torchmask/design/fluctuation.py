@@ -44,18 +44,18 @@ def mean_inverse(mean: Tensor, variance: Tensor, ratio: Tensor) -> Tensor:
 
 
 def steady_lenses(lenses: Lenses, n: int) -> Tensor:
-    """Return the square of |OTF|^2 of each lens (B, L, rows, columns), N^4 times, without turbulence within it.
+    """Return the square of what is kept of |OTF|^2 of each lens (B, L, rows, columns), N^4 times.
 
     All `n` holes with themselves are one lens. The modes of a band are independent. Every lens counts at nu and at -nu.
     """
-    power = (lenses.values**4).sum(0)
+    power = (lenses.kept**4).sum(0)
     return torch.cat([power[:, :1] * (n**4 / 2), power[:, 1:]], 1)
 
 
 def piston_powers(centers: Tensor, geometry: Geometry, wavelength: float) -> tuple[Tensor, Tensor]:
     """Return P and the sum of A^4 (B, H // 2 + 1, W) of masks with `centers` (B, N, 2) [m], for pistons alone."""
     with torch.device("cpu"):  # whatever the default device: their tables are made in numpy and scipy
-        patches = LensPatches(geometry, Band.of([wavelength]), wavelength, None, centers.dtype, centers.device)
+        patches = LensPatches(geometry, Band.of([wavelength]), wavelength, None, None, centers.dtype, centers.device)
     n, found = centers.shape[1], []
     for mask in centers.split(1):
         lenses = patches(mask)

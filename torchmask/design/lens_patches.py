@@ -3,40 +3,40 @@
 A pair of holes transmits light of the wavelength a^-1 (of the reference) at frequencies near its baseline times a: the
 lenses of a band lie side by side. The light of two wavelengths that meet at one frequency is coherent in part only,
 as the frequency says (`torchmask.atmosphere.colour_coherence`); its modes make of the band a few lenses of which each
-is coherent with itself and none with another.
+is coherent with itself and none with another. Of each wavelength turbulence leaves an amplitude of its own
+(`torchmask.atmosphere.lens_coherence`), as lenses of two wavelengths that meet may have very unlike sizes.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchmask.atmosphere.colour_coherence import ColourCoherence
+from torchmask.atmosphere.lens_coherence import PolarTable, lens_sum
 from torchmask.design.frequency_plane import FrequencyPlane
 from torchmask.design.overlap import Geometry, PatchPlan, cached_plan
 from torchmask.design.spline_patches import SplinePatches
 from torchmask.optics.band import Band
 
 _NOTHING = 1e-12  # of T
-_FAINT = 1e-4  # of T: light that does not say which wavelength it has
 
 
 class Lenses(NamedTuple):
     """The lenses (B, L) of masks: L - 1 pairs of holes after those of the holes with themselves.
 
-    values (M, B, L, rows, columns) T on the pixels of each one's patch, in M modes; `root` (B, L, rows, columns) the
-    square root of the T that the light there sees, for `lens_sum`; `scale` (B, L, rows, columns) the phases of
-    that light over those at the reference wavelength, None for 1; `index` (B, L, rows, columns) the pixels of the
-    plane; `baseline`, `turns`, `corner`, `size` (B, L, 2) [pixels], that on the frequency torus, with nu_y >= 0 (sign
-    (B, L, 1) times that of the pair), what had to be taken off it, the first pixel, and the columns and rows that may
-    hold light; `middle` (B, L, 2) [m] between the holes
+    values (M, B, L, rows, columns) T on the pixels of each one's patch, in M modes; `kept` the same times the
+    amplitude that turbulence leaves of each wavelength; `index` (B, L, rows, columns) the pixels of the plane;
+    `baseline`, `turns`, `corner`, `size` (B, L, 2) [pixels], that on the frequency torus, with nu_y >= 0 (sign (B, L,
+    1) times that of the pair), what had to be taken off it, the first pixel, and the columns and rows that may hold
+    light; `middle` (B, L, 2) [m] between the holes
     """
 
     values: Tensor
-    root: Tensor
-    scale: Tensor | None
+    kept: Tensor
     index: Tensor
     baseline: Tensor
     turns: Tensor
@@ -47,19 +47,35 @@ class Lenses(NamedTuple):
 
 
 class Colour(NamedTuple):
-    """One wavelength of a band: its phases over those at the reference wavelength, its share of the light, its patches,
-    and the exact T (rows * columns) of a hole with itself."""
+    """One wavelength of a band: its phases over those at the reference wavelength, its patches, the pixels (2,) over a
+    hole's outer diameter, the exact T (rows * columns) of a hole with itself, and the factors (parts, pixels of the
+    plane) of its amplitude, if there are any."""
 
     scale: float
-    share: float
     plan: PatchPlan
     splines: SplinePatches
     slices: Tensor
+    pixel: list[float]
     central: Tensor
+    factors: Tensor | None
+
+
+class Patch(NamedTuple):
+    """The lenses (B, L) of one wavelength: T and what turbulence leaves of it (B, L, rows, columns), the pixels of the
+    plane, and the first pixel (B, L, 2)."""
+
+    values: Tensor
+    kept: Tensor
+    index: Tensor
+    corner: Tensor
 
 
 class LensPatches:
-    """The lenses of any masks with the holes of one geometry, in one band."""
+    """The lenses of any masks with the holes of one geometry, in one band.
+
+    coherence : what its wavelengths have in common; None for one wavelength
+    amplitude : makes the table of `lens_amplitude` for phases of a scale; None: turbulence leaves lenses as they are
+    """
 
     def __init__(
         self,
@@ -67,6 +83,7 @@ class LensPatches:
         band: Band,
         reference: float,
         coherence: ColourCoherence | None,
+        amplitude: Callable[[float], PolarTable] | None,
         dtype: torch.dtype,
         device: torch.device,
     ) -> None:
@@ -81,7 +98,7 @@ class LensPatches:
         self.modes: Tensor = (modes * shares[:, None]).flatten(1).to(device, dtype)
         self.n_pixels: int = 0  # of the patches of a lens, one for each wavelength
         self.colours: list[Colour] = []
-        for wavelength, share in zip(band.wavelengths, band.shares, strict=True):
+        for wavelength in band.wavelengths:
             scale = reference / wavelength
             own = geometry._replace(period=geometry.period / scale)
             plan = cached_plan(own, 1, dtype, device)
@@ -96,7 +113,11 @@ class LensPatches:
             y = (first[1] + torch.arange(len(plan.row))) * pixels[1]
             places = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
             central = geometry.shape.otf(places, geometry.diameter).flatten().to(device, dtype)
-            self.colours.append(Colour(scale, share, plan, splines, slices, central))
+            factors = None
+            if amplitude is not None:
+                factors = amplitude(scale)(self.plane.baselines / scale).to(device, dtype)
+            unit = [size / geometry.reach for size in pixels]
+            self.colours.append(Colour(scale, plan, splines, slices, unit, central, factors))
 
     def __call__(self, centers: Tensor) -> Lenses:
         """Return the lenses of masks with `centers` (B, N, 2) [m]."""
@@ -110,53 +131,57 @@ class LensPatches:
         size = nu.new_tensor(self.size)
         baseline, turns = nu * sign * size, turns * sign * size
         middle = (one + other) / 2
-        if len(self.colours) == 1:
-            lens, corner = self._lens(self.colours[0], baseline, turns)
-            values, root, scale = lens[None], lens.clamp(min=_NOTHING).sqrt(), None
+        patches = [self._patch(colour, baseline, turns) for colour in self.colours]
+        if len(patches) == 1:
+            lens, kept, index, corner = patches[0]
             extent = size.new_tensor(lens.shape[:1:-1]).expand_as(corner)
-        else:
-            values, root, scale, corner, extent = self._merged(baseline, turns)
+            return Lenses(lens[None], kept[None], index, baseline, turns, corner, extent, sign, middle)
+        values, kept, corner, extent = self._merged(patches)
         index = self.plane.index(corner, *values.shape[-2:])
-        return Lenses(values, root, scale, index, baseline, turns, corner, extent, sign, middle)
+        return Lenses(values, kept, index, baseline, turns, corner, extent, sign, middle)
 
-    def _lens(self, colour: Colour, baseline: Tensor, turns: Tensor) -> tuple[Tensor, Tensor]:
-        """Return T (B, L, rows, columns) at one wavelength, and the first pixel of the patch (B, L, 2)."""
+    def _patch(self, colour: Colour, baseline: Tensor, turns: Tensor) -> Patch:
         place = (baseline + turns) * colour.scale - turns
         corner = (place.detach() - colour.plan.reach).ceil()
-        values = colour.splines.weights(corner - place) @ colour.slices
-        values[:, 0] = colour.central  # N holes share it: what a spline makes of its edge would count N times
-        return values.unflatten(-1, (len(colour.plan.row), len(colour.plan.column))), corner
+        offset, shape = corner - place, (len(colour.plan.row), len(colour.plan.column))
+        flat = colour.splines.weights(offset) @ colour.slices
+        flat[:, 0] = colour.central  # N holes share it: what a spline makes of its edge would count N times
+        values, index = flat.unflatten(-1, shape), self.plane.index(corner, *shape)
+        if colour.factors is None:
+            return Patch(values, values, index, corner)
+        x = ((offset[..., :1] + colour.plan.column) * colour.pixel[0])[..., None, :]
+        y = ((offset[..., 1:] + torch.arange(shape[0], device=offset.device)) * colour.pixel[1])[..., :, None]
+        pixels, root = index.flatten(), values.clamp(min=_NOTHING).sqrt()
+        amplitude = lens_sum((part.index_select(0, pixels).view_as(root) for part in colour.factors), root, x, y)
+        return Patch(values, values * amplitude, index, corner)
 
-    def _merged(self, baseline: Tensor, turns: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Return values, root, scale, corner and size of the lenses of all wavelengths together."""
-        lenses = [self._lens(colour, baseline, turns) for colour in self.colours]
-        corner = torch.stack([own for _, own in lenses]).amin(0)
-        ends = torch.stack([own + own.new_tensor(lens.shape[:1:-1]) for lens, own in lenses])
-        size = (ends.amax(0) - corner).nan_to_num(1.0)
+    def _merged(self, patches: list[Patch]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return values, what is kept of them, corner and size of the lenses of all wavelengths together."""
+        corner = torch.stack([patch.corner for patch in patches]).amin(0)
+        ends = [patch.corner + corner.new_tensor(patch.values.shape[:1:-1]) for patch in patches]
+        size = (torch.stack(ends).amax(0) - corner).nan_to_num(1.0)
         columns, rows = size.amax((0, 1)).long().tolist()
         first = torch.arange(corner[..., 0].numel(), device=corner.device).view(*corner.shape[:2], 1) * (rows * columns)
-        sources, targets, lights = [], [], []
-        for number, (colour, (lens, own)) in enumerate(zip(self.colours, lenses, strict=True)):
-            n_rows, n_columns = lens.shape[-2:]
-            sources.append((self.plane.index(own, n_rows, n_columns) + number * self.plane.n_pixels).flatten())
-            x, y = (own - corner).nan_to_num(0.0).long()[..., None].unbind(2)
+        sources, targets = [], []
+        for number, patch in enumerate(patches):
+            n_rows, n_columns = patch.values.shape[-2:]
+            sources.append((patch.index + number * self.plane.n_pixels).flatten())
+            x, y = (patch.corner - corner).nan_to_num(0.0).long()[..., None].unbind(2)
             row = first + (y + torch.arange(n_rows, device=y.device)) * columns
             column = x + torch.arange(n_columns, device=x.device)
             targets.append((row[..., :, None] + column[..., None, :]).flatten())
-            lens = lens.flatten()
-            positive = lens * lens * torch.rsqrt(lens * lens + _FAINT**2)  # a spline overshoots
-            light = colour.share * positive
-            lights.append(torch.stack([light, light * (positive + _NOTHING).sqrt(), light * colour.scale]))
-        source, target, lens = torch.cat(sources), torch.cat(targets), torch.cat([lens.flatten() for lens, _ in lenses])
-        dark = lens.new_zeros(first.numel() * rows * columns)
+        source, target = torch.cat(sources), torch.cat(targets)
+        shares = [mode.index_select(0, source) for mode in self.modes]
+        dark = corner.new_zeros(first.numel() * rows * columns)
 
-        def merged(light: Tensor) -> Tensor:
-            return dark.scatter_add(0, target, light).view(*corner.shape[:2], rows, columns)
+        def merged(lens: Tensor) -> Tensor:
+            parts = [dark.scatter_add(0, target, share * lens) for share in shares]
+            return torch.stack(parts).unflatten(1, (*corner.shape[:2], rows, columns))
 
-        values = torch.stack([merged(mode.index_select(0, source) * lens) for mode in self.modes])
-        total, roots, phases = (merged(moment) for moment in torch.cat(lights, 1))
-        total = total + _NOTHING
-        return values, roots / total, (phases + _NOTHING) / total, corner, size
+        values, kept = (
+            torch.cat([one.flatten() for one in ones]) for ones in zip(*(p[:2] for p in patches), strict=True)
+        )
+        return merged(values), merged(kept), corner, size
 
 
 def _pairs(n: int, device: torch.device) -> Tensor:

@@ -109,12 +109,14 @@ class PairCoherence:
             axes = self._axes(bx - x, by - y)
             known, found = -between, self._changing([separation, *axes, (bx, by)])
         else:
-            one, other = phases = self._phases(bx, by, x, y)
+            phases, spreads = self._phases(bx, by, x, y)
+            at = torch.stack([bx, by], -1)[None] / phases.mean(0)[:, None]
+            second, third = self.colours(at)[0].unbind(-1)
+            one, other = phases = _shared_phases(phases, spreads, second, third)
             axes = self._axes(bx / phases - x, by / phases - y)
             mean, half = (1 / one + 1 / other) / 2, (1 / one - 1 / other) / 2
             mx, my, hx, hy = bx * mean, by * mean, bx * half, by * half
             own = self.structure.at(mx + hx, my + hy) * one**2 + self.structure.at(mx - hx, my - hy) * other**2
-            second, third = self.colours(torch.stack([bx, by], -1)[None] / ((one + other) / 2)[:, None])[0].unbind(-1)
             known = colour_loss(second, third, one, other) - own / 2
             found = self._changing([separation, *axes, (mx, my), (hx, hy)]) * (one * other)
         return self.weights @ found.add_(known - _log_far(between)).exp_()
@@ -138,13 +140,15 @@ class PairCoherence:
             total.add_(term, alpha=factor)
         return total
 
-    def _phases(self, bx: Tensor, by: Tensor, x: Tensor, y: Tensor) -> Tensor:
-        """Return the phases (2, Q), over those at the reference wavelength, of the light of a band that lenses with the
-        baselines (x, y) (2, Q) transmit, on average."""
+    def _phases(self, bx: Tensor, by: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and variance (2, Q) of the phases, over those at the reference wavelength, of the light of a band
+        that lenses with the baselines (x, y) (2, Q) transmit."""
         scales = self.scales[:, None, None]
         x, y = bx / scales - x, by / scales - y
         brightness = self.shares.log()[:, None, None] - (x * x + y * y) / (2 * _LIGHT * self.reach**2)
-        return (torch.softmax(brightness, 0) * scales).sum(0)
+        light = torch.softmax(brightness, 0)
+        mean = (light * scales).sum(0)
+        return mean, (light * scales**2).sum(0) - mean**2
 
     def _moments(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the moments xx, xy and yy (...) [m^2] of the lens at the place (x, y).
@@ -160,6 +164,17 @@ class PairCoherence:
         narrow, base = (width - height) * (self.variance / square), height * self.variance
         along, across = narrow * x, narrow * y
         return torch.addcmul(base, along, x), along * y, torch.addcmul(base, across, y)
+
+
+def _shared_phases(mean: Tensor, variance: Tensor, second: Tensor, third: Tensor) -> Tensor:
+    """Return the mean phases (2, Q) of the light that two lenses share, by those of all their light.
+
+    Like colours count most: exp(-k), with k = loss (a - a')^2, brings normal distributions of a and a' nearer.
+    """
+    one, other = mean
+    loss = (second + third * (one - other).abs() * 2 / (one + other)).clamp(min=0)
+    nearer = 2 * loss * (one - other) / (1 + 2 * loss * variance.sum(0))
+    return torch.stack([one - variance[0] * nearer, other + variance[1] * nearer])
 
 
 def _log_far(structure: Tensor) -> Tensor:
