@@ -75,8 +75,8 @@ class TurbulentMSE(AsymptoticMSE):
     integral for holes of 0.4 to 1.5 r0, exposures up to 2 tau0 and bands up to 20 % wide, where it is above 2 % of what
     one pair of holes gives at most (within 5 % below; 3.3 % were seen for 20 holes of 1.5 r0 in the widest band); that
     of full pupils, which is interpolated, within 2 % where it is above 1e-4 (4 % with vanes of D/25, or with an outer
-    scale of 5 D). Baselines beyond the frequency torus alias as in MSE_a. A value takes 7 to 18 times as long as that of MSE_a, 35 to 85 times for 7
-    wavelengths over 20 %, and its gradient two to three times the value.
+    scale of 5 D). Baselines beyond the frequency torus alias as in MSE_a. A value takes 7 to 18 times as long as that
+    of MSE_a, 35 to 85 times for 7 wavelengths over 20 %, and its gradient two to three times the value.
 
     Examples
     --------
