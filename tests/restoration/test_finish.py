@@ -82,14 +82,14 @@ def test_a_recipe_has_a_finer_basis_if_it_has_more_modes(options, n_modes, five_
         assert torch.allclose(finer.mixing, basis_of(five_holes, 6).mixing)
 
 
-def ended(objective, state, setting, schedule, records=None, minimizer=None):
+def ended(objective, state, setting, schedule, records=None, minimizer=None, end=End.LAST_DESCENT):
     progress = Progress(Candidates(state, 1))
     listen = None if records is None else records.append
     found = finish(
         objective,
         setting,
         progress,
-        End.LAST_DESCENT,
+        end,
         schedule,
         minimizer or ProjectedLBFGS(),
         listen,
@@ -147,8 +147,36 @@ def test_the_last_descent_ends_when_half_a_segment_gains_little(explained):
     assert len(gains) == 1
 
 
+@pytest.mark.parametrize(
+    ("change", "end"),
+    [(1.0, End.INTEGRATION), (2.0, End.BOTH), (2.99, End.BOTH), (3.0, End.LAST_DESCENT), (math.inf, End.LAST_DESCENT)],
+)
+def test_how_a_restoration_ends_depends_on_how_much_its_frames_change(change, end):
+    assert End.of(change, Schedule(faint=2.0, noisy=3.0)) is end
+    assert end.descends is (end is not End.INTEGRATION)
+
+
+@pytest.mark.parametrize(
+    ("end", "stages"),
+    [
+        (End.LAST_DESCENT, ["last descent"] * 4),
+        (End.BOTH, ["last descent"] * 4 + ["integration"] * 3),
+        (End.INTEGRATION, ["integration"] * 5),
+    ],
+)
+def test_aberrations_are_integrated_out_after_the_last_descent_or_in_its_place(explained, end, stages):
+    objective, state = explained
+    schedule, records = Schedule(segment=4, last_segments=1, rounds=5, fine_rounds=3, moves=2), []
+    found, progress = ended(objective, state, Setting.of(objective), schedule, records, end=end)
+    assert [record.stage for record in records] == stages
+    assert progress.integrated is (end is not End.LAST_DESCENT)
+    assert isinstance(found.prior, SmoothVariation) is end.descends
+    assert progress.n_evaluations >= sum(2 + 2 if stage == "integration" else 1 for stage in stages)
+
+
 def test_nothing_follows_the_search_of_a_schedule_without_last_segments(observe, five_holes):
     assert End.of(math.inf, Schedule()) is End.LAST_DESCENT
+    assert End.of(10.0, Schedule(last_segments=0)) is End.NONE
     assert End.of(math.inf, Schedule.plain()) is End.NONE
     seen, stages = observe(n_frames=2, shape=(32, 32)), []
     schedule = Schedule(start_iterations=10, segment=10, last_segments=0, chance=math.inf, faint=0.0)

@@ -7,6 +7,7 @@ import torch
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import SparseAperture
+from torchmask.restoration import marginal
 from torchmask.restoration.aberrations import turbulent_basis
 from torchmask.restoration.descent import descend
 from torchmask.restoration.forward import ExposureModel
@@ -14,7 +15,6 @@ from torchmask.restoration.marginal import (
     AberrationSampler,
     integrate_aberrations,
     laplace_precision,
-    settle_at_own_scale,
 )
 from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.priors import TotalVariation
@@ -23,7 +23,7 @@ from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.state import Calibration, State
 
 GRID = Grid.nyquist(1.0, 550e-9, 32, oversampling=1.2)
-BRIEF = Schedule(rounds=4, moves=3, renewal=2, segment=3)
+BRIEF = Schedule(moves=3, renewal=2, segment=3)
 
 
 class OfOneScale(TotalVariation):
@@ -133,8 +133,8 @@ def test_the_object_is_where_the_marginal_cost_is_least():
     """Which quadrature tells where a frame has a single aberration: nothing is left of what the joint mode leaves."""
     objective, state = one_piston(10.0, 40, weight=0.3)
     joint = descend(objective, state, 400, ProjectedLBFGS(), lambda *_: None)
-    schedule = Schedule(rounds=30, moves=5)
-    found, evaluations = integrate_aberrations(objective, joint, schedule, ProjectedLBFGS(), seed=0, follow_r0=False)
+    schedule, how = Schedule(moves=5), {"seed": 0, "follow_r0": False}
+    found, evaluations = integrate_aberrations(objective, joint, 30, schedule, ProjectedLBFGS(), **how)
     before, after = (float(marginal_cost(objective, at.image)) for at in (joint, found))
     assert before > after
     assert after - least_marginal_cost(objective, found.image) < 0.05 * (before - after)
@@ -143,7 +143,7 @@ def test_the_object_is_where_the_marginal_cost_is_least():
 
 def test_aberrations_end_at_what_fits_the_object_best():
     objective, state = one_piston(1.5, 6)
-    found, _ = integrate_aberrations(objective, state, Schedule(rounds=4), ProjectedLBFGS(), seed=0, follow_r0=False)
+    found, _ = integrate_aberrations(objective, state, 4, Schedule(), ProjectedLBFGS(), seed=0, follow_r0=False)
     slope = objective.with_changes(free=Free.ABERRATIONS).value_and_gradients(found.image, found.z, found.calibration)
     assert float(slope.aberration_gradient.abs().max()) < 1e-3  # against 1 where the prior alone moves z by its unit
 
@@ -160,7 +160,9 @@ def test_one_seed_one_result_and_a_record_of_every_round(explain):
     objective, state = explain()
     records = []
     first, again, other = (
-        integrate_aberrations(objective, state, BRIEF, ProjectedLBFGS(), records.append, seed=seed, follow_r0=True)[0]
+        integrate_aberrations(objective, state, 4, BRIEF, ProjectedLBFGS(), records.append, seed=seed, follow_r0=True)[
+            0
+        ]
         for seed in (0, 0, 1)
     )
     assert torch.equal(first.image, again.image)
@@ -170,20 +172,36 @@ def test_one_seed_one_result_and_a_record_of_every_round(explain):
     assert all(record.stage == "integration" and 0 <= record.scalars["accepted"] <= 1 for record in records)
 
 
-def test_in_the_end_the_object_is_settled_at_its_own_scale(explain):
-    """Nothing pulls at it there: the gradient of misfit and suited prior vanishes, or pushes against the bound."""
-    objective, state = explain()
-    settled = settle_at_own_scale(objective, state, 400)
-    assert torch.equal(settled.z, state.z)
-    prior = objective.prior.suited_to(state.image)
-    slope, power = objective.object_quadratic(state.image, state.z, state.calibration)
-    change = settled.image - state.image
-    curved = torch.fft.irfft2(torch.fft.rfft2(change) * power, s=change.shape)
+def test_the_prior_has_the_scale_that_the_object_suggests():
+    """As with a prior of that scale from the beginning, whatever weight it has by itself."""
+    objective, state = one_piston(10.0, 10)
+    state = replace(
+        state, image=state.image + torch.rand(state.image.shape, generator=torch.Generator().manual_seed(2))
+    )
+    suited = TotalVariation().suited_to(state.image)
 
-    def pull(image, data):
-        free = data + prior.value_and_gradient(image)[1]
-        return float(torch.where(image > 0, free, free.clamp(max=0)).abs().max())
+    class AsSuited(TotalVariation):
+        def suited_to(self, image):
+            return suited
 
-    assert pull(settled.image, slope + curved) < 1e-2 * pull(state.image, slope)
-    fixed = MyopicObjective(objective.model, objective.frames, objective.precision, OfOneScale())
-    assert settle_at_own_scale(fixed, state, 5) is state
+    found = []
+    for prior in (TotalVariation(), AsSuited(), OfOneScale()):
+        changed, how = objective.with_changes(prior=prior), {"seed": 0, "follow_r0": False}
+        found.append(integrate_aberrations(changed, state, 4, BRIEF, ProjectedLBFGS(), **how)[0].image)
+    assert torch.equal(found[0], found[1])
+    assert not torch.allclose(found[0], found[2], rtol=0.01)
+
+
+def test_the_object_is_the_mean_of_the_later_rounds(monkeypatch):
+    objective, state = one_piston(10.0, 10)
+    settled, fit = [], marginal.settle
+
+    def settle(*arguments):
+        settled.append(fit(*arguments))
+        return settled[-1]
+
+    monkeypatch.setattr(marginal, "settle", settle)
+    found, _ = integrate_aberrations(objective, state, 5, BRIEF, ProjectedLBFGS(), seed=0, follow_r0=False)
+    assert len(settled) == 5
+    torch.testing.assert_close(found.image, sum(one.image for one in settled[2:]) / 3)
+    assert not torch.allclose(found.image, settled[-1].image)

@@ -1,8 +1,9 @@
-"""The end of a restoration: through a mask faint frames are integrated over, others get a finer model.
+"""The end of a restoration: through a mask a finer model, and in noisy light its aberrations are integrated out.
 
 A descent from far away takes few modes per sub-aperture. Close to the solution, more of them take away much of what the
 model leaves unexplained. So once the search has ended, the aberrations gain modes, and the object a smoother prior
-(`ObjectPrior.smoother`), and that descent goes on while it gains. For a full pupil phases are retrieved.
+(`ObjectPrior.smoother`), and that descent goes on while it gains. Where noise leaves the aberrations uncertain, they
+are integrated out after it, or in its place if frames are faint. For a full pupil phases are retrieved.
 """
 
 from __future__ import annotations
@@ -38,15 +39,31 @@ def finish(
 
     `save` is called after every segment of the last descent, which goes on where an interrupted one was.
     """
-    if end is End.INTEGRATION:
-        how = {"seed": traits.seed, "follow_r0": traits.r0_is_open}
-        ended.state, spent = integrate_aberrations(objective, ended.state, schedule, minimizer, callback, **how)
-        ended.n_evaluations += spent
-        ended.integrated = True
-        return objective
     if end is End.RETRIEVAL:
         retrieve_phases(objective, ended, schedule, minimizer, callback, follow_r0=traits.r0_is_open)
         return objective
+    if end.descends:
+        objective = descend_in_finer_modes(objective, setting, ended, schedule, minimizer, callback, traits, save)
+    if end is not End.LAST_DESCENT:
+        rounds = schedule.fine_rounds if end.descends else schedule.rounds
+        how = {"seed": traits.seed, "follow_r0": traits.r0_is_open}
+        ended.state, spent = integrate_aberrations(objective, ended.state, rounds, schedule, minimizer, callback, **how)
+        ended.n_evaluations += spent
+        ended.integrated = True
+    return objective
+
+
+def descend_in_finer_modes(
+    objective: MyopicObjective,
+    setting: Setting,
+    ended: Progress,
+    schedule: Schedule,
+    minimizer: Minimizer,
+    callback: Callback | None,
+    traits: Traits,
+    save: Callable[[Progress], None],
+) -> MyopicObjective:
+    """Run the last descent: update `ended`, and return the objective of its state."""
     state = setting.in_finer_modes(ended.state) if ended.finer is None else ended.finer
     objective = setting.objective_at(objective, state).with_changes(prior=objective.prior.smoother())
     most, done = (number * schedule.segment for number in (schedule.last_segments, ended.last_segments))

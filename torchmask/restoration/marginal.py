@@ -2,10 +2,10 @@
 
 A joint estimate of the object and the aberrations of all frames is biased: every frame brings as many new unknowns,
 which are fitted to its noise (Neyman & Scott, Econometrica 16, 1, 1948; for blind deconvolution Levin et al., IEEE
-Trans. Pattern Anal. 33, 2354, 2011). The aberrations are therefore integrated out by expectation maximisation: the
-object minimises the misfit averaged over samples of the aberrations, which are then moved on for the new object. The
-averages forget earlier samples gradually (stochastic approximation; Delyon, Lavielle & Moulines, Ann. Stat. 27, 94,
-1999).
+Trans. Pattern Anal. 33, 2354, 2011). The aberrations are therefore integrated out by stochastic expectation
+maximisation (Celeux & Diebolt, Comput. Stat. Q. 2, 73, 1985): the object is fitted to a sample of the aberrations,
+which are then moved on for the new object, and the result is its mean over the later rounds. The prior on the object
+has the scale that the object suggests.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from torchmask.record import Callback, Record
 from torchmask.restoration.adjoint import data_fidelity
 from torchmask.restoration.calibration import follow_turbulence, unwrap_pistons
 from torchmask.restoration.descent import Variables, descend
-from torchmask.restoration.escapes import settle, settle_object
+from torchmask.restoration.escapes import settle
 from torchmask.restoration.linearization import Linearization
 from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.projected_lbfgs import Minimizer
@@ -117,6 +117,7 @@ def laplace_precision(objective: MyopicObjective, state: State) -> Tensor:
 def integrate_aberrations(
     objective: MyopicObjective,
     state: State,
+    rounds: int,
     schedule: Schedule,
     minimizer: Minimizer,
     callback: Callback | None = None,
@@ -127,54 +128,29 @@ def integrate_aberrations(
     """Return the marginal estimate of the object with its best-fitting aberrations, and the number of evaluations.
 
     `state` is the end of a descent, with a positive weight of the aberrations' prior; with `follow_r0` this weight is
-    estimated from the samples. At the end the object is fitted again under a prior with the scale that it suggests. The
-    callback is called with a `Record` after every round.
+    estimated from the samples. The callback is called with a `Record` after every round.
     """
     generator = torch.Generator().manual_seed(seed)
     sampler, size, spent = AberrationSampler(objective, state, generator), schedule.move_size, 0
-    pull, power, total = 0.0, 0.0, torch.zeros_like(state.image)
-    for number in range(schedule.rounds):
+    suited = objective.with_changes(prior=objective.prior.suited_to(state.image))
+    total, first = torch.zeros_like(state.image), rounds // 2
+    for number in range(rounds):
         if number and number % schedule.renewal == 0:
             sampler = AberrationSampler(objective, state, generator)
         z, accepted = sampler.sample(state, schedule.moves, size)
         size = size * _ADAPTED if accepted > _ACCEPTED else size / _ADAPTED
-        slope, now = objective.object_quadratic(state.image, z, state.calibration)
-        kept = min(schedule.memory, number / (number + 1))
-        pull = kept * pull + (1 - kept) * (_filter(state.image, now) - slope)
-        power = kept * power + (1 - kept) * now
-        slope = _filter(state.image, power) - pull + objective.model.background.price
-        image = settle_object(state.image, slope, power, objective.prior, schedule.settling)[1]
-        state = unwrap_pistons(objective, replace(state, image=image, z=z))
+        state = settle(suited, replace(state, z=z), schedule.settling)
+        state = unwrap_pistons(objective, state)
         state = follow_turbulence(objective, state) if follow_r0 else state
-        if number >= schedule.rounds // 2:
-            total += image / (schedule.rounds - schedule.rounds // 2)
+        if number >= first:
+            total += state.image / (rounds - first)
         spent += schedule.moves + 2
         if callback is not None:
-            callback(Record("integration", number + 1, schedule.rounds, {"accepted": accepted}, {}))
+            callback(Record("integration", number + 1, rounds, {"accepted": accepted}, {}))
 
     def count(cost: float, evaluations: int, variables: Variables) -> None:
         nonlocal spent
         spent += evaluations
 
     known_object = objective.with_changes(free=objective.free & ~Free.OBJECT)
-    state = descend(known_object, replace(state, image=total), schedule.segment, minimizer, count)
-    suited = settle_at_own_scale(objective, state, schedule.last_settling)
-    if suited is not state:
-        state = descend(known_object, suited, schedule.segment, minimizer, count)
-    return state, spent
-
-
-@torch.no_grad()
-def settle_at_own_scale(objective: MyopicObjective, state: State, n_iterations: int) -> State:
-    """Fit the object under a prior with the scale that it suggests, for fixed aberrations.
-
-    Returns `state` itself if the prior has no scale (`ObjectPrior.suited_to`).
-    """
-    prior = objective.prior.suited_to(state.image)
-    if prior is objective.prior:
-        return state
-    return settle(objective.with_changes(prior=prior), state, n_iterations)
-
-
-def _filter(image: Tensor, response: Tensor) -> Tensor:
-    return torch.fft.irfft2(torch.fft.rfft2(image) * response, s=image.shape)
+    return descend(known_object, replace(state, image=total), schedule.segment, minimizer, count), spent

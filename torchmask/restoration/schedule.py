@@ -11,12 +11,22 @@ from numbers import Integral
 _NO_LIMIT = 10**9  # iterations
 
 # Ranges of the numbers that are not simply at least 0, with both ends.
-_COUNTS = ("segment", "start_iterations", "starts", "doubtful_starts", "faint_starts", "averaged", "rounds", "renewal")
+_COUNTS = (
+    "segment",
+    "start_iterations",
+    "starts",
+    "doubtful_starts",
+    "faint_starts",
+    "averaged",
+    "rounds",
+    "fine_rounds",
+    "renewal",
+)
 _RANGES = {
     **dict.fromkeys(_COUNTS, (1, math.inf)),
     **dict.fromkeys(("nearly_at_rest", "chance", "alike"), (-math.inf, math.inf)),  # negative ones never apply
     **dict.fromkeys(("start_rms", "start_rms_unwhitened", "move_size"), (0, sys.float_info.max)),
-    **dict.fromkeys(("memory", "farthest"), (0, 1)),
+    "farthest": (0, 1),
     "first_inflation": (sys.float_info.min, math.inf),  # as it divides
 }
 
@@ -64,14 +74,16 @@ class Schedule:
     misplaced : and if that step moves holes by more than this fraction of their distance from the centre
     farthest : a mask found displaced by more than this fraction is reset to the given geometry
     still : the geometry has converged when a segment moves holes by less than this fraction
-    faint : change from frame to frame, in noise variances, below which the aberrations are integrated out at the end
-    rounds : number of rounds of that integration; the object is the mean of the second half of them
+    faint : change from frame to frame, in noise variances, below which frames are faint: the aberrations are integrated
+        out in place of a last descent
+    noisy : the same below which they are integrated out after the last descent
+    rounds : number of rounds of the integration of faint frames; the object is the mean of the second half of them
+    fine_rounds : the same after a last descent
     moves : number of moves of the aberrations' samples in a round
     move_size : size of the first moves, in standard deviations of Laplace's approximation
     renewal : number of rounds after which that approximation is recomputed
-    memory : weight of the earlier rounds in the running averages
     settling : maximum number of iterations that fit the object in a round
-    last_settling : maximum number of iterations that fit it at the end, under a prior that suits it better
+    last_settling : maximum number of iterations that fit it after the last descent
     last_modes : number of modes of each sub-aperture of a mask in the last descent of frames that are not faint
     last_segments : maximum number of segments of that descent; 0: there is none
     last_gain : it ends when the second half of a segment lowers the cost by less than this fraction
@@ -117,11 +129,12 @@ class Schedule:
     farthest: float = 0.05
     still: float = 1e-4
     faint: float = 5.0
-    rounds: int = 80
+    noisy: float = 30.0
+    rounds: int = 100
+    fine_rounds: int = 50
     moves: int = 10
     move_size: float = 0.3
     renewal: int = 20
-    memory: float = 0.7
     settling: int = 30
     last_settling: int = 80
     last_modes: int = 28

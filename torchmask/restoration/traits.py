@@ -16,6 +16,7 @@ class End(Enum):
     NONE = "the search is the end"
     INTEGRATION = "the aberrations of faint frames are integrated out"
     LAST_DESCENT = "object and aberrations descend once more, with more modes"
+    BOTH = "the aberrations of noisy frames are integrated out after a last descent"
     RETRIEVAL = "the phases of frames of a full pupil are retrieved for the sharp object"
 
     @classmethod
@@ -23,7 +24,14 @@ class End(Enum):
         """Return the end for a mask whose frames change from one to the next by so many noise variances."""
         if change < schedule.faint:
             return cls.INTEGRATION
-        return cls.LAST_DESCENT if schedule.last_segments else cls.NONE
+        if not schedule.last_segments:
+            return cls.NONE
+        return cls.BOTH if change < schedule.noisy else cls.LAST_DESCENT
+
+    @property
+    def descends(self) -> bool:
+        """Whether a last descent follows."""
+        return self in (End.LAST_DESCENT, End.BOTH)
 
 
 class Refinement(Enum):
