@@ -94,4 +94,5 @@ class MaskTransfer:
 
     @cached_property
     def _steady_patches(self) -> LensPatches:
-        return self._make_steady()
+        with torch.inference_mode(False), torch.device("cpu"):  # as for the tables that are made at once
+            return self._make_steady()
