@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -183,6 +184,19 @@ with tracking.RunLogger(sys.argv[1]) as log:
 """
 
 
+def stop_and_listen(process, stop):
+    """What a process has printed that is told to stop: again, if it goes on.
+
+    Of 60 interrupts 3 were lost without a word, as C code that asks whether there is an attribute forgets whatever
+    exception comes meanwhile.
+    """
+    for _ in range(4):
+        os.kill(process.pid, stop)
+        with suppress(subprocess.TimeoutExpired):
+            return process.communicate(timeout=15)[1]
+    raise AssertionError("the process goes on after four signals")
+
+
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGKILL])
 def test_a_stopped_process_leaves_a_readable_folder(tmp_path, stop):
     folder = tmp_path / "run"
@@ -190,9 +204,8 @@ def test_a_stopped_process_leaves_a_readable_folder(tmp_path, stop):
         while not (folder / "checkpoints" / "fit.npz").exists():
             assert process.poll() is None, process.stderr.read().decode()
             time.sleep(0.02)
-        os.kill(process.pid, stop)
         try:
-            _, printed = process.communicate(timeout=60)
+            printed = stop_and_listen(process, stop)
         finally:
             process.kill()  # what goes on for ever would keep the test waiting
     rows = read_metrics(folder)
