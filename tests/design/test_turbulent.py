@@ -391,6 +391,12 @@ def test_half_precision_is_refused(r0, dtype):
         criterion_of(n_photons=1e6, r0=r0)(mask.to(dtype))
 
 
+def test_tables_made_within_a_transform_are_those_made_outside():
+    centers = mask_of(4).centers
+    found = torch.func.vmap(lambda c: criterion_of(r0=0.2)(SparseAperture(c, 0.1, 1.0)))(centers[None])
+    torch.testing.assert_close(found[0], criterion_of(r0=0.2)(SparseAperture(centers, 0.1, 1.0)))
+
+
 def test_a_second_derivative_is_refused():
     criterion = criterion_of(Grid.nyquist(1.0, 550e-9, 24), r0=0.25)
     centers = torch.tensor(CENTERS["random"], dtype=torch.float64, requires_grad=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -206,9 +207,10 @@ class TurbulentMSE(AsymptoticMSE):
         if key not in self._tables:
             if len(self._tables) >= _KEPT:
                 self._tables.pop(next(iter(self._tables)))
-            # whatever the default device: tables are made in numpy and scipy; a later call may need gradients
-            with torch.inference_mode(False), torch.device("cpu"):
-                self._tables[key] = make(aperture)
+            # Tables are made in numpy and scipy. In a thread of its own neither a default device nor inference mode
+            # nor a transform such as vmap, in which a tensor has no numbers, is in force.
+            with ThreadPoolExecutor(1) as own:
+                self._tables[key] = own.submit(make, aperture).result()
         return self._tables[key]
 
     def _mask_transfer(self, aperture: Aperture) -> MaskTransfer:
