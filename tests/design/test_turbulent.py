@@ -391,14 +391,19 @@ def test_half_precision_is_refused(r0, dtype):
         criterion_of(n_photons=1e6, r0=r0)(mask.to(dtype))
 
 
-def test_tables_made_within_a_transform_are_those_made_outside():
+@pytest.mark.parametrize(
+    ("of", "turbulence"),
+    [("forward", {"r0": 0.2}), ("jensen_term", {})],
+    ids=["error under turbulence", "Jensen's term of pistons"],
+)
+def test_tables_may_first_be_needed_within_a_transform(of, turbulence):
     centers = mask_of(4).centers
 
-    def error(criterion):
-        return lambda c: criterion(SparseAperture(c, 0.1, 1.0))
+    def value(criterion):
+        return lambda c: getattr(criterion, of)(SparseAperture(c, 0.1, 1.0))
 
-    found = torch.func.jacrev(error(criterion_of(r0=0.2)))(centers)
-    expected = torch.autograd.functional.jacobian(error(criterion_of(r0=0.2)), centers)
+    found = torch.func.jacrev(value(criterion_of(**turbulence)))(centers)
+    expected = torch.autograd.functional.jacobian(value(criterion_of(**turbulence)), centers)
     torch.testing.assert_close(found, expected)
 
 

@@ -14,7 +14,7 @@ from torchmask.restoration.background import Background
 from torchmask.restoration.calibration import fit_of_frames
 from torchmask.restoration.candidates import Candidates
 from torchmask.restoration.checkpoint import Progress
-from torchmask.restoration.finish import finish
+from torchmask.restoration.finish import Finisher
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.motion import Setting
@@ -85,18 +85,8 @@ def test_a_recipe_has_a_finer_basis_if_it_has_more_modes(options, n_modes, five_
 def ended(objective, state, setting, schedule, records=None, minimizer=None, end=End.LAST_DESCENT):
     progress = Progress(Candidates(state, 1))
     listen = None if records is None else records.append
-    found = finish(
-        objective,
-        setting,
-        progress,
-        end,
-        schedule,
-        minimizer or ProjectedLBFGS(),
-        listen,
-        TRAITS,
-        lambda progress: None,
-    )
-    return found, progress
+    finisher = Finisher(setting, schedule, minimizer or ProjectedLBFGS(), listen, TRAITS, lambda progress: None)
+    return finisher.finish(objective, progress, end), progress
 
 
 def test_more_modes_explain_what_few_leave(five_holes, explain):

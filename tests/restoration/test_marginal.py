@@ -159,11 +159,9 @@ def test_common_aberrations_stay_while_those_of_frames_are_sampled(three_holes, 
 def test_one_seed_one_result_and_a_record_of_every_round(explain):
     objective, state = explain()
     records = []
+    how = {"callback": records.append, "follow_r0": True}
     first, again, other = (
-        integrate_aberrations(objective, state, 4, BRIEF, ProjectedLBFGS(), records.append, seed=seed, follow_r0=True)[
-            0
-        ]
-        for seed in (0, 0, 1)
+        integrate_aberrations(objective, state, 4, BRIEF, ProjectedLBFGS(), seed=seed, **how)[0] for seed in (0, 0, 1)
     )
     assert torch.equal(first.image, again.image)
     assert torch.equal(first.z, again.z)

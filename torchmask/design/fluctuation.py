@@ -15,6 +15,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchmask.design.apart import make_apart
 from torchmask.design.lens_patches import Lenses, LensPatches
 from torchmask.design.overlap import Geometry
 from torchmask.optics.band import Band
@@ -54,8 +55,8 @@ def steady_lenses(lenses: Lenses, n: int) -> Tensor:
 
 def piston_powers(centers: Tensor, geometry: Geometry, wavelength: float) -> tuple[Tensor, Tensor]:
     """Return P and the sum of A^4 (B, H // 2 + 1, W) of masks with `centers` (B, N, 2) [m], for pistons alone."""
-    with torch.device("cpu"):  # whatever the default device: their tables are made in numpy and scipy
-        patches = LensPatches(geometry, Band.of([wavelength]), wavelength, None, None, centers.dtype, centers.device)
+    light = Band.of([wavelength]), wavelength
+    patches = make_apart(LensPatches, geometry, *light, None, None, centers.dtype, centers.device)
     n, found = centers.shape[1], []
     for mask in centers.split(1):
         lenses = patches(mask)

@@ -17,6 +17,7 @@ from torch import Tensor
 from torchmask.atmosphere.colour_coherence import ColourCoherence
 from torchmask.atmosphere.lens_coherence import lens_amplitude
 from torchmask.atmosphere.seeing import Seeing
+from torchmask.design.apart import make_apart
 from torchmask.design.central_lenses import CentralLenses
 from torchmask.design.fluctuation import steady_lenses
 from torchmask.design.frequency_plane import FrequencyPlane, half_plane
@@ -94,5 +95,4 @@ class MaskTransfer:
 
     @cached_property
     def _steady_patches(self) -> LensPatches:
-        with torch.inference_mode(False), torch.device("cpu"):  # as for the tables that are made at once
-            return self._make_steady()
+        return make_apart(self._make_steady)

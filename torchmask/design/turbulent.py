@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -14,6 +13,7 @@ from torch import Tensor
 from torchmask.atmosphere.lens_coherence import PolarTable
 from torchmask.atmosphere.seeing import Seeing
 from torchmask.atmosphere.transfer import mean_square_otf, steady_square_otf
+from torchmask.design.apart import make_apart
 from torchmask.design.criterion import AsymptoticMSE
 from torchmask.design.early_gradient import by_chunks
 from torchmask.design.frequency_plane import half_plane
@@ -207,10 +207,7 @@ class TurbulentMSE(AsymptoticMSE):
         if key not in self._tables:
             if len(self._tables) >= _KEPT:
                 self._tables.pop(next(iter(self._tables)))
-            # Tables are made in numpy and scipy. In a thread of its own neither a default device nor inference mode
-            # nor a transform such as vmap, in which a tensor has no numbers, is in force.
-            with ThreadPoolExecutor(1) as own:
-                self._tables[key] = own.submit(make, aperture).result()
+            self._tables[key] = make_apart(make, aperture)
         return self._tables[key]
 
     def _mask_transfer(self, aperture: Aperture) -> MaskTransfer:

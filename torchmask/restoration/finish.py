@@ -9,6 +9,7 @@ are integrated out after it, or in its place if frames are faint. For a full pup
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 from torchmask.record import Callback
 from torchmask.restoration.calibration import recalibrate
@@ -24,62 +25,56 @@ from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.traits import End, Traits
 
 
-def finish(
-    objective: MyopicObjective,
-    setting: Setting,
-    ended: Progress,
-    end: End,
-    schedule: Schedule,
-    minimizer: Minimizer,
-    callback: Callback | None,
-    traits: Traits,
-    save: Callable[[Progress], None],
-) -> MyopicObjective:
-    """Finish a restoration whose search has ended: update `ended`, and return the objective of its state.
+@dataclass(frozen=True)
+class Finisher:
+    """Finishes restorations whose search has ended.
 
     `save` is called after every segment of the last descent, which goes on where an interrupted one was.
     """
-    if end is End.RETRIEVAL:
-        retrieve_phases(objective, ended, schedule, minimizer, callback, follow_r0=traits.r0_is_open)
+
+    setting: Setting
+    schedule: Schedule
+    minimizer: Minimizer
+    callback: Callback | None
+    traits: Traits
+    save: Callable[[Progress], None]
+
+    def finish(self, objective: MyopicObjective, ended: Progress, end: End) -> MyopicObjective:
+        """Update `ended`, and return the objective of its state."""
+        how = (self.schedule, self.minimizer, self.callback)
+        if end is End.RETRIEVAL:
+            retrieve_phases(objective, ended, *how, follow_r0=self.traits.r0_is_open)
+            return objective
+        if end.descends:
+            objective = self._descend(objective, ended)
+        if end is not End.LAST_DESCENT:
+            rounds = self.schedule.fine_rounds if end.descends else self.schedule.rounds
+            known = {"seed": self.traits.seed, "follow_r0": self.traits.r0_is_open}
+            ended.state, spent = integrate_aberrations(objective, ended.state, rounds, *how, **known)
+            ended.n_evaluations += spent
+            ended.integrated = True
         return objective
-    if end.descends:
-        objective = descend_in_finer_modes(objective, setting, ended, schedule, minimizer, callback, traits, save)
-    if end is not End.LAST_DESCENT:
-        rounds = schedule.fine_rounds if end.descends else schedule.rounds
-        how = {"seed": traits.seed, "follow_r0": traits.r0_is_open}
-        ended.state, spent = integrate_aberrations(objective, ended.state, rounds, schedule, minimizer, callback, **how)
-        ended.n_evaluations += spent
-        ended.integrated = True
-    return objective
 
+    def _descend(self, objective: MyopicObjective, ended: Progress) -> MyopicObjective:
+        """Run the last descent, with the same effects."""
+        schedule = self.schedule
+        state = self.setting.in_finer_modes(ended.state) if ended.finer is None else ended.finer
+        objective = self.setting.objective_at(objective, state).with_changes(prior=objective.prior.smoother())
+        most, done = (number * schedule.segment for number in (schedule.last_segments, ended.last_segments))
+        report, costs = ended.reporter("last descent", most, self.callback, done), []
 
-def descend_in_finer_modes(
-    objective: MyopicObjective,
-    setting: Setting,
-    ended: Progress,
-    schedule: Schedule,
-    minimizer: Minimizer,
-    callback: Callback | None,
-    traits: Traits,
-    save: Callable[[Progress], None],
-) -> MyopicObjective:
-    """Run the last descent: update `ended`, and return the objective of its state."""
-    state = setting.in_finer_modes(ended.state) if ended.finer is None else ended.finer
-    objective = setting.objective_at(objective, state).with_changes(prior=objective.prior.smoother())
-    most, done = (number * schedule.segment for number in (schedule.last_segments, ended.last_segments))
-    report, costs = ended.reporter("last descent", most, callback, done), []
+        def listen(cost: float, evaluations: int, variables: Variables) -> None:
+            costs.append(cost)
+            report(cost, evaluations, variables)
 
-    def listen(cost: float, evaluations: int, variables: Variables) -> None:
-        costs.append(cost)
-        report(cost, evaluations, variables)
-
-    while ended.last_segments < schedule.last_segments:
-        costs.clear()
-        if schedule.recalibrates:
-            state = recalibrate(objective, state, power=1, follow_r0=traits.r0_is_open)
-        state = descend(objective, state, schedule.segment, minimizer, listen)
-        gains = bool(costs) and costs[len(costs) // 2] - costs[-1] > schedule.last_gain * abs(costs[-1])
-        ended.finer, ended.last_segments = state, ended.last_segments + 1 if gains else schedule.last_segments
-        save(ended)
-    ended.state = settle(objective, state, schedule.last_settling)  # a descent moves flat parts of the object slowly
-    return objective
+        while ended.last_segments < schedule.last_segments:
+            costs.clear()
+            if schedule.recalibrates:
+                state = recalibrate(objective, state, power=1, follow_r0=self.traits.r0_is_open)
+            state = descend(objective, state, schedule.segment, self.minimizer, listen)
+            gains = bool(costs) and costs[len(costs) // 2] - costs[-1] > schedule.last_gain * abs(costs[-1])
+            ended.finer, ended.last_segments = state, ended.last_segments + 1 if gains else schedule.last_segments
+            self.save(ended)
+        # a descent moves flat parts of the object slowly
+        ended.state = settle(objective, state, schedule.last_settling)
+        return objective

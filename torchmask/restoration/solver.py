@@ -24,7 +24,7 @@ from torchmask.restoration.checkpoint import Checkpoint, Ending, Progress, Statu
 from torchmask.restoration.consensus import average_starts
 from torchmask.restoration.descent import Variables, descend
 from torchmask.restoration.escapes import escape
-from torchmask.restoration.finish import finish
+from torchmask.restoration.finish import Finisher
 from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.judge import Judge
 from torchmask.restoration.motion import Setting
@@ -117,7 +117,7 @@ class Solver:
             average_starts(self.objective, ended, self.schedule, self.minimizer, self.callback)
         if self.end is not End.NONE and (ended.starts > 1 or not cut_short):
             how = (self.schedule, self.minimizer, self.callback, self.traits, save_nothing if cut_short else save)
-            self.objective = finish(self.objective, self.setting, ended, self.end, *how)
+            self.objective = Finisher(self.setting, *how).finish(self.objective, ended, self.end)
         return ended
 
     def begin(self, known: Known, start: RestorationResult | None) -> Progress:
