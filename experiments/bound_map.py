@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 N_HOLES, EXPONENT = 11, 1.5
-OVERSAMPLING = 4  # of the pupil: holes of 15 samples; with 8 an excess differs by half a per cent of itself
 KEYS = ("n_modes", "n_frames", "n_photons")
 
 
@@ -73,7 +72,6 @@ def bound(task: Mapping[str, Any]) -> dict[str, Any]:
         *(make_scene(grid.shape, photons), mask, grid, signal, noise, task["n_frames"], task["n_modes"]),
         r0=DIAMETER / task["strength"],
         outer_scale=OUTER_SCALE,
-        oversampling=OVERSAMPLING,
         generator=torch.Generator().manual_seed(task["draw"]),
     )
     floor = float(AsymptoticMSE(grid, signal, noise, 1).floor(DIAMETER) / signal(grid).mean())

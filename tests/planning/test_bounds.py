@@ -24,7 +24,7 @@ def scene(light=1e4):
 
 
 def bound(n_modes=3, n_frames=3, r0=0.4, seed=0, **changes):
-    known = {"image": scene(), "object_psd": OBJECT, "noise_psd": NOISE, "aperture": MASK} | changes
+    known = {"image": scene(), "object_psd": OBJECT, "noise_psd": NOISE, "aperture": MASK, "oversampling": 2} | changes
     generator = torch.Generator().manual_seed(seed)
     return myopic_bound(
         **known,
@@ -32,7 +32,6 @@ def bound(n_modes=3, n_frames=3, r0=0.4, seed=0, **changes):
         n_frames=n_frames,
         n_modes=n_modes,
         r0=r0,
-        oversampling=2,
         generator=generator,
     )
 
@@ -95,6 +94,20 @@ def test_it_is_computed_in_float64_where_the_aperture_is():
     image, expected = scene(), bound()
     with torch.device("meta"):
         assert bound(image=image) == expected
+
+
+@pytest.mark.parametrize(("diameter", "finer"), [(0.4, 7), (0.3, 9)])
+def test_holes_are_14_samples_wide_unless_told(diameter, finer):
+    """Samples lie 2/11 m apart, over the oversampling."""
+    mask = SparseAperture(MASK.centers, diameter, 1.0)
+    assert bound(aperture=mask, oversampling=None) == bound(aperture=mask, oversampling=finer)
+    assert bound(aperture=mask, oversampling=None) != bound(aperture=mask, oversampling=finer - 1)
+
+
+def test_finer_samples_change_the_excess_little():
+    """By less than the share that the default allows; by far more from holes of four samples on."""
+    coarse, default, fine = (bound(oversampling=finer).ratio - 1 for finer in (2, 7, 14))
+    assert abs(default / fine - 1) < 0.04 < abs(coarse / fine - 1)
 
 
 @pytest.mark.parametrize(
