@@ -142,9 +142,29 @@ def test_faint_frames_get_several_starts_though_they_are_explained(explain):
         verdict = judge.verdict(objective, ending)
         assert verdict.explained
         starts.append(judge.most_starts(verdict))
-        progress = Progress(Candidates(replace(state, z=0 * state.z), 1), schedule.glance * [1.0], rival=ending)
-        assert judge.gives_up(objective, progress) is (end is End.LAST_DESCENT)
     assert starts == [1, 4]
+
+
+def test_a_start_in_faint_frames_is_given_up_where_it_costs_much_more(explain):
+    """By the cost for each aberration, with the noise as given; in bright frames by what it leaves."""
+    objective, state = explain(noise=0.003)
+    worse = replace(state, z=0.5 * state.z)
+    costs = [float(objective.value_and_gradients(s.image, s.z, s.calibration).value) for s in (worse, state)]
+    above = (costs[0] - costs[1]) / state.z.numel()
+    assert above > 0
+
+    def given_up(hopeless, end=End.INTEGRATION, iterations=300, rival=state):
+        schedule = Schedule(hopeless=hopeless, promising=math.inf)
+        judge = Judge(Setting.of(objective), stack_of(objective), TRAITS, schedule, end)
+        before = None if rival is None else Ending(rival, Status.CONVERGED)
+        now = Candidates(worse.with_noise_inflation(3.0), 1)
+        return judge.gives_up(objective, Progress(now, iterations * [1.0], rival=before))
+
+    assert given_up(0.999 * above)
+    assert not given_up(1.001 * above)
+    assert not given_up(0.0, End.LAST_DESCENT)
+    assert not given_up(0.0, iterations=299)
+    assert not given_up(0.0, rival=None)
 
 
 def test_a_start_that_explains_the_frames_ends_when_nearly_at_rest(explain):

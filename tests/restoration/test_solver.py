@@ -432,15 +432,29 @@ def test_aberrations_of_faint_frames_are_integrated_out(faint, traits, integrate
     assert len(progress.costs) == min(5, traits.get("max_iterations", 5))
 
 
-@pytest.mark.parametrize(("max_iterations", "n_starts"), [(1000, 3), (15, 2), (10, 1)])
-def test_faint_frames_get_whole_starts_from_twins(max_iterations, n_starts, explained):
-    """As many as there is time for, so that the aberrations can still be integrated out."""
-    numbers = {"rounds": 2, "moves": 2, "start_iterations": 5}
+@pytest.mark.parametrize(
+    ("max_iterations", "n_starts", "n_iterations"), [(1000, 6, 30), (13, 3, 13), (12, 2, 10), (8, 2, 8), (7, 1, 5)]
+)
+def test_faint_frames_get_starts_that_can_be_judged(max_iterations, n_starts, n_iterations, explained):
+    """As many as there is time to see whether they are hopeless, the last of which may be cut short."""
+    numbers = {"rounds": 2, "moves": 2, "start_iterations": 5, "glance": 3}
     schedule = Schedule(faint=math.inf, **numbers, **NONE_MISSED, **BRISK)
     progress = solver_of(explained[0], schedule=schedule, max_iterations=max_iterations).solve(Known())
     assert progress.starts == n_starts
-    assert len(progress.costs) == 5 * n_starts
+    assert len(progress.costs) == n_iterations
     assert progress.integrated
+
+
+@pytest.mark.parametrize("faint", [0.0, math.inf])
+@pytest.mark.parametrize("starts", [2, 5])
+def test_any_later_start_in_faint_frames_may_be_given_up(starts, faint, explained):
+    """In brighter ones those from twins alone, of which the fifth is none."""
+    objective, truth = explained
+    poor = replace(truth, z=0 * truth.z)
+    schedule = Schedule(starts=starts, faint_starts=starts, glance=5, hopeless=0.0, faint=faint, **ALL_MISSED, **BRISK)
+    begun = Progress(Candidates(poor, 1), [], starts=starts, rival=Ending(truth, Status.CONVERGED))
+    progress = solver_of(objective, schedule=schedule, max_iterations=20).run(begun, True, lambda _: None)
+    assert len(progress.costs) == (20 if faint == 0 and starts == 5 else 5)
 
 
 def test_frames_are_faint_by_how_they_change(explained):

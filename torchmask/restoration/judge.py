@@ -112,10 +112,17 @@ class Judge:
         return verdict.explained and self.most_starts(verdict) == 1
 
     def gives_up(self, objective: MyopicObjective, progress: Progress) -> bool:
-        """Return whether it is time to see that the present start is not well ahead of the best earlier one."""
-        if self.end is End.INTEGRATION or progress.rival is None or progress.iterations != self.schedule.glance:
+        """Return whether it is time to see that the present start is not well ahead of the best earlier one.
+
+        In faint frames, whose residual does not tell, it need not be ahead, but not cost much more either.
+        """
+        if progress.rival is None or progress.iterations != self.schedule.glance:
             return False
-        left, least = (self.verdict(objective, ending).excess for ending in (progress.ending, progress.rival))
+        now, best = progress.ending, progress.rival
+        if self.end is End.INTEGRATION:
+            above = self._cost(objective, now.state) - self._cost(objective, best.state)
+            return above > self.schedule.hopeless * now.state.z.numel()
+        left, least = (self.verdict(objective, ending).excess for ending in (now, best))
         return left >= self.schedule.promising * least
 
     def _cost(self, objective: MyopicObjective, state: State) -> float:

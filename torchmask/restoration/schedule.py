@@ -57,11 +57,12 @@ class Schedule:
     twins : number of further starts of a mask from twins of its object before one from random aberrations
     doubtful : the fit of a mask is doubted if the excess is larger than this number times that expected
     doubtful_starts : maximum number of starts of a mask whose fit is explained but doubted
-    faint_starts : number of starts of a mask whose faint frames are explained, of which the likeliest is kept, as far
-        as the maximum number of iterations leaves room for whole ones
+    faint_starts : maximum number of starts of a mask whose faint frames are explained, of which the likeliest is kept
     likelier : cost by which a later of these starts has to be lower to replace an earlier one
-    glance : number of iterations after which a start from a twin is given up, unless frames are faint
-    promising : unless its excess chi-square is below this fraction of that of the best start so far
+    glance : number of iterations after which a start from a twin, or any later start in faint frames, may be given up
+    promising : a twin is, unless its excess chi-square is below this fraction of that of the best start so far
+    hopeless : a start in faint frames is, if its cost exceeds that of the best so far by more than this for each
+        aberration of all frames
     averaged : for a full pupil, number of starts that explain the frames, the mean of whose objects is the result
     alike : relative difference of the excess chi-square of two starts of a full pupil below which they are the same
     outlying : a frame is outlying if its residual variance is larger than this number times that of well-fitted frames
@@ -112,10 +113,11 @@ class Schedule:
     twins: int = 3
     doubtful: float = 1.0
     doubtful_starts: int = 3
-    faint_starts: int = 3
+    faint_starts: int = 6
     likelier: float = 50.0
     glance: int = 300
     promising: float = 0.7
+    hopeless: float = 0.3
     averaged: int = 3
     alike: float = 0.03
     outlying: float = 1.25

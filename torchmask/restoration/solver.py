@@ -199,7 +199,8 @@ class Solver:
         is_still = distance(place, state.geometry) < schedule.still
         at_rest = is_still and self.judge.is_at_rest(objective, progress, decrease)
         self._look_at_place(progress)
-        if self._is_twin(progress) and self.judge.gives_up(objective, progress):
+        may_be_hopeless = self._is_twin(progress) or self.end is End.INTEGRATION
+        if may_be_hopeless and self.judge.gives_up(objective, progress):
             progress.status = Status.GIVEN_UP
             return
         goes_on = (limit := self._limit(progress)) is Status.RUNNING
@@ -267,7 +268,9 @@ class Solver:
         if self.averages and now.explained:
             progress.explained += (progress.ending,)
         again = progress.starts < self.judge.most_starts(verdict) and not progress.alike
-        needed = self.schedule.start_iterations + 1 if verdict.explained else 1  # what could be spared is not cut short
+        needed = 1
+        if verdict.explained:  # what could be spared is not cut short; in faint frames most starts are given up
+            needed = self.schedule.glance if self.end is End.INTEGRATION else self.schedule.start_iterations + 1
         if progress.explained:
             again, needed = len(progress.explained) < self.schedule.averaged, self.schedule.start_iterations
         if again and len(progress.costs) + needed <= self.traits.max_iterations:
