@@ -111,10 +111,19 @@ class Judge:
         verdict = self.verdict(objective, progress.ending)
         return verdict.explained and self.most_starts(verdict) == 1
 
-    def gives_up(self, objective: MyopicObjective, progress: Progress) -> bool:
-        """Return whether it is time to see that the present start is not well ahead of the best earlier one.
+    def least_iterations(self, verdict: Verdict) -> int:
+        """Return how many iterations have to be left for another start if this is the verdict on the best.
 
-        In faint frames, whose residual does not tell, it need not be ahead, but not cost much more either.
+        A start that could be spared is not begun to be cut short, but in faint frames most are given up by then.
+        """
+        if not verdict.explained:
+            return 1
+        return self.schedule.glance if self.end is End.INTEGRATION else self.schedule.start_iterations + 1
+
+    def gives_up(self, objective: MyopicObjective, progress: Progress, *, is_twin: bool) -> bool:
+        """Return whether it is time to see that the present start, if from a twin, is not well ahead of the best.
+
+        In faint frames, whose residual does not tell, any start is given up that costs much more than the best.
         """
         if progress.rival is None or progress.iterations != self.schedule.glance:
             return False
@@ -123,7 +132,7 @@ class Judge:
             above = self._cost(objective, now.state) - self._cost(objective, best.state)
             return above > self.schedule.hopeless * now.state.z.numel()
         left, least = (self.verdict(objective, ending).excess for ending in (now, best))
-        return left >= self.schedule.promising * least
+        return is_twin and left >= self.schedule.promising * least
 
     def _cost(self, objective: MyopicObjective, state: State) -> float:
         """Return the joint cost of object and aberrations, comparable between starts: with the noise as given.

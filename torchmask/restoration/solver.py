@@ -199,8 +199,7 @@ class Solver:
         is_still = distance(place, state.geometry) < schedule.still
         at_rest = is_still and self.judge.is_at_rest(objective, progress, decrease)
         self._look_at_place(progress)
-        may_be_hopeless = self._is_twin(progress) or self.end is End.INTEGRATION
-        if may_be_hopeless and self.judge.gives_up(objective, progress):
+        if self.judge.gives_up(objective, progress, is_twin=self._is_twin(progress)):
             progress.status = Status.GIVEN_UP
             return
         goes_on = (limit := self._limit(progress)) is Status.RUNNING
@@ -268,9 +267,7 @@ class Solver:
         if self.averages and now.explained:
             progress.explained += (progress.ending,)
         again = progress.starts < self.judge.most_starts(verdict) and not progress.alike
-        needed = 1
-        if verdict.explained:  # what could be spared is not cut short; in faint frames most starts are given up
-            needed = self.schedule.glance if self.end is End.INTEGRATION else self.schedule.start_iterations + 1
+        needed = self.judge.least_iterations(verdict)
         if progress.explained:
             again, needed = len(progress.explained) < self.schedule.averaged, self.schedule.start_iterations
         if again and len(progress.costs) + needed <= self.traits.max_iterations:
