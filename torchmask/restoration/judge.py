@@ -131,8 +131,10 @@ class Judge:
         if self.end is End.INTEGRATION:
             above = self._cost(objective, now.state) - self._cost(objective, best.state)
             return above > self.schedule.hopeless * now.state.z.numel()
+        if not is_twin:
+            return False
         left, least = (self.verdict(objective, ending).excess for ending in (now, best))
-        return is_twin and left >= self.schedule.promising * least
+        return left >= self.schedule.promising * least
 
     def _cost(self, objective: MyopicObjective, state: State) -> float:
         """Return the joint cost of object and aberrations, comparable between starts: with the noise as given.
