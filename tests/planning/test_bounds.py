@@ -105,7 +105,7 @@ def test_holes_are_14_samples_wide_unless_told(diameter, finer):
 
 
 def test_finer_samples_change_the_excess_little():
-    """By less than the share that the default allows; by far more from holes of four samples on."""
+    """By less than the share that the default allows, which holes of four samples exceed."""
     coarse, default, fine = (bound(oversampling=finer).ratio - 1 for finer in (2, 7, 14))
     assert abs(default / fine - 1) < 0.04 < abs(coarse / fine - 1)
 
