@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
-from torchmask.design.constraint_base import Constraint, Subspace, all_margins, project
+from torchmask.design.constraint_base import (
+    Constraint,
+    Inequality,
+    LinearEquality,
+    Subspace,
+    all_margins,
+    project,
+)
 from torchmask.optics.aperture import SparseAperture
 
 
@@ -75,12 +84,40 @@ class Holes:
         """Return x (..., F) with one hole, and those tied to it, moved to `position` (..., 2) [mask diameters]."""
         return self.subspace.place(x, hole, self._unroll(position.to(x), 1.0))
 
+    def turned(self, x: Tensor, angle: float, *, over: bool = False) -> Tensor:
+        """Return x (..., F) with the mask turned by `angle` [rad], before that `over`, which mirrors its columns."""
+        return self.coordinates(_turned(self.aperture(x).centers, angle, over=over))
+
+    @cached_property
+    def orientation_matters(self) -> bool:
+        """Whether a mask may be turned, and the inequalities tell it from the mask before, as vanes do."""
+        equalities = [rule for rule in self.constraints if isinstance(rule, LinearEquality)]
+        return all(map(self._is_alike_all_around, equalities)) and len(self.free_to_turn.constraints) < len(
+            self.constraints
+        )
+
+    @cached_property
+    def free_to_turn(self) -> Holes:
+        """The same holes without the constraints that are not alike all around."""
+        return Holes(self.template, [rule for rule in self.constraints if self._is_alike_all_around(rule)])
+
+    def _is_alike_all_around(self, rule: Constraint) -> bool:
+        mask = self.aperture(0.3 * self.subspace.spread())
+        values = rule.margins if isinstance(rule, Inequality) else rule.residuals
+        change = values(mask.replace(centers=_turned(mask.centers, 1.0))) - values(mask)
+        return not bool((change.abs() > 1e-5 * mask.mask_diameter).any())
+
     def feasible(self, x: Tensor, tick: Callable[[], None] | None = None) -> SparseAperture:
         """Return the mask nearest to x (F,) that satisfies all constraints; for `tick` see `project`.
 
         Raises `Infeasible` if none is found.
         """
         return project(self.aperture(x.detach()), self.constraints, tick)
+
+
+def _turned(centers: Tensor, angle: float, *, over: bool = False) -> Tensor:
+    cosine, sine, sign = math.cos(angle), math.sin(angle), -1.0 if over else 1.0
+    return centers @ centers.new_tensor([[sign * cosine, sign * sine], [-sine, cosine]])  # rows are (x, y)
 
 
 class Evaluation(NamedTuple):
@@ -123,7 +160,10 @@ class Merit:
     def value(self, x: Tensor) -> Tensor:
         """Return the merit (P,) without multipliers."""
         with torch.no_grad():
-            aperture = self.holes.aperture(x)
-            shortfall = self.holes.margins(aperture).clamp(max=0)
             self.evaluations += len(x)
-            return self.criterion.relative(aperture).log() + self.weight / 2 * (shortfall**2).sum(-1)
+            return self.penalised(self.criterion.relative(self.holes.aperture(x)), x)
+
+    def penalised(self, relative_mse: Tensor, x: Tensor) -> Tensor:
+        """Return the merit (P,) without multipliers of masks at x (P, F) whose relative MSE (P,) is known."""
+        shortfall = self.holes.margins(self.holes.aperture(x)).clamp(max=0)
+        return relative_mse.log() + self.weight / 2 * (shortfall**2).sum(-1)

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from torchmask.design.merit import Holes
 
+TURNS = 64  # orientations of which the one that breaks the rules least is taken
+
 
 def random_mask(holes: Holes, rng: np.random.Generator) -> Tensor:
     """Draw the coordinates (F,) of a random mask, whose holes may overlap.
@@ -30,10 +32,15 @@ def random_mask(holes: Holes, rng: np.random.Generator) -> Tensor:
 
 
 def changed_mask(holes: Holes, x: Tensor, rng: np.random.Generator) -> Tensor:
-    """Return a start near the mask x (F,), with all holes moved slightly, or one or two moved anywhere."""
-    moved = int(rng.integers(3))
+    """Return a start near the mask x (F,), with all holes moved slightly, or one or two moved anywhere.
+
+    Where rules are not alike all around, the whole mask may be turned instead.
+    """
+    moved = int(rng.integers(3 + holes.orientation_matters))
     if moved == 0:
         return x + 0.03 * torch.as_tensor(rng.standard_normal(len(x)), device="cpu").to(x)
+    if moved == 3:
+        return turned_to_fit(holes, x, rng)
     n = holes.template.n_subapertures
     for hole in rng.choice(n, size=min(n, moved), replace=False):
         radius, angle = holes.radius * rng.random() ** rng.uniform(0, 0.5), 2 * math.pi * rng.random()
@@ -41,3 +48,13 @@ def changed_mask(holes: Holes, x: Tensor, rng: np.random.Generator) -> Tensor:
         # rounded to float32, whatever the default: a seed keeps its result
         x = holes.place(x, int(hole), torch.tensor(place, dtype=torch.float32, device="cpu"))
     return x
+
+
+def turned_to_fit(holes: Holes, x: Tensor, rng: np.random.Generator) -> Tensor:
+    """Return the mask x (F,) turned by one of a few random angles, or over, which breaks the rules least.
+
+    A descent does not turn a mask past a vane, but the error is the same for all orientations.
+    """
+    turns = torch.stack([holes.turned(x, 2 * math.pi * rng.random(), over=rng.random() < 0.5) for _ in range(TURNS)])
+    shortfall = holes.margins(holes.aperture(turns)).clamp(max=0)
+    return turns[int((shortfall**2).sum(-1).argmin())]
