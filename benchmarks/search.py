@@ -44,6 +44,7 @@ TELESCOPES = {
 }
 
 _TRIAL = 0.05  # of the time of a search, which measures what the rest of it buys
+_GROWN = 2.5  # times the time that a quarter of the budget took: most of it then grows with the budget
 
 METHODS: dict[str, dict[str, Any]] = {
     "cma": {"method": "cma", "refine": False},
@@ -154,16 +155,16 @@ def main(config: Config) -> None:
 
 
 def affordable(case: Case, n: int, wanted: float, clock: Callable[[], float], options: dict[str, Any]) -> int:
-    """Evaluations that so many seconds buy, from the times of two budgets, the larger one long enough to tell."""
+    """Evaluations that so many seconds buy, from the times of two budgets, of which the larger takes long enough."""
     budget, before = 320, math.inf
     case.search(n, seed=0, budget=budget, **options)  # first use of everything
     while True:
         start = clock()
         case.search(n, seed=0, budget=budget, **options)
         spent = clock() - start
-        if spent > max(_TRIAL * wanted, 1.5 * before):  # what does not grow with the budget is in both times
+        if spent > max(_TRIAL * wanted, _GROWN * before):  # the gradient stage, in both times, does not grow
             rate = 0.75 * budget / (spent - before)
-            return max(budget, int(budget + rate * (wanted - spent)))
+            return max(1, int(budget + rate * (wanted - spent)))
         budget, before = 4 * budget, spent
 
 
