@@ -100,7 +100,8 @@ def test_aberrations_are_fitted_to_the_mean_object(explained):
 # --- whole restorations
 
 STAGES = ("restoration", "fit to the mean")
-BRISK = {"candidates": ((2, 4),), "segment": 4, "sharp_after": 4, "escapes": 0, "start_iterations": 8, "retrievals": 0}
+BRISK = {"candidates": ((2, 4),), "segment": 4, "sharp_after": 4, "escapes": 0, "start_iterations": 8}
+BRISK |= {"retrievals": 0, "last_segments": 0}
 
 
 def restore(explained, schedule, **given):

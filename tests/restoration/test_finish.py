@@ -7,8 +7,10 @@ import pytest
 import torch
 
 from torchmask.grid import Grid
+from torchmask.metrics import relative_error
 from torchmask.optics.aperture import FullAperture
 from torchmask.optics.band import Band
+from torchmask.restoration import finish
 from torchmask.restoration.aberrations import moving_basis, turbulent_basis
 from torchmask.restoration.background import Background
 from torchmask.restoration.calibration import fit_of_frames
@@ -82,10 +84,12 @@ def test_a_recipe_has_a_finer_basis_if_it_has_more_modes(options, n_modes, five_
         assert torch.allclose(finer.mixing, basis_of(five_holes, 6).mixing)
 
 
-def ended(objective, state, setting, schedule, records=None, minimizer=None, end=End.LAST_DESCENT):
-    progress = Progress(Candidates(state, 1))
+def ended(
+    objective, state, setting, schedule, records=None, minimizer=None, end=End.LAST_DESCENT, traits=TRAITS, finer=None
+):
+    progress = Progress(Candidates(state, 1), finer=finer)
     listen = None if records is None else records.append
-    finisher = Finisher(setting, schedule, minimizer or ProjectedLBFGS(), listen, TRAITS, lambda progress: None)
+    finisher = Finisher(setting, schedule, minimizer or ProjectedLBFGS(), listen, traits, lambda progress: None)
     return finisher.finish(objective, progress, end), progress
 
 
@@ -278,18 +282,20 @@ def test_a_search_need_not_come_to_rest_if_a_last_descent_follows(observe, five_
 @pytest.mark.parametrize(
     ("change", "end"),
     [
-        ({}, End.RETRIEVAL),
-        ({"schedule": Schedule(retrievals=0)}, End.NONE),
+        ({}, End.FULL_PUPIL),
+        ({"schedule": Schedule(retrievals=0)}, End.FULL_PUPIL),
+        ({"schedule": Schedule(last_segments=0)}, End.FULL_PUPIL),
+        ({"schedule": Schedule(retrievals=0, last_segments=0)}, End.NONE),
         ({"schedule": Schedule.plain()}, End.NONE),
         ({"free": Free.OBJECT}, End.NONE),
         ({"free": Free.ABERRATIONS}, End.NONE),
-        ({"band": Band.of([500e-9, 600e-9])}, End.NONE),
+        ({"band": Band.of([500e-9, 600e-9])}, End.FULL_PUPIL),
         ({"prior_on_aberrations": False}, End.NONE),
         ({"estimated": True}, End.NONE),
     ],
 )
-def test_phases_of_a_full_pupil_are_retrieved_where_its_aberrations_are_sought(change, end):
-    """In the light of one wavelength, with the prior of turbulence."""
+def test_more_follows_the_search_of_a_full_pupil_where_its_aberrations_are_sought(change, end):
+    """With the prior of turbulence."""
     grid = Grid.nyquist(1.0, 500e-9, 16)
     model = ExposureModel(FullAperture(1.0), grid, 3, change.get("band"))
     frames = torch.randn(2, 16, 16, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
@@ -300,3 +306,87 @@ def test_phases_of_a_full_pupil_are_retrieved_where_its_aberrations_are_sought(c
     said = {name: change[name] for name in ("prior_on_aberrations", "estimated") if name in change}
     traits = replace(FULL_PUPIL, **said)
     assert Solver(objective, stack, traits, change.get("schedule", Schedule()), ProjectedLBFGS()).end is end
+
+
+def frames_of_a_full_pupil(explain, n_modes=6, band=None, **given):
+    model = ExposureModel(FullAperture(1.0), GRID, basis_of(FullAperture(1.0), n_modes), band)
+    return explain(model, **given)
+
+
+def test_a_full_pupil_has_as_many_modes_in_its_last_descent_as_the_schedule_says(five_holes):
+    schedule = Schedule(last_modes=8, last_modes_full=300)
+    for aperture, n_modes, most in ((FullAperture(1.0), None, 300), (five_holes, None, 8), (FullAperture(1.0), 231, 0)):
+        method = MyopicDeconvolution(aperture, GRID, n_modes, schedule=schedule)
+        assert method.recipe.last_modes == most
+
+
+@pytest.mark.parametrize(("wavelengths", "finer", "n_calls"), [(1, False, 1), (2, False, 0), (1, True, 0)])
+def test_phases_are_retrieved_before_the_last_descent(wavelengths, finer, n_calls, explain, monkeypatch):
+    """In the light of one wavelength, and not again if the last descent has begun."""
+    band = Band.of([500e-9 + 50e-9 * number for number in range(wavelengths)])
+    objective, state = frames_of_a_full_pupil(explain, band=band)
+    calls, records = [], []
+    monkeypatch.setattr(finish, "retrieve_phases", lambda *given, **more: calls.append(len(records)))
+    schedule, how = Schedule(segment=4, last_segments=1), {"end": End.FULL_PUPIL, "traits": FULL_PUPIL}
+    found, progress = ended(
+        objective, state, Setting.of(objective), schedule, records, **how, finer=state if finer else None
+    )
+    assert calls == n_calls * [0]
+    assert [record.stage for record in records] == ["last descent"] * 4
+    assert isinstance(found.prior, SmoothVariation)
+    assert not progress.integrated
+
+
+@pytest.mark.parametrize(("traits", "power"), [(TRAITS, 1), (FULL_PUPIL, 2)])
+def test_frames_of_a_full_pupil_that_fit_badly_count_less(traits, power, explained, monkeypatch):
+    objective, state = explained
+    given = []
+    monkeypatch.setattr(finish, "recalibrate", lambda objective, state, power, **more: given.append(power) or state)
+    ended(objective, state, Setting.of(objective), Schedule(segment=2, last_segments=1), traits=traits)
+    assert given == [power]
+
+
+def test_the_object_of_a_full_pupil_is_settled_before_each_segment(explain):
+    """A descent in object and aberrations leaves what the pupil hardly passes, which makes most of the error.
+
+    Of an object whose finest structure is missing, a segment of a few iterations returns less than a settled one.
+    """
+    objective, state = frames_of_a_full_pupil(explain, noise=1e-4)
+    fine = torch.fft.rfft2(state.image)
+    rows, columns = torch.fft.fftfreq(len(fine)), torch.fft.rfftfreq(state.image.shape[1])
+    fine *= torch.hypot(rows[:, None], columns) < 0.7 * objective.model.cutoff
+    begun = replace(state, image=torch.fft.irfft2(fine, s=state.image.shape).clamp(min=0))
+    schedule, setting = Schedule(segment=4, last_segments=1, last_settling=200, retrievals=0), Setting.of(objective)
+
+    def lost(traits):
+        """Error before the object is settled once more at the end."""
+        _, progress = ended(objective, begun, setting, schedule, end=End.FULL_PUPIL, traits=traits)
+        return relative_error(progress.finer.image, state.image, objective.model.cutoff)
+
+    assert lost(FULL_PUPIL) < 0.5 * lost(TRAITS)
+
+
+def test_an_interrupted_last_descent_of_a_full_pupil_goes_on(observe, tmp_path):
+    """Neither are starts averaged again, nor phases retrieved, and the message tells of both."""
+    seen = observe(FullAperture(1.0), n_frames=3, r0=0.5)
+    options = {"candidates": ((2, 4),), "segment": 4, "sharp_after": 4, "escapes": 0, "start_iterations": 8}
+    options |= {"chance": 1e9, "last_segments": 3, "last_gain": 0.0, "reflections": 2, "retrieved_from": 0.0}
+    schedule = Schedule(**options, retrievals=1, retrieved_gain=math.inf, retrieved_iterations=4)
+    method = MyopicDeconvolution(FullAperture(1.0), seen.grid, 10, readout_noise=1.5, tolerance=0, schedule=schedule)
+    whole = method.restore(seen.frames)
+    assert "the mean object of 3 starts" in whole.message
+    assert "phases were retrieved" in whole.message
+    path = tmp_path / "state.npz"
+
+    def interrupt(record):
+        if (record.stage, record.step) == ("last descent", 6):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        method.restore(seen.frames, checkpoint=path, callback=interrupt)
+    records = []
+    resumed = method.restore(seen.frames, checkpoint=path, callback=records.append)
+    assert [(record.stage, record.step) for record in records] == [("last descent", 5 + i) for i in range(8)]
+    assert torch.equal(resumed.object, whole.object)
+    assert torch.equal(resumed.coefficients, whole.coefficients)
+    assert (resumed.n_evaluations, resumed.message) == (whole.n_evaluations, whole.message)

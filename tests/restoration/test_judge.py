@@ -176,7 +176,7 @@ def test_a_start_that_explains_the_frames_ends_when_nearly_at_rest(explain):
     known, wrong = (Progress(Candidates(found, 1)) for found in (state, replace(state, z=0 * state.z)))
 
     def rests(progress, decrease, end=End.LAST_DESCENT, tolerance=0.001):
-        traits = replace(TRAITS, tolerance=tolerance)
+        traits = replace(TRAITS, tolerance=tolerance, many_minima=end is End.FULL_PUPIL)
         judge = Judge(Setting.of(objective), stack_of(objective), traits, schedule, end)
         return judge.is_at_rest(objective, progress, decrease)
 
@@ -185,6 +185,7 @@ def test_a_start_that_explains_the_frames_ends_when_nearly_at_rest(explain):
     assert not rests(wrong, 0.009)
     assert not rests(known, 0.009, End.NONE)
     assert not rests(known, 0.009, End.INTEGRATION)
+    assert not rests(known, 0.009, End.FULL_PUPIL)
     assert rests(known, 0.011, tolerance=0.02)
     for progress in (known, wrong):
         assert rests(progress, 0.001)

@@ -68,7 +68,7 @@ class Progress:
     finer : state of the last descent, which may have more modes; None before it
     last_segments : number of segments of the last descent that are done; all there may be, once it gains no more
     integrated : whether the aberrations have been integrated out, which is done at the end and not stored
-    averaged : number of starts whose objects have been averaged, likewise
+    averaged : number of starts whose objects have been averaged, before the last descent
     retrieved : whether phases have been retrieved, likewise
     """
 
@@ -130,7 +130,7 @@ class Progress:
         self.status, self.decrease = Status.RUNNING, None
 
 
-_NUMBERS = ("n_evaluations", "escapes", "starts", "began", "alike", "last_segments")
+_NUMBERS = ("n_evaluations", "escapes", "starts", "began", "alike", "last_segments", "averaged", "retrieved")
 # arrays of an ending
 _NEEDED = ("image", "z", "geometry", "modes", "status", *(item.name for item in fields(Calibration)))
 

@@ -42,12 +42,11 @@ class Finisher:
     def finish(self, objective: MyopicObjective, ended: Progress, end: End) -> MyopicObjective:
         """Update `ended`, and return the objective of its state."""
         how = (self.schedule, self.minimizer, self.callback)
-        if end is End.RETRIEVAL:
+        if end is End.FULL_PUPIL and ended.finer is None and objective.model.pupil.n_rasters == 1:
             retrieve_phases(objective, ended, *how, follow_r0=self.traits.r0_is_open)
-            return objective
         if end.descends:
             objective = self._descend(objective, ended)
-        if end is not End.LAST_DESCENT:
+        if end.integrates:
             rounds = self.schedule.fine_rounds if end.descends else self.schedule.rounds
             known = {"seed": self.traits.seed, "follow_r0": self.traits.r0_is_open}
             ended.state, spent = integrate_aberrations(objective, ended.state, rounds, *how, **known)
@@ -62,6 +61,7 @@ class Finisher:
         objective = self.setting.objective_at(objective, state).with_changes(prior=objective.prior.smoother())
         most, done = (number * schedule.segment for number in (schedule.last_segments, ended.last_segments))
         report, costs = ended.reporter("last descent", most, self.callback, done), []
+        power = 2 if self.traits.many_minima else 1
 
         def listen(cost: float, evaluations: int, variables: Variables) -> None:
             costs.append(cost)
@@ -70,7 +70,9 @@ class Finisher:
         while ended.last_segments < schedule.last_segments:
             costs.clear()
             if schedule.recalibrates:
-                state = recalibrate(objective, state, power=1, follow_r0=self.traits.r0_is_open)
+                state = recalibrate(objective, state, power, follow_r0=self.traits.r0_is_open)
+            if self.traits.many_minima:
+                state = settle(objective, state, schedule.last_settling)
             state = descend(objective, state, schedule.segment, self.minimizer, listen)
             gains = bool(costs) and costs[len(costs) // 2] - costs[-1] > schedule.last_gain * abs(costs[-1])
             ended.finer, ended.last_segments = state, ended.last_segments + 1 if gains else schedule.last_segments

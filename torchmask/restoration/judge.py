@@ -106,7 +106,7 @@ class Judge:
         """
         if decrease <= self.traits.tolerance:
             return True
-        if not self.end.descends or decrease > self.schedule.nearly_at_rest:
+        if not self.end.descends or self.traits.many_minima or decrease > self.schedule.nearly_at_rest:
             return False
         verdict = self.verdict(objective, progress.ending)
         return verdict.explained and self.most_starts(verdict) == 1

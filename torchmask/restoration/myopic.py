@@ -157,7 +157,7 @@ class MyopicDeconvolution:
             grid,
             Band.of([grid.wavelength] if wavelengths is None else wavelengths, weights),
             frame_modes=(FULL_MODES if self.many_minima else 6) if n_modes is None else n_modes,
-            last_modes=self.schedule.last_modes if n_modes is None and not self.many_minima else 0,
+            last_modes=self.schedule.most_modes(self.many_minima) if n_modes is None else 0,
             static_modes=static_modes,
             # The holes of a mask are usually about r0 wide; a full pupil that needs a restoration spans several r0.
             r0=aperture.subaperture_diameter / (7 if self.many_minima else 1) if r0 is None else r0,

@@ -86,6 +86,7 @@ class Schedule:
     settling : maximum number of iterations that fit the object in a round
     last_settling : maximum number of iterations that fit it after the last descent
     last_modes : number of modes of each sub-aperture of a mask in the last descent of frames that are not faint
+    last_modes_full : number of modes of a full pupil in its last descent
     last_segments : maximum number of segments of that descent; 0: there is none
     last_gain : it ends when the second half of a segment lowers the cost by less than this fraction
     retrievals : for a full pupil, maximum number of rounds of phase retrieval at the end; 0: there is none
@@ -140,6 +141,7 @@ class Schedule:
     settling: int = 30
     last_settling: int = 80
     last_modes: int = 28
+    last_modes_full: int = 351
     last_segments: int = 20
     last_gain: float = 0.003
     retrievals: int = 3
@@ -190,6 +192,7 @@ class Schedule:
             averaged=1,
             faint=0.0,
             last_modes=0,
+            last_modes_full=0,
             last_segments=0,
             retrievals=0,
             misplaced_gain=math.inf,
@@ -199,6 +202,15 @@ class Schedule:
     def n_candidates(self) -> int:
         """Number of candidates at the beginning of a tournament; 1 without a tournament."""
         return self.candidates[0][0] if self.candidates else 1
+
+    @property
+    def finishes_full_pupils(self) -> bool:
+        """Whether anything follows the search of a full pupil."""
+        return self.retrievals > 0 or self.last_segments > 0
+
+    def most_modes(self, of_full_pupil: bool) -> int:
+        """Return the number of modes of each sub-aperture in the last descent."""
+        return self.last_modes_full if of_full_pupil else self.last_modes
 
     def stage_iterations(self, n_candidates: int) -> int:
         """Return the number of iterations of the stage with this number of candidates."""

@@ -7,7 +7,8 @@ to the residual of the model, if that is larger. Once the object is sharp, frame
 when nothing changes any more, each frame is weighted by how well it fits. A start ends when a segment gains nothing, or
 little if it explains the frames, or its iterations are used up. If its verdict is that it missed the object, or in
 faint frames, others start, from random aberrations or, for a mask, from twins of the object, and the best is kept. Then
-aberrations of faint frames are integrated out, those of others gain modes; full pupils average and retrieve phases.
+aberrations of faint frames are integrated out, those of others gain modes; full pupils average and retrieve phases
+before they do.
 """
 
 from __future__ import annotations
@@ -94,9 +95,8 @@ class Solver:
         is_open = traits.prior_on_aberrations and Free.OBJECT | Free.ABERRATIONS in objective.free
         many_ends = is_open and traits.many_minima and not traits.estimated
         self.averages: bool = many_ends and schedule.averaged > 1
-        retrieves = many_ends and schedule.retrievals > 0 and objective.model.pupil.n_rasters == 1
         of_mask = End.of(stack.change, schedule) if is_open and not traits.many_minima else End.NONE
-        self.end: End = End.RETRIEVAL if retrieves else of_mask
+        self.end: End = End.FULL_PUPIL if many_ends and schedule.finishes_full_pupils else of_mask
         self.judge: Judge = Judge(self.setting, stack, traits, schedule, self.end)
 
     def solve(self, known: Known, start: RestorationResult | None = None, file: Checkpoint | None = None) -> Progress:
@@ -113,7 +113,7 @@ class Solver:
         may_start_again = blind and self.traits.prior_on_aberrations and len(self.objective.frames) > 1
         ended = self.run(begun, may_start_again, save := save_nothing if file is None else file.save)
         cut_short = ended.status is Status.ITERATION_LIMIT  # it may go on from its file, which the end leaves as it is
-        if len(ended.explained) > 1:
+        if len(ended.explained) > 1 and ended.finer is None:
             average_starts(self.objective, ended, self.schedule, self.minimizer, self.callback)
         if self.end is not End.NONE and (ended.starts > 1 or not cut_short):
             how = (self.schedule, self.minimizer, self.callback, self.traits, save_nothing if cut_short else save)

@@ -17,7 +17,7 @@ class End(Enum):
     INTEGRATION = "the aberrations of faint frames are integrated out"
     LAST_DESCENT = "object and aberrations descend once more, with more modes"
     BOTH = "the aberrations of noisy frames are integrated out after a last descent"
-    RETRIEVAL = "the phases of frames of a full pupil are retrieved for the sharp object"
+    FULL_PUPIL = "phases of frames of a full pupil are retrieved for the sharp object, and a last descent follows"
 
     @classmethod
     def of(cls, change: float, schedule: Schedule) -> End:
@@ -31,7 +31,12 @@ class End(Enum):
     @property
     def descends(self) -> bool:
         """Whether a last descent follows."""
-        return self in (End.LAST_DESCENT, End.BOTH)
+        return self in (End.LAST_DESCENT, End.BOTH, End.FULL_PUPIL)
+
+    @property
+    def integrates(self) -> bool:
+        """Whether the aberrations are integrated out."""
+        return self in (End.INTEGRATION, End.BOTH)
 
 
 class Refinement(Enum):
