@@ -84,7 +84,7 @@ class Schedule:
     move_size : size of the first moves, in standard deviations of Laplace's approximation
     renewal : number of rounds after which that approximation is recomputed
     settling : maximum number of iterations that fit the object in a round
-    last_settling : maximum number of iterations that fit it after the last descent
+    last_settling : the same after the last descent, and for a full pupil before each of its segments
     last_modes : number of modes of each sub-aperture of a mask in the last descent of frames that are not faint
     last_modes_full : number of modes of a full pupil in its last descent
     last_segments : maximum number of segments of that descent; 0: there is none
