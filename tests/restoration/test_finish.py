@@ -346,6 +346,21 @@ def test_frames_of_a_full_pupil_that_fit_badly_count_less(traits, power, explain
     assert given == [power]
 
 
+@pytest.mark.parametrize(("traits", "kept"), [(TRAITS, True), (FULL_PUPIL, False)])
+def test_a_last_descent_that_loses_frames_of_a_full_pupil_is_not_kept(traits, kept, explained):
+    objective, state = explained
+
+    def loses(cost, start, lower, *, max_iterations, callback):
+        """A minimiser that brings object and aberrations to zero."""
+        return Minimum(torch.zeros_like(start), 1.0, 1, 1, False, "says so")
+
+    schedule = Schedule(segment=2, last_segments=1)
+    found, progress = ended(objective, state, Setting.of(objective), schedule, minimizer=loses, traits=traits)
+    assert (progress.state is state) is not kept
+    assert (found is objective) is not kept
+    assert progress.last_segments == 1  # it is not run again
+
+
 def test_the_object_of_a_full_pupil_is_settled_before_each_segment(explain):
     """A descent in object and aberrations leaves what the pupil hardly passes, which makes most of the error.
 

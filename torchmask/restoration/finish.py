@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from torchmask.record import Callback
-from torchmask.restoration.calibration import recalibrate
+from torchmask.restoration.calibration import calibrate, recalibrate
 from torchmask.restoration.checkpoint import Progress
 from torchmask.restoration.descent import Variables, descend
 from torchmask.restoration.escapes import settle
@@ -24,6 +24,7 @@ from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.retrieval import retrieve_phases
 from torchmask.restoration.schedule import Schedule
+from torchmask.restoration.state import State
 from torchmask.restoration.traits import End, Traits
 
 
@@ -57,8 +58,12 @@ class Finisher:
         return objective
 
     def _descend(self, objective: MyopicObjective, ended: Progress) -> MyopicObjective:
-        """Run the last descent, with the same effects."""
-        schedule = self.schedule
+        """Run the last descent, with the same effects.
+
+        There are none where it leaves more of a full pupil's frames unexplained: those in poor minima count little, and
+        it may give up too many of them.
+        """
+        schedule, first = self.schedule, objective
         state = self.setting.in_finer_modes(ended.state) if ended.finer is None else ended.finer
         objective = self.setting.objective_at(objective, state).with_changes(prior=objective.prior.smoother())
         most, done = (number * schedule.segment for number in (schedule.last_segments, ended.last_segments))
@@ -80,5 +85,13 @@ class Finisher:
             ended.finer, ended.last_segments = state, ended.last_segments + 1 if gains else schedule.last_segments
             self.save(ended)
         # a descent moves flat parts of the object slowly
-        ended.state = settle(objective, state, schedule.last_settling)
+        state = settle(objective, state, schedule.last_settling)
+        if self.traits.many_minima and _chi_square(objective, state) > _chi_square(first, ended.state):
+            return first
+        ended.state = state
         return objective
+
+
+def _chi_square(objective: MyopicObjective, state: State) -> float:
+    """Return the mean chi-square of the frames, at least 1 for each."""
+    return float(calibrate(objective, state).calibration.noise_inflation.mean())
