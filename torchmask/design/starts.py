@@ -53,7 +53,7 @@ def changed_mask(holes: Holes, x: Tensor, rng: np.random.Generator) -> Tensor:
 def turned_to_fit(holes: Holes, x: Tensor, rng: np.random.Generator) -> Tensor:
     """Return the mask x (F,) turned by one of a few random angles, or over, which breaks the rules least.
 
-    A descent does not turn a mask past a vane, but the error is the same for all orientations.
+    A descent does not turn a mask past a vane, and to most criteria its orientation does not matter.
     """
     turns = torch.stack([holes.turned(x, 2 * math.pi * rng.random(), over=rng.random() < 0.5) for _ in range(TURNS)])
     shortfall = holes.margins(holes.aperture(turns)).clamp(max=0)
