@@ -182,7 +182,8 @@ VANE = KeepOutSegment((0.0, 0.0), (0.5, 0.0), 0.02)
 @pytest.mark.parametrize(("angle", "over"), [(0.7, False), (-2.0, True), (0.0, True)])
 def test_a_mask_is_turned_and_mirrored(angle, over):
     holes = holes_of(3)
-    turned = holes.aperture(holes.turned(coordinates(holes, TRIANGLE), angle, over=over)).centers
+    given = torch.tensor([angle], dtype=torch.float64), torch.tensor([over])
+    (turned,) = holes.aperture(holes.turned(coordinates(holes, TRIANGLE), *given)).centers
     x, y = TRIANGLE.T * np.array([[-1 if over else 1], [1]])
     expected = np.stack([x * math.cos(angle) - y * math.sin(angle), x * math.sin(angle) + y * math.cos(angle)], axis=1)
     assert np.abs(turned.numpy() - expected).max() < 1e-12
@@ -212,6 +213,19 @@ def test_masks_are_turned_where_rules_are_not_alike_all_around(rules, matters, k
     # A turned mask, and no other start, has all separations as they were.
     kept_shape = [float((torch.pdist(start) - torch.pdist(centers)).abs().max()) < 1e-9 for start in moved]
     assert any(kept_shape) is matters
+
+
+def test_a_symmetry_that_orders_holes_one_way_round_is_not_mirrored():
+    """The mirrored orbit runs the other way, and the nearest symmetric mask has all holes in the middle."""
+    template = SparseAperture(torch.zeros(3, 2, dtype=torch.float64), 0.1, 1.0)
+    free, ordered = (Holes(template, (InsideDisc(), VANE, *rules)) for rules in ((), (NFoldSymmetry(3),)))
+    assert free.may_be_mirrored
+    assert not ordered.may_be_mirrored
+    x = ordered.coordinates(torch.as_tensor(TRIANGLE))
+    radii = ordered.aperture(x).centers.norm(dim=1)
+    for seed in range(8):
+        turned = ordered.aperture(turned_to_fit(ordered, x, np.random.default_rng(seed))).centers
+        torch.testing.assert_close(turned.norm(dim=1), radii)
 
 
 def test_a_mask_is_turned_to_where_it_breaks_the_rules_least():

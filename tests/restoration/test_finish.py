@@ -10,7 +10,7 @@ from torchmask.grid import Grid
 from torchmask.metrics import relative_error
 from torchmask.optics.aperture import FullAperture
 from torchmask.optics.band import Band
-from torchmask.restoration import finish
+from torchmask.restoration import finish, myopic
 from torchmask.restoration.aberrations import moving_basis, turbulent_basis
 from torchmask.restoration.background import Background
 from torchmask.restoration.calibration import fit_of_frames
@@ -337,6 +337,15 @@ def test_phases_are_retrieved_before_the_last_descent(wavelengths, finer, n_call
     assert not progress.integrated
 
 
+def test_a_full_pupil_without_last_segments_ends_with_its_phases(explain):
+    objective, state = frames_of_a_full_pupil(explain)
+    schedule = Schedule(last_segments=0, retrievals=0)
+    setting = Setting.of(objective, finer=lambda: pytest.fail("it was made"))
+    found, progress = ended(objective, state, setting, schedule, end=End.FULL_PUPIL, traits=FULL_PUPIL)
+    assert found is objective
+    assert progress.state is state
+
+
 @pytest.mark.parametrize(("traits", "power"), [(TRAITS, 1), (FULL_PUPIL, 2)])
 def test_frames_of_a_full_pupil_that_fit_badly_count_less(traits, power, explained, monkeypatch):
     objective, state = explained
@@ -358,7 +367,6 @@ def test_a_last_descent_that_loses_frames_of_a_full_pupil_is_not_kept(traits, ke
     found, progress = ended(objective, state, Setting.of(objective), schedule, minimizer=loses, traits=traits)
     assert (progress.state is state) is not kept
     assert (found is objective) is not kept
-    assert progress.last_segments == 1  # it is not run again
 
 
 def test_the_object_of_a_full_pupil_is_settled_before_each_segment(explain):
@@ -381,13 +389,14 @@ def test_the_object_of_a_full_pupil_is_settled_before_each_segment(explain):
     assert lost(FULL_PUPIL) < 0.5 * lost(TRAITS)
 
 
-def test_an_interrupted_last_descent_of_a_full_pupil_goes_on(observe, tmp_path):
+def test_an_interrupted_last_descent_of_a_full_pupil_goes_on(observe, tmp_path, monkeypatch):
     """Neither are starts averaged again, nor phases retrieved, and the message tells of both."""
     seen = observe(FullAperture(1.0), n_frames=3, r0=0.5)
+    monkeypatch.setattr(myopic, "FULL_MODES", 10)
     options = {"candidates": ((2, 4),), "segment": 4, "sharp_after": 4, "escapes": 0, "start_iterations": 8}
     options |= {"chance": 1e9, "last_segments": 3, "last_gain": 0.0, "reflections": 2, "retrieved_from": 0.0}
-    schedule = Schedule(**options, retrievals=1, retrieved_gain=math.inf, retrieved_iterations=4)
-    method = MyopicDeconvolution(FullAperture(1.0), seen.grid, 10, readout_noise=1.5, tolerance=0, schedule=schedule)
+    schedule = Schedule(**options, retrievals=1, retrieved_gain=math.inf, retrieved_iterations=4, last_modes_full=15)
+    method = MyopicDeconvolution(FullAperture(1.0), seen.grid, readout_noise=1.5, tolerance=0, schedule=schedule)
     whole = method.restore(seen.frames)
     assert "the mean object of 3 starts" in whole.message
     assert "phases were retrieved" in whole.message

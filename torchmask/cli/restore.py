@@ -64,7 +64,7 @@ class Options(BandOptions, StackOptions, OIFITSOptions, WorkerOptions, RunOption
     outer_scale: float | None = None
     """Outer scale of the turbulence [m]; None: 20 mask diameters."""
     n_modes: int | None = None
-    """Number of Zernike modes per hole, from Noll mode 1 (piston); None: 6, more at the end, or 231 for a full
+    """Number of Zernike modes per hole, from Noll mode 1 (piston); None: 6, or 231 for a full
     pupil."""
     static_modes: int = 0
     """Number of Zernike modes per hole for aberrations that all frames share, such as those of the telescope."""

@@ -52,7 +52,7 @@ def basin_hopping(
     """Return the best few local optima (n, F), best first, and the number of evaluations used, at most `budget`.
 
     Where rules are not alike all around, such as those on vanes, half of the budget goes to masks without them, which
-    are then turned to where they break them least: a mask that has to go through vanes to be found is not found.
+    are then turned to where they break them least, as descents carry no hole across a vane.
     """
     merit, spent = Merit(criterion, holes, WEIGHT), 0
     starts: list[Tensor] = []

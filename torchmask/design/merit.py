@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import NamedTuple, Protocol
@@ -84,27 +83,32 @@ class Holes:
         """Return x (..., F) with one hole, and those tied to it, moved to `position` (..., 2) [mask diameters]."""
         return self.subspace.place(x, hole, self._unroll(position.to(x), 1.0))
 
-    def turned(self, x: Tensor, angle: float, *, over: bool = False) -> Tensor:
-        """Return x (..., F) with the mask turned by `angle` [rad], before that `over`, which mirrors its columns."""
-        return self.coordinates(_turned(self.aperture(x).centers, angle, over=over))
+    def turned(self, x: Tensor, angle: Tensor, over: Tensor) -> Tensor:
+        """Return the masks (T, F): x (F,) mirrored left to right where `over` (T,), then turned by `angle` (T,) [rad]."""
+        return self.coordinates(_turned(self.aperture(x).centers, angle.to(x), over))
 
     @cached_property
     def orientation_matters(self) -> bool:
-        """Whether a mask may be turned, and the inequalities tell it from the mask before, as vanes do."""
-        equalities = [rule for rule in self.constraints if isinstance(rule, LinearEquality)]
-        return all(map(self._is_alike_all_around, equalities)) and len(self.free_to_turn.constraints) < len(
-            self.constraints
-        )
+        """Whether a mask may be turned, and some inequality changes when it is, as those on vanes do."""
+        may_turn = all(self._is_alike(rule) for rule in self.constraints if isinstance(rule, LinearEquality))
+        return may_turn and len(self.free_to_turn.constraints) < len(self.constraints)
+
+    @cached_property
+    def may_be_mirrored(self) -> bool:
+        """Whether the equalities also hold for the mirrored mask; those of a symmetry order the holes one way round."""
+        return all(self._is_alike(rule, over=True) for rule in self.constraints if isinstance(rule, LinearEquality))
 
     @cached_property
     def free_to_turn(self) -> Holes:
         """The same holes without the constraints that are not alike all around."""
-        return Holes(self.template, [rule for rule in self.constraints if self._is_alike_all_around(rule)])
+        return Holes(self.template, [rule for rule in self.constraints if self._is_alike(rule)])
 
-    def _is_alike_all_around(self, rule: Constraint) -> bool:
+    def _is_alike(self, rule: Constraint, *, over: bool = False) -> bool:
+        """Return whether a rule takes a mask for the same one turned, and before that mirrored if `over`."""
         mask = self.aperture(0.3 * self.subspace.spread())
         values = rule.margins if isinstance(rule, Inequality) else rule.residuals
-        change = values(mask.replace(centers=_turned(mask.centers, 1.0))) - values(mask)
+        turned = _turned(mask.centers, mask.centers.new_ones(1), torch.tensor([over]))[0]
+        change = values(mask.replace(centers=turned)) - values(mask)
         return not bool((change.abs() > 1e-5 * mask.mask_diameter).any())
 
     def feasible(self, x: Tensor, tick: Callable[[], None] | None = None) -> SparseAperture:
@@ -115,9 +119,11 @@ class Holes:
         return project(self.aperture(x.detach()), self.constraints, tick)
 
 
-def _turned(centers: Tensor, angle: float, *, over: bool = False) -> Tensor:
-    cosine, sine, sign = math.cos(angle), math.sin(angle), -1.0 if over else 1.0
-    return centers @ centers.new_tensor([[sign * cosine, sign * sine], [-sine, cosine]])  # rows are (x, y)
+def _turned(centers: Tensor, angle: Tensor, over: Tensor) -> Tensor:
+    """Return the centres (T, N, 2) of a mask (N, 2), mirrored and turned as by `Holes.turned`."""
+    cosine, sine, sign = angle.cos(), angle.sin(), 1 - 2 * over.to(angle)
+    rows = torch.stack([sign * cosine, sign * sine, -sine, cosine], dim=-1)
+    return centers @ rows.unflatten(-1, (2, 2))
 
 
 class Evaluation(NamedTuple):

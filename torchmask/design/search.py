@@ -51,6 +51,8 @@ def search_mask(
     method : {"hybrid", "cma"}
         "cma" is CMA-ES with penalties, the published method. "hybrid" makes batched quasi-Newton descents from random
         masks, then basin hopping on a pool of the best, on a coarse frequency grid; it is better in the same time.
+        Where constraints are not alike all around, such as those on vanes, half of its budget goes to masks without
+        them, which it then turns into place.
     refine : bool
         Whether to end with a gradient stage on the grid of `criterion`. Otherwise the best mask of the search is only
         projected onto the constraints.

@@ -55,6 +55,7 @@ def turned_to_fit(holes: Holes, x: Tensor, rng: np.random.Generator) -> Tensor:
 
     A descent does not turn a mask past a vane, and to most criteria its orientation does not matter.
     """
-    turns = torch.stack([holes.turned(x, 2 * math.pi * rng.random(), over=rng.random() < 0.5) for _ in range(TURNS)])
+    turn, over = torch.as_tensor(rng.random((TURNS, 2)), device="cpu").T.to(x)
+    turns = holes.turned(x, 2 * math.pi * turn, (over < 0.5) & holes.may_be_mirrored)
     shortfall = holes.margins(holes.aperture(turns)).clamp(max=0)
     return turns[int((shortfall**2).sum(-1).argmin())]

@@ -47,7 +47,7 @@ class Finisher:
         how = (self.schedule, self.minimizer, self.callback)
         if end is End.FULL_PUPIL and ended.finer is None and objective.model.pupil.n_rasters == 1:
             retrieve_phases(objective, ended, *how, follow_r0=self.traits.r0_is_open)
-        if end.descends:
+        if end.descends and self.schedule.last_segments:
             objective = self._descend(objective, ended)
         if end.integrates:
             rounds = self.schedule.fine_rounds if end.descends else self.schedule.rounds
@@ -60,8 +60,8 @@ class Finisher:
     def _descend(self, objective: MyopicObjective, ended: Progress) -> MyopicObjective:
         """Run the last descent, with the same effects.
 
-        There are none where it leaves more of a full pupil's frames unexplained: those in poor minima count little, and
-        it may give up too many of them.
+        For a full pupil its result is dropped if the mean chi-square rises: frames in poor minima count little in it,
+        so that it may give up too many of them.
         """
         schedule, first = self.schedule, objective
         state = self.setting.in_finer_modes(ended.state) if ended.finer is None else ended.finer

@@ -102,7 +102,7 @@ class Judge:
     def is_at_rest(self, objective: MyopicObjective, progress: Progress, decrease: float) -> bool:
         """Return whether the present start is at rest, its last segment having lowered the cost by the part `decrease`.
 
-        If it explains the frames beyond doubt and a last descent goes on from it, it need not quite be.
+        If it explains a mask's frames beyond doubt and a last descent goes on from it, it need not quite be.
         """
         if decrease <= self.traits.tolerance:
             return True

@@ -45,7 +45,7 @@ class MyopicDeconvolution:
 
     starting from the clipped mean frame, with the best-fitting background b_t. `torchmask.restoration.solver` describes
     the algorithm: how it updates the noise sigma and the transmissions g_t, and how it escapes from local minima.
-    `torchmask.restoration.finish` describes the end for a mask, which depends on how faint the frames are.
+    `torchmask.restoration.finish` describes the end, which for a mask depends on how faint the frames are.
 
     Parameters
     ----------
@@ -54,8 +54,8 @@ class MyopicDeconvolution:
     grid : Grid
         Grid of the frames.
     n_modes : int, optional
-        Number of Zernike modes per sub-aperture, from Noll index 1. None: 231 for a full pupil, 6 for a mask; unless
-        frames are faint, its last descent then has `Schedule.last_modes`, of which the result holds the first 6.
+        Number of Zernike modes per sub-aperture, from Noll index 1. None: 231 for a full pupil, 6 for a mask. The last
+        descent, if there is one, then has more (`Schedule.last_modes`), of which the result holds these first ones.
     r0 : float, optional
         Fried parameter of the turbulence [m]. None: it is estimated from the restored aberrations.
     outer_scale : float, optional
@@ -89,7 +89,7 @@ class MyopicDeconvolution:
     aberration_prior : bool
         False: leave out 1/2 ||z||^2; z are then the Zernike coefficients themselves.
     max_iterations : int
-        Maximum number over all starts, each of at most 1000; the object behind a full pupil is the mean of three. Faint
+        Maximum number over all starts, each of at most 1000; that of a full pupil is first the mean of three. Faint
         frames through a mask get three too, and up to nine are made while none explains the frames; the best is kept.
     tolerance : float
         A start has converged when 100 iterations gain less than this part of the cost (see `Schedule.nearly_at_rest`).

@@ -55,7 +55,7 @@ class ObjectPrior(nn.Module):
         return self
 
     def smoother(self) -> ObjectPrior:
-        """Return the prior for the last descent of bright frames: the same one where it knows none."""
+        """Return the prior for the last descent: the same one where it knows none."""
         return self
 
 

@@ -63,7 +63,7 @@ class Schedule:
     promising : a twin is, unless its excess chi-square is below this fraction of that of the best start so far
     hopeless : a start in faint frames is, if its cost exceeds that of the best so far by more than this for each
         aberration of all frames
-    averaged : for a full pupil, number of starts that explain the frames, the mean of whose objects is the result
+    averaged : for a full pupil, number of starts that explain the frames, from the mean of whose objects the end begins
     alike : relative difference of the excess chi-square of two starts of a full pupil below which they are the same
     outlying : a frame is outlying if its residual variance is larger than this number times that of well-fitted frames
     restarts : number of random starts of the aberrations of an outlying frame
@@ -86,7 +86,7 @@ class Schedule:
     settling : maximum number of iterations that fit the object in a round
     last_settling : the same after the last descent, and for a full pupil before each of its segments
     last_modes : number of modes of each sub-aperture of a mask in the last descent of frames that are not faint
-    last_modes_full : number of modes of a full pupil in its last descent
+    last_modes_full : the same of a full pupil, however faint
     last_segments : maximum number of segments of that descent; 0: there is none
     last_gain : it ends when the second half of a segment lowers the cost by less than this fraction
     retrievals : for a full pupil, maximum number of rounds of phase retrieval at the end; 0: there is none

@@ -7,8 +7,8 @@ to the residual of the model, if that is larger. Once the object is sharp, frame
 when nothing changes any more, each frame is weighted by how well it fits. A start ends when a segment gains nothing, or
 little if it explains the frames, or its iterations are used up. If its verdict is that it missed the object, or in
 faint frames, others start, from random aberrations or, for a mask, from twins of the object, and the best is kept. Then
-aberrations of faint frames are integrated out, those of others gain modes; full pupils average and retrieve phases
-before they do.
+aberrations of faint frames are integrated out, those of others gain modes. The starts of a full pupil are averaged and
+its phases retrieved first, then it gains modes too.
 """
 
 from __future__ import annotations
