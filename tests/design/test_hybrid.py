@@ -218,7 +218,8 @@ def test_masks_are_turned_where_rules_are_not_alike_all_around(rules, matters, k
 def test_a_symmetry_that_orders_holes_one_way_round_is_not_mirrored():
     """The mirrored orbit runs the other way, and the nearest symmetric mask has all holes in the middle."""
     template = SparseAperture(torch.zeros(3, 2, dtype=torch.float64), 0.1, 1.0)
-    free, ordered = (Holes(template, (InsideDisc(), VANE, *rules)) for rules in ((), (NFoldSymmetry(3),)))
+    wide = KeepOutSegment((0.25, 0.0), (0.5, 0.0), 0.3)  # which nearly every mask breaks, but not holes in the middle
+    free, ordered = (Holes(template, (InsideDisc(), wide, *rules)) for rules in ((), (NFoldSymmetry(3),)))
     assert free.may_be_mirrored
     assert not ordered.may_be_mirrored
     x = ordered.coordinates(torch.as_tensor(TRIANGLE))

@@ -84,7 +84,7 @@ class Holes:
         return self.subspace.place(x, hole, self._unroll(position.to(x), 1.0))
 
     def turned(self, x: Tensor, angle: Tensor, over: Tensor) -> Tensor:
-        """Return the masks (T, F): x (F,) mirrored left to right where `over` (T,), then turned by `angle` (T,) [rad]."""
+        """Return masks (T, F): x (F,), mirrored left to right where `over` (T,), then turned by `angle` (T,) [rad]."""
         return self.coordinates(_turned(self.aperture(x).centers, angle.to(x), over))
 
     @cached_property
