@@ -107,7 +107,7 @@ class Holes:
         """Return whether a rule takes a mask for the same one turned, and before that mirrored if `over`."""
         mask = self.aperture(0.3 * self.subspace.spread())
         values = rule.margins if isinstance(rule, Inequality) else rule.residuals
-        turned = _turned(mask.centers, mask.centers.new_ones(1), torch.tensor([over]))[0]
+        turned = _turned(mask.centers, mask.centers.new_ones(1), mask.centers.new_tensor([over], dtype=torch.bool))[0]
         change = values(mask.replace(centers=turned)) - values(mask)
         return not bool((change.abs() > 1e-5 * mask.mask_diameter).any())
 
