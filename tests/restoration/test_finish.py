@@ -203,6 +203,17 @@ def test_a_result_holds_the_modes_of_the_search(observe, five_holes):
     assert "TotalVariation" in known.prior
 
 
+def interrupt_last_descent(method, frames, path, step):
+    """Leave the checkpoint of a restoration that is interrupted at this step of its last descent."""
+
+    def interrupt(record):
+        if (record.stage, record.step) == ("last descent", step):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        method.restore(frames, checkpoint=path, callback=interrupt)
+
+
 def test_an_interrupted_last_descent_goes_on(observe, five_holes, tmp_path):
     """After its first segment; what has ended is not done again."""
     seen = observe(n_frames=2, shape=(32, 32))
@@ -210,14 +221,7 @@ def test_an_interrupted_last_descent_goes_on(observe, five_holes, tmp_path):
     schedule = Schedule(**options, last_segments=3, last_gain=0.0)
     method = MyopicDeconvolution(five_holes, seen.grid, readout_noise=1.5, schedule=schedule)
     whole = method.restore(seen.frames)
-    path = tmp_path / "state.npz"
-
-    def interrupt(record):
-        if (record.stage, record.step) == ("last descent", 15):
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        method.restore(seen.frames, checkpoint=path, callback=interrupt)
+    interrupt_last_descent(method, seen.frames, path := tmp_path / "state.npz", 15)
     records = []
     for n_left in (20, 0):
         resumed = method.restore(seen.frames, checkpoint=path, callback=records.append)
@@ -400,14 +404,7 @@ def test_an_interrupted_last_descent_of_a_full_pupil_goes_on(observe, tmp_path, 
     whole = method.restore(seen.frames)
     assert "the mean object of 3 starts" in whole.message
     assert "phases were retrieved" in whole.message
-    path = tmp_path / "state.npz"
-
-    def interrupt(record):
-        if (record.stage, record.step) == ("last descent", 6):
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        method.restore(seen.frames, checkpoint=path, callback=interrupt)
+    interrupt_last_descent(method, seen.frames, path := tmp_path / "state.npz", 6)
     records = []
     resumed = method.restore(seen.frames, checkpoint=path, callback=records.append)
     assert [(record.stage, record.step) for record in records] == [("last descent", 5 + i) for i in range(8)]

@@ -60,7 +60,8 @@ def basin_hopping(
         free = Merit(criterion, holes.free_to_turn, WEIGHT)
 
         def tell(found: Evaluation, x: Tensor) -> None:
-            monitor.update(free.evaluations, merit.penalised(found.relative_mse, x), found.relative_mse, x)
+            under_all = merit.penalised(found.relative_mse, holes.aperture(x))
+            monitor.update(free.evaluations, under_all, found.relative_mse, x)
 
         shapes = _hop(free, share, [], rng, tell).entries
         starts = [turned_to_fit(holes, x, rng) for _, x, _ in shapes for _ in range(TURNED)]

@@ -166,10 +166,11 @@ class Merit:
     def value(self, x: Tensor) -> Tensor:
         """Return the merit (P,) without multipliers."""
         with torch.no_grad():
+            aperture = self.holes.aperture(x)
             self.evaluations += len(x)
-            return self.penalised(self.criterion.relative(self.holes.aperture(x)), x)
+            return self.penalised(self.criterion.relative(aperture), aperture)
 
-    def penalised(self, relative_mse: Tensor, x: Tensor) -> Tensor:
-        """Return the merit (P,) without multipliers of masks at x (P, F) whose relative MSE (P,) is known."""
-        shortfall = self.holes.margins(self.holes.aperture(x)).clamp(max=0)
+    def penalised(self, relative_mse: Tensor, aperture: SparseAperture) -> Tensor:
+        """Return the merit (P,) without multipliers of P masks whose relative MSE (P,) is known."""
+        shortfall = self.holes.margins(aperture).clamp(max=0)
         return relative_mse.log() + self.weight / 2 * (shortfall**2).sum(-1)

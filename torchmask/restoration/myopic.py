@@ -89,8 +89,8 @@ class MyopicDeconvolution:
     aberration_prior : bool
         False: leave out 1/2 ||z||^2; z are then the Zernike coefficients themselves.
     max_iterations : int
-        Maximum number over all starts, each of at most 1000; that of a full pupil is first the mean of three. Faint
-        frames through a mask get three too, and up to nine are made while none explains the frames; the best is kept.
+        Maximum number over all starts, each of at most 1000. A full pupil gets three, faint frames through a mask up to
+        six, and up to nine are made while none explains the frames.
     tolerance : float
         A start has converged when 100 iterations gain less than this part of the cost (see `Schedule.nearly_at_rest`).
     minimizer : Minimizer
