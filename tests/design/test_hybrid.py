@@ -10,7 +10,7 @@ from torchmask.design import hybrid
 from torchmask.design.constraints import FixedHoles, InsideDisc, KeepOutDisc, KeepOutSegment, NFoldSymmetry, NoOverlap
 from torchmask.design.criterion import AsymptoticMSE
 from torchmask.design.hybrid import FINALISTS, FREE_SHARE, RANDOM_SHARE, Pool, basin_hopping, coarse_criterion
-from torchmask.design.merit import Holes
+from torchmask.design.merit import Holes, Merit
 from torchmask.design.refine import Monitor
 from torchmask.design.starts import changed_mask, turned_to_fit
 from torchmask.grid import Grid
@@ -263,6 +263,20 @@ def test_a_mask_that_fits_between_vanes_is_looked_for_without_them_and_then_turn
     # Of five seeds 0.76 to 0.86 of masks break a rule without vanes, 0.28 to 0.34 with vanes, and then 0.18 to 0.26.
     assert np.mean(broken[half // 2 : half]) > 0.55
     assert np.mean(broken[-half // 2 :]) < 0.5
+
+
+def test_a_known_error_is_penalised_as_the_merit_penalises_it():
+    """Masks that break the rules and one that keeps them."""
+    holes = holes_of(3)
+    x = torch.stack([coordinates(holes, factor * TRIANGLE) for factor in (0.05, 0.1, 1.0)])
+    merit = Merit(AsymptoticMSE(Grid.nyquist(1.0, 550e-9, 32), PowerLawPSD(1.5, 1e7), NoisePSD(1e7), 20), holes, 50.0)
+    found = merit(x)
+    torch.testing.assert_close(merit.penalised(found.relative_mse, holes.aperture(x)), found.merit)
+    torch.testing.assert_close(merit.value(x), found.merit)
+    above = (found.merit - found.relative_mse.log()).tolist()
+    assert above[0] > above[1] > above[2] == 0
+    assert above[0] == pytest.approx(25.0 * float((found.margins[0].clamp(max=0) ** 2).sum()))
+    assert merit.evaluations == 6
 
 
 def test_rules_are_kept_up_to_what_the_penalty_lets_through():
