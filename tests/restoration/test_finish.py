@@ -146,7 +146,7 @@ def test_the_last_descent_ends_when_half_a_segment_gains_little(explained):
     [(1.0, End.INTEGRATION), (2.0, End.BOTH), (2.99, End.BOTH), (3.0, End.LAST_DESCENT), (math.inf, End.LAST_DESCENT)],
 )
 def test_how_a_restoration_ends_depends_on_how_much_its_frames_change(change, end):
-    assert End.of(change, Schedule(faint=2.0, noisy=3.0)) is end
+    assert End.of(change, Schedule(faint=2.0, noisy=3.0), of_mask=True) is end
     assert end.descends is (end is not End.INTEGRATION)
 
 
@@ -169,9 +169,9 @@ def test_aberrations_are_integrated_out_after_the_last_descent_or_in_its_place(e
 
 
 def test_nothing_follows_the_search_of_a_schedule_without_last_segments(observe, five_holes):
-    assert End.of(math.inf, Schedule()) is End.LAST_DESCENT
-    assert End.of(10.0, Schedule(last_segments=0)) is End.NONE
-    assert End.of(math.inf, Schedule.plain()) is End.NONE
+    assert End.of(math.inf, Schedule(), of_mask=True) is End.LAST_DESCENT
+    assert End.of(10.0, Schedule(last_segments=0), of_mask=True) is End.NONE
+    assert End.of(math.inf, Schedule.plain(), of_mask=True) is End.NONE
     seen, stages = observe(n_frames=2, shape=(32, 32)), []
     schedule = Schedule(start_iterations=10, segment=10, last_segments=0, chance=math.inf, faint=0.0)
     method = MyopicDeconvolution(five_holes, seen.grid, readout_noise=1.5, schedule=schedule)
@@ -288,8 +288,7 @@ def test_a_search_need_not_come_to_rest_if_a_last_descent_follows(observe, five_
     [
         ({}, End.FULL_PUPIL),
         ({"schedule": Schedule(retrievals=0)}, End.FULL_PUPIL),
-        ({"schedule": Schedule(last_segments=0)}, End.FULL_PUPIL),
-        ({"schedule": Schedule(retrievals=0, last_segments=0)}, End.NONE),
+        ({"schedule": Schedule(last_segments=0)}, End.NONE),
         ({"schedule": Schedule.plain()}, End.NONE),
         ({"free": Free.OBJECT}, End.NONE),
         ({"free": Free.ABERRATIONS}, End.NONE),
@@ -322,32 +321,6 @@ def test_a_full_pupil_has_as_many_modes_in_its_last_descent_as_the_schedule_says
     for aperture, n_modes, most in ((FullAperture(1.0), None, 300), (five_holes, None, 8), (FullAperture(1.0), 231, 0)):
         method = MyopicDeconvolution(aperture, GRID, n_modes, schedule=schedule)
         assert method.recipe.last_modes == most
-
-
-@pytest.mark.parametrize(("wavelengths", "finer", "n_calls"), [(1, False, 1), (2, False, 0), (1, True, 0)])
-def test_phases_are_retrieved_before_the_last_descent(wavelengths, finer, n_calls, explain, monkeypatch):
-    """In the light of one wavelength, and not again if the last descent has begun."""
-    band = Band.of([500e-9 + 50e-9 * number for number in range(wavelengths)])
-    objective, state = frames_of_a_full_pupil(explain, band=band)
-    calls, records = [], []
-    monkeypatch.setattr(finish, "retrieve_phases", lambda *given, **more: calls.append(len(records)))
-    schedule, how = Schedule(segment=4, last_segments=1), {"end": End.FULL_PUPIL, "traits": FULL_PUPIL}
-    found, progress = ended(
-        objective, state, Setting.of(objective), schedule, records, **how, finer=state if finer else None
-    )
-    assert calls == n_calls * [0]
-    assert [record.stage for record in records] == ["last descent"] * 4
-    assert isinstance(found.prior, SmoothVariation)
-    assert not progress.integrated
-
-
-def test_a_full_pupil_without_last_segments_ends_with_its_phases(explain):
-    objective, state = frames_of_a_full_pupil(explain)
-    schedule = Schedule(last_segments=0, retrievals=0)
-    setting = Setting.of(objective, finer=lambda: pytest.fail("it was made"))
-    found, progress = ended(objective, state, setting, schedule, end=End.FULL_PUPIL, traits=FULL_PUPIL)
-    assert found is objective
-    assert progress.state is state
 
 
 @pytest.mark.parametrize(("traits", "power"), [(TRAITS, 1), (FULL_PUPIL, 2)])
@@ -393,17 +366,18 @@ def test_the_object_of_a_full_pupil_is_settled_before_each_segment(explain):
     assert lost(FULL_PUPIL) < 0.5 * lost(TRAITS)
 
 
-def test_an_interrupted_last_descent_of_a_full_pupil_goes_on(observe, tmp_path, monkeypatch):
-    """Neither are starts averaged again, nor phases retrieved, and the message tells of both."""
+@pytest.mark.parametrize(("retrievals", "said"), [(0, "the mean object of 3 starts"), (1, "phases were retrieved")])
+def test_an_interrupted_last_descent_of_a_full_pupil_goes_on(retrievals, said, observe, tmp_path, monkeypatch):
+    """Neither are starts averaged again, nor phases retrieved, and the message tells what was done."""
     seen = observe(FullAperture(1.0), n_frames=3, r0=0.5)
     monkeypatch.setattr(myopic, "FULL_MODES", 10)
     options = {"candidates": ((2, 4),), "segment": 4, "sharp_after": 4, "escapes": 0, "start_iterations": 8}
     options |= {"chance": 1e9, "last_segments": 3, "last_gain": 0.0, "reflections": 2, "retrieved_from": 0.0}
-    schedule = Schedule(**options, retrievals=1, retrieved_gain=math.inf, retrieved_iterations=4, last_modes_full=15)
+    options |= {"retrievals": retrievals, "retrieved_gain": math.inf, "retrieved_iterations": 4}
+    schedule = Schedule(**options, last_modes_full=15)
     method = MyopicDeconvolution(FullAperture(1.0), seen.grid, readout_noise=1.5, tolerance=0, schedule=schedule)
     whole = method.restore(seen.frames)
-    assert "the mean object of 3 starts" in whole.message
-    assert "phases were retrieved" in whole.message
+    assert said in whole.message
     interrupt_last_descent(method, seen.frames, path := tmp_path / "state.npz", 6)
     records = []
     resumed = method.restore(seen.frames, checkpoint=path, callback=records.append)

@@ -6,14 +6,16 @@ import pytest
 import torch
 
 from torchmask.grid import Grid
-from torchmask.optics.aperture import FullAperture
-from torchmask.restoration import reflections, retrieval
+from torchmask.optics.aperture import FullAperture, SparseAperture
+from torchmask.restoration import reflections, retrieval, solver
 from torchmask.restoration.aberrations import AberrationBasis
 from torchmask.restoration.background import Background
+from torchmask.restoration.calibration import calibrate
 from torchmask.restoration.candidates import Candidates
 from torchmask.restoration.checkpoint import Progress
 from torchmask.restoration.descent import descend
 from torchmask.restoration.forward import ExposureModel
+from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.priors import TotalVariation
 from torchmask.restoration.projected_lbfgs import ProjectedLBFGS
@@ -21,6 +23,7 @@ from torchmask.restoration.reflections import STEPS, retrieve_fields
 from torchmask.restoration.retrieval import parameters_of_fields, retrieve_phases
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.state import Calibration, State
+from torchmask.restoration.traits import Refinement, Traits
 
 PUPIL, GRID, MODES, NOISE = FullAperture(1.0), Grid.nyquist(1.0, 550e-9, 32), 21, 0.01
 
@@ -149,14 +152,15 @@ def test_the_intensity_fits_the_frame_and_stays_where_the_object_hides_it(monkey
     torch.testing.assert_close(angle[bright].imag, torch.zeros_like(angle[bright].imag), rtol=0, atol=1e-9)
 
 
-# --- rounds at the end of a restoration
+# --- rounds
 
 BRISK = {"reflections": 60, "retrieved_segments": 1, "segment": 40}
+TRAITS = Traits(True, False, True, False, 0.2, 20.0, 1000, 0.0, 0, Refinement.OFF)
 
 
-def finish(objective, state, **numbers):
+def retrieve(objective, state, **numbers):
     ended = Progress(Candidates(state, 1))
-    retrieve_phases(objective, ended, Schedule(**BRISK | numbers), ProjectedLBFGS(), None, follow_r0=False)
+    retrieve_phases(objective, ended, TRAITS, Schedule(**BRISK | numbers), ProjectedLBFGS(), None)
     return ended
 
 
@@ -170,19 +174,19 @@ def lost(truth):
 def test_lost_frames_are_found_and_the_others_stay():
     objective, truth = problem(5, rms=0.2, noise=0.1)
     before = chi_squares(objective, lost(truth)) - 1
-    ended = finish(objective, lost(truth))
+    ended = retrieve(objective, lost(truth), reflections=200)
     after = chi_squares(objective, replace(ended.state, calibration=truth.calibration)) - 1
     assert ended.retrieved
     assert bool((after[:2] < 0.25 * before[:2]).all())
     assert float(after[2:].max()) < 0.2  # four deviations of 32^2 pixels
-    assert ended.n_evaluations >= 60 * (STEPS + 2) / 2  # those of the reflections count
+    assert ended.n_evaluations >= 200 * (STEPS + 2) / 2  # those of the reflections count
 
 
 def test_what_does_not_gain_enough_is_not_kept():
     """The least fraction that is asked for cannot be reached."""
     objective, truth = problem(5, rms=0.2)
     start = lost(truth)
-    ended = finish(objective, start, retrieved_gain=0.0)
+    ended = retrieve(objective, start, retrieved_gain=0.0, retrievals=2)
     assert not ended.retrieved
     assert ended.state is start
 
@@ -190,41 +194,143 @@ def test_what_does_not_gain_enough_is_not_kept():
 def test_frames_that_are_explained_are_left_alone(monkeypatch):
     objective, truth = problem(5, rms=0.2)
     monkeypatch.setattr(retrieval, "retrieve_fields", lambda *given: pytest.fail("it was called"))
-    ended = finish(objective, truth)
+    ended = retrieve(objective, truth)
     assert not ended.retrieved
     assert ended.n_evaluations == 0
 
 
-def test_rounds_end_when_little_is_gained_in_the_first(monkeypatch):
-    """One that leaves the excess where it was, though a frame has gained; and three that lower it."""
-    objective, truth = problem(5, rms=0.2)
+class Script:
+    """Stands in for the trials of frames: says what is found in each round, and keeps who was tried.
 
-    def rounds(lower):
-        calls = []
+    `results` has for each round what becomes of all frames, of which only those that are tried count.
+    """
 
-        def descend_a_little(objective, state, *given, follow_r0):
-            calls.append(state)
-            inflation = state.calibration.noise_inflation
-            return state.calibrated(noise_inflation=1 + lower * (inflation - 1)), 1
+    def __init__(self, monkeypatch, results):
+        self.results, self.tried = results, []
+        monkeypatch.setattr(retrieval, "_try_frames", self.try_frames)
+        monkeypatch.setattr(retrieval, "_descend_together", lambda objective, state, *given, **more: state)
 
-        monkeypatch.setattr(retrieval, "_retrieve_once", descend_a_little)
-        finish(objective, lost(truth))
-        return len(calls)
-
-    assert rounds(0.95) == 1
-    assert rounds(0.85) == 3
+    def try_frames(self, objective, state, tried, *given):
+        found = self.results[len(self.tried)]
+        self.tried.append(tried.tolist())
+        found, again = (torch.tensor([word == said for word in found])[tried] for said in ("found", "again"))
+        return retrieval._Trial(state, found, again, 0)
 
 
-def test_rounds_end_when_no_frame_gains(monkeypatch):
-    """The fields of the present aberrations are no better than those."""
-    objective, truth = problem(5, rms=0.2)
+def left(truth, *excess):
+    """The state whose frames leave this excess chi-square, whatever their aberrations."""
+    return truth.calibrated(noise_inflation=1 + torch.tensor(excess, dtype=torch.float64))
+
+
+NO, YES, AGAIN = "", "found", "again"
+
+
+@pytest.mark.parametrize(
+    ("results", "tried"),
+    [
+        # what is found, for the first time or again, is not tried any more
+        ([(YES, NO, AGAIN, NO), (NO, YES, NO, NO), (NO, NO, NO, YES)], [[0, 1, 2, 3], [1, 3], [3]]),
+        # rounds end once as many tries as there are frames were in vain since the last success
+        ([(NO, NO, NO, NO)], [[0, 1, 2, 3]]),
+        ([(YES, AGAIN, NO, NO), (NO, NO, NO, NO), (NO, NO, NO, NO)], [[0, 1, 2, 3], [2, 3], [2, 3]]),
+        ([(YES, AGAIN, NO, NO), (NO, NO, NO, NO), (NO, NO, NO, YES)], [[0, 1, 2, 3], [2, 3], [2, 3], [2]]),
+        # frames that lead back to where they were are no success, but need not be tried again
+        ([(AGAIN, AGAIN, AGAIN, AGAIN)], [[0, 1, 2, 3]]),
+    ],
+)
+def test_rounds_try_the_frames_that_have_not_been_found(results, tried, monkeypatch):
+    objective, truth = problem(4, rms=0.2)
+    monkeypatch.setattr(retrieval, "calibrate", lambda objective, state: state)
+    script = Script(monkeypatch, [*results, (NO, NO, NO, NO)])
+    retrieve(objective, left(truth, 3.0, 3.0, 3.0, 3.0), retrievals=4)
+    assert script.tried == tried
+
+
+def test_frames_that_fit_much_worse_than_most_are_tried_again(monkeypatch):
+    """Though they have been found: what was found for them is another poor minimum."""
+    objective, truth = problem(4, rms=0.2)
+    monkeypatch.setattr(retrieval, "calibrate", lambda objective, state: state)
+    script = Script(monkeypatch, [(YES, YES, YES, YES), (NO, YES, NO, NO), (NO, NO, NO, NO)])
+    retrieve(objective, left(truth, 3.0, 7.5, 3.2, 3.1), retrievals=3)
+    assert script.tried == [[0, 1, 2, 3], [1], [1]]
+
+
+def test_a_frame_is_found_where_clearly_less_is_left_and_again_where_as_much_is(monkeypatch):
+    """Frames at the truth come back to it; lost ones are found; ones whose trial fails are neither, and stay."""
+    objective, truth = problem(4, rms=0.2, noise=0.1)
+    start = calibrate(objective, lost(truth))
+    z = truth.z.clone()
+    z[3] = 3 * z[0]
+    monkeypatch.setattr(retrieval, "parameters_of_fields", lambda part, fields, now: z)
+    every = torch.arange(4)
+    trial = retrieval._try_frames(
+        objective, start, every, 0, Schedule(retrieved_iterations=0, reflections=1), ProjectedLBFGS()
+    )
+    assert trial.found.tolist() == [True, True, False, False]
+    assert trial.found_again.tolist() == [True, True, True, False]  # less than before is not more
+    torch.testing.assert_close(trial.state.z, truth.z, rtol=1e-12, atol=1e-12)
+
+
+def test_trials_begin_at_random_phases_that_the_seed_gives(monkeypatch):
+    objective, truth = problem(3, rms=0.2, noise=0.1)
+    start, given = calibrate(objective, lost(truth)), []
+
+    def watch(part, state, n_reflections):
+        given.append(state.z)
+        return retrieve_fields(part, state, n_reflections)
+
+    monkeypatch.setattr(retrieval, "retrieve_fields", watch)
+    schedule = Schedule(retrieved_iterations=1, reflections=1)
+    for seed in (0, 0, 1):
+        retrieval._try_frames(objective, start, torch.tensor([0, 2]), seed, schedule, ProjectedLBFGS())
+    assert torch.equal(given[0], given[1])
+    assert not bool((given[0] == given[2]).any())
+    assert float((given[0] - start.z[[0, 2]]).abs().min()) > 0
+
+
+def test_objects_are_moved_to_where_they_fit_best_between_rounds(monkeypatch):
+    """Once in a round, and settled before each segment."""
+    objective, truth = problem(3, rms=0.2)
     calls = []
+    for name in ("centre_on_pixels", "settle"):
+        monkeypatch.setattr(retrieval, name, lambda objective, state, numbers, name=name: calls.append(name) or state)
+    schedule = Schedule(retrieved_segments=2, segment=1)
+    retrieval._descend_together(objective, truth, TRAITS, schedule, ProjectedLBFGS(), lambda *said: None)
+    assert calls == ["centre_on_pixels", "settle", "settle"]
 
-    def present_fields(objective, state, n_reflections):
-        calls.append(n_reflections)
-        samples = objective.model.pupil.samples()
-        return samples.field(samples.phase(state.z))
 
-    monkeypatch.setattr(retrieval, "retrieve_fields", present_fields)
-    finish(objective, lost(truth), retrieved_iterations=0)
-    assert calls == [60]
+# --- whole restorations
+
+
+@pytest.mark.parametrize(
+    ("change", "finds", "calls", "iterations"),
+    [
+        ({}, True, [8], 8),  # what is found ends the search
+        ({}, False, [8], 24),  # else other starts follow, whose mean is wanted, and there is no second try
+        ({"max_iterations": 7}, True, [], 7),  # a start that was cut short may go on
+        ({"wavelengths": (550e-9, 600e-9)}, True, [], 24),  # a field of one wavelength is no start for two
+        ({"retrievals": 0}, True, [], 24),
+        ({"known": True}, True, [], 8),
+        ({"aperture": SparseAperture([[0.0, 0.3], [0.3, -0.2], [-0.3, -0.2]], 0.2, 1.0)}, True, [], 8),
+    ],
+)
+def test_phases_are_retrieved_after_the_first_start_of_a_full_pupil(change, finds, calls, iterations, monkeypatch):
+    seen = []
+
+    def stand_in(objective, ended, *given):
+        seen.append(len(ended.costs))
+        ended.retrieved = finds
+
+    monkeypatch.setattr(solver, "retrieve_phases", stand_in)
+    objective, truth = problem(3, rms=0.2)
+    options = {"candidates": ((2, 4),), "segment": 4, "sharp_after": 4, "escapes": 0, "start_iterations": 8}
+    options |= {"chance": 1e9, "alike": -1.0, "last_segments": 0, "retrievals": change.get("retrievals", 8)}
+    given = {name: change[name] for name in ("max_iterations", "wavelengths") if name in change}
+    method = MyopicDeconvolution(
+        change.get("aperture", PUPIL), GRID, MODES, r0=0.5, tolerance=0, schedule=Schedule(**options), **given
+    )
+    known = {"coefficients": truth.z[:, None]} if "known" in change else {}
+    result = method.restore(objective.frames * 500 + 500, **known)
+    assert seen == calls
+    assert len(result.cost) == iterations
+    assert ("phases were retrieved" in result.message) == bool(finds and calls)

@@ -145,7 +145,7 @@ def test_noise_falls_from_a_share_of_the_change(explained):
 def test_the_truth_is_explained_as_far_as_the_schedule_asks(explained):
     objective, state = explained
     solver = solver_of(objective)
-    verdict = solver.verdict(Ending(state, Status.CONVERGED))
+    verdict = solver.judge.verdict(solver.objective, Ending(state, Status.CONVERGED))
     chi_square = fit_of_frames(objective, state)[1]
     total, freedom = float(chi_square.sum()) * 32**2, verdict.degrees_of_freedom
     assert verdict.explained
@@ -155,9 +155,8 @@ def test_the_truth_is_explained_as_far_as_the_schedule_asks(explained):
     level, unevenness = solver.judge.noise
     noise = math.sqrt(2 * float((level**2 * unevenness).mean()) / freedom)
     assert verdict.limit == pytest.approx(1 + 2 * verdict.model_error + 2 * noise, rel=1e-4)
-    other = solver_of(objective, schedule=Schedule(model_errors=3.0, chance=1.0)).verdict(
-        Ending(state, Status.CONVERGED)
-    )
+    lenient = solver_of(objective, schedule=Schedule(model_errors=3.0, chance=1.0))
+    other = lenient.judge.verdict(objective, Ending(state, Status.CONVERGED))
     assert other.limit == pytest.approx(1 + 3 * verdict.model_error + noise, rel=1e-4)
 
 
@@ -166,7 +165,7 @@ def test_a_full_pupil_may_leave_a_share_of_the_change(explain):
     left = {}
     for missed in (0.0, 1.0):
         solver = solver_of(objective, schedule=Schedule(missed=missed, chance=0.0), many_minima=True)
-        left[missed] = solver.verdict(Ending(state, Status.CONVERGED)).limit - 1
+        left[missed] = solver.judge.verdict(solver.objective, Ending(state, Status.CONVERGED)).limit - 1
     frames = objective.frames
     change = ((frames - frames.mean((1, 2), keepdim=True) * frames.mean(0)) ** 2).mean() * objective.precision
     assert left[0.0] < left[1.0] == pytest.approx(float(change))
@@ -190,8 +189,8 @@ def test_the_better_of_two_starts_is_kept(rival_is_better, explained):
         assert (progress.status, progress.decrease) == (Status.CONVERGED, 1e-9)
     else:
         assert progress.status is Status.START_LIMIT
-        worse = solver.verdict(Ending(poor, Status.CONVERGED))
-        assert solver.verdict(progress.ending).excess < worse.excess
+        worse = solver.judge.verdict(solver.objective, Ending(poor, Status.CONVERGED))
+        assert solver.judge.verdict(solver.objective, progress.ending).excess < worse.excess
 
 
 @pytest.mark.parametrize(("alike", "full", "n_starts"), [(0.03, True, 2), (-1.0, True, 3), (0.03, False, 3)])
@@ -244,7 +243,7 @@ def test_a_doubted_fit_gets_few_starts_and_a_missed_one_many(explained):
     """A fit is doubted, though explained, if it leaves more than is expected."""
     objective, truth = explained
     solver = solver_of(objective)
-    verdict, schedule = solver.verdict(Ending(truth, Status.CONVERGED)), solver.schedule
+    verdict, schedule = solver.judge.verdict(solver.objective, Ending(truth, Status.CONVERGED)), solver.schedule
     noise = verdict.limit - 1 - schedule.model_errors * verdict.model_error
     doubtful = 1 + schedule.doubtful * verdict.model_error + noise
     assert doubtful < verdict.limit

@@ -72,8 +72,7 @@ def recalibrate(objective: MyopicObjective, state: State, power: int | None, *, 
     """Update transmissions and noise and, with `follow_r0`, the strength of the turbulence from the state.
 
     `power` is None before the object has been found. Afterwards, frames are weighted by that power of their residual
-    variance: 2 for a full pupil, where residuals come from poor minima and are more harmful than white noise of that
-    variance; 1 for a mask, where they come from modes left out.
+    variance (`Traits.fit_power`).
     """
     state = calibrate(objective, state)
     state = share_noise_inflation(state) if power is None else sharpen_noise_inflation(state, power)
@@ -100,9 +99,13 @@ def share_noise_inflation(state: State) -> State:
 
 
 def sharpen_noise_inflation(state: State, power: int) -> State:
-    """Return the state with noise inflation raised to `power` relative to that of the best frame."""
+    """Return the state with noise inflation raised to `power` relative to that of the frames that fit best.
+
+    With powers above 1 these are the best quarter, which count alike: a single frame would soon rule the object.
+    """
     inflation = state.calibration.noise_inflation
-    return state.calibrated(noise_inflation=inflation**power / inflation.min() ** (power - 1))
+    best = inflation.quantile(0.25) if power > 1 else inflation.min()
+    return state.calibrated(noise_inflation=inflation.clamp(min=best) ** power / best ** (power - 1))
 
 
 def follow_turbulence(objective: MyopicObjective, state: State) -> State:

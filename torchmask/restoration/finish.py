@@ -3,9 +3,9 @@
 A descent from far away takes few modes per sub-aperture. Close to the solution, more of them take away much of what the
 model leaves unexplained. So once the search has ended, the aberrations gain modes, and the object a smoother prior
 (`ObjectPrior.smoother`), and that descent goes on while it gains. Where noise leaves the aberrations of a mask
-uncertain, they are integrated out after it, or in its place if frames are faint. For a full pupil phases are retrieved
-before it, and its segments begin with the object settled for the aberrations at hand: a joint descent is too slow at
-the frequencies that a full pupil hardly passes, in which most of the error in bright light would lie.
+uncertain, they are integrated out after it, or in its place if frames are faint. For a full pupil its segments begin
+with the object settled for the aberrations at hand: a joint descent is too slow at the frequencies that a full pupil
+hardly passes, in which most of the error in bright light would lie.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from torchmask.restoration.marginal import integrate_aberrations
 from torchmask.restoration.motion import Setting
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.projected_lbfgs import Minimizer
-from torchmask.restoration.retrieval import retrieve_phases
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.state import State
 from torchmask.restoration.traits import End, Traits
@@ -44,13 +43,11 @@ class Finisher:
 
     def finish(self, objective: MyopicObjective, ended: Progress, end: End) -> MyopicObjective:
         """Update `ended`, and return the objective of its state."""
-        how = (self.schedule, self.minimizer, self.callback)
-        if end is End.FULL_PUPIL and ended.finer is None and objective.model.pupil.n_rasters == 1:
-            retrieve_phases(objective, ended, *how, follow_r0=self.traits.r0_is_open)
-        if end.descends and self.schedule.last_segments:
+        if end.descends:
             objective = self._descend(objective, ended)
         if end.integrates:
             rounds = self.schedule.fine_rounds if end.descends else self.schedule.rounds
+            how = (self.schedule, self.minimizer, self.callback)
             known = {"seed": self.traits.seed, "follow_r0": self.traits.r0_is_open}
             ended.state, spent = integrate_aberrations(objective, ended.state, rounds, *how, **known)
             ended.n_evaluations += spent
@@ -68,7 +65,6 @@ class Finisher:
         objective = self.setting.objective_at(objective, state).with_changes(prior=objective.prior.smoother())
         most, done = (number * schedule.segment for number in (schedule.last_segments, ended.last_segments))
         report, costs = ended.reporter("last descent", most, self.callback, done), []
-        power = 2 if self.traits.many_minima else 1
 
         def listen(cost: float, evaluations: int, variables: Variables) -> None:
             costs.append(cost)
@@ -77,7 +73,7 @@ class Finisher:
         while ended.last_segments < schedule.last_segments:
             costs.clear()
             if schedule.recalibrates:
-                state = recalibrate(objective, state, power, follow_r0=self.traits.r0_is_open)
+                state = recalibrate(objective, state, self.traits.fit_power, follow_r0=self.traits.r0_is_open)
             if self.traits.many_minima:
                 state = settle(objective, state, schedule.last_settling)
             state = descend(objective, state, schedule.segment, self.minimizer, listen)

@@ -89,8 +89,8 @@ class MyopicDeconvolution:
     aberration_prior : bool
         False: leave out 1/2 ||z||^2; z are then the Zernike coefficients themselves.
     max_iterations : int
-        Maximum number over all starts, each of at most 1000. A full pupil gets three, faint frames through a mask up to
-        six, and up to nine are made while none explains the frames.
+        Maximum number over all starts, each of at most 1000. A full pupil gets three, or one in bright light, faint
+        frames through a mask up to six, and up to nine are made while none explains the frames.
     tolerance : float
         A start has converged when 100 iterations gain less than this part of the cost (see `Schedule.nearly_at_rest`).
     minimizer : Minimizer
@@ -274,8 +274,8 @@ class MyopicDeconvolution:
             settings = (replace(traits, max_iterations=0, tolerance=0.0), self.minimizer, self.schedule)
             check_prior(self.prior, model.window.embed(stack.frames.mean(0).clamp(min=0)).double())
             progress = solver.solve(known, start, Checkpoint.of(checkpoint, objective, settings, known.tensors))
-            found = (progress, solver.prior_r0, replace(solver.verdict(progress.ending), **look._asdict()))
-            result = assemble_result(solver.objective, stack, *found, n_modes=self.n_modes)
+            verdict = replace(solver.judge.verdict(solver.objective, progress.ending), **look._asdict())
+            result = assemble_result(solver.objective, stack, progress, solver.prior_r0, verdict, n_modes=self.n_modes)
             if n_samples:
                 result = add_deviations(result, solver.objective, stack, progress, n_samples)
         return replace(result, seconds=time.perf_counter() - started)

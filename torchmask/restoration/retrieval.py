@@ -1,15 +1,17 @@
-"""The frames of a full pupil that the search leaves in poor minima, once the object is sharp.
+"""The phases of a full pupil's frames in bright light, retrieved once the object is sharp.
 
-In bright light most of a full pupil's residual comes from minima of its many modes. Once there is an object to hold the
-frames against, phase retrieval finds the field of each frame from anywhere (`reflections`). The modes closest to its
-phase are the start of a descent; frames that end lower there than before keep it, and object and aberrations
-descend together. Better aberrations sharpen the object, so this is done a few times.
+In bright light most of a full pupil's residual comes from minima of its many modes, and in strong turbulence a search
+leaves nearly all frames in such. Once there is an object to hold the frames against, phase retrieval finds the field of
+a frame from random phases (`reflections`), though seldom at once. The modes closest to its phase are the start of a
+descent; frames that end lower there than before keep it, and object and aberrations descend together. Every frame that
+is found sharpens the object, which helps to find the next ones, so this is done in rounds.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,16 +19,22 @@ from torch import Tensor
 from torchmask.record import Callback
 from torchmask.restoration.calibration import calibrate, recalibrate, share_noise_inflation
 from torchmask.restoration.checkpoint import Progress
-from torchmask.restoration.descent import Listener, descend
+from torchmask.restoration.descent import Listener, Variables, descend
+from torchmask.restoration.escapes import centre_on_pixels, settle
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.reflections import STEPS, retrieve_fields
 from torchmask.restoration.schedule import Schedule
+from torchmask.restoration.starts import random_candidates
 from torchmask.restoration.state import State
+from torchmask.restoration.traits import Traits
 
 _LOWER = 0.99  # of its cost before: a frame that comes back to where it was is no gain
-_PROMISING = 0.9  # of the excess chi-square before all rounds: with more left after one, others bring little
+_FOUND = 0.75  # of a frame's excess chi-square before: with no more left, its phases have been found
+_AGAIN = 1.1  # of its chi-square before: a frame that random phases lead back to where it was had been found before
+_POOR = 2.0  # of the median chi-square: a frame with more is tried again, whatever was found
+_IN_VAIN = 1.0  # tries of all frames, without one that is found in between, after which there are no more
 _CORRECTIONS = 3  # of the modes by the phase that is left
 _EVALUATIONS = STEPS / 2 + 1  # whose FFTs a reflection makes
 
@@ -34,26 +42,31 @@ _EVALUATIONS = STEPS / 2 + 1  # whose FFTs a reflection makes
 def retrieve_phases(
     objective: MyopicObjective,
     ended: Progress,
+    traits: Traits,
     schedule: Schedule,
     minimizer: Minimizer,
     callback: Callback | None,
-    *,
-    follow_r0: bool,
 ) -> None:
     """Give `ended` the state to which phase retrieval leads, if that leaves clearly less of the frames unexplained.
 
-    Another round follows while frames gain, less is left than at first, and more than the noise.
+    A round tries the frames whose phases have not been found. There are rounds while such frames are left, some are
+    found from time to time, and more is left of the frames than the noise.
     """
     first = state = calibrate(objective, ended.state)
-    n_iterations = schedule.retrieved_iterations + schedule.retrieved_segments * schedule.segment
-    listen = ended.reporter("phase retrieval", schedule.retrievals * n_iterations, callback)
-    for _ in range(schedule.retrievals):
-        if _excess(state) <= schedule.retrieved_from:
+    listen = ended.reporter(
+        "phase retrieval", schedule.retrievals * schedule.retrieved_segments * schedule.segment, callback
+    )
+    missing, in_vain = torch.ones_like(state.calibration.noise_inflation, dtype=torch.bool), 0.0
+    for number in range(schedule.retrievals):
+        tried = (missing | _is_poor(state)).nonzero().flatten()
+        if _excess(state) <= schedule.retrieved_from or in_vain >= _IN_VAIN or not len(tried):
             break
-        state, n_better = _retrieve_once(objective, state, schedule, minimizer, listen, follow_r0=follow_r0)
-        ended.n_evaluations += round(schedule.reflections * _EVALUATIONS)
-        if not n_better or _excess(state) > _PROMISING * _excess(first):
-            break
+        trial = _try_frames(objective, state, tried, traits.seed + number, schedule, minimizer)
+        share = len(tried) / len(missing)
+        ended.n_evaluations += round(share * (trial.evaluations + schedule.reflections * _EVALUATIONS))
+        missing[tried] = ~(trial.found | trial.found_again)
+        in_vain = 0.0 if bool(trial.found.any()) else in_vain + share
+        state = _descend_together(objective, trial.state, traits, schedule, minimizer, listen)
     if _excess(state) < schedule.retrieved_gain * _excess(first):
         ended.state, ended.retrieved = state, True
 
@@ -63,28 +76,68 @@ def _excess(state: State) -> float:
     return float(state.calibration.noise_inflation.mean()) - 1
 
 
-def _retrieve_once(
+def _is_poor(state: State) -> Tensor:
+    """Return which frames (T,) fit much worse than most."""
+    inflation = state.calibration.noise_inflation
+    return inflation > _POOR * inflation.median()
+
+
+class _Trial(NamedTuple):
+    """The state after a round's retrieval, and what has become of the frames that were tried.
+
+    state : state with the aberrations of the frames that end lower
+    found, found_again : (n,) whether better phases have been found, or those that a frame had
+    evaluations : number of evaluations of these frames
+    """
+
+    state: State
+    found: Tensor
+    found_again: Tensor
+    evaluations: int
+
+
+def _try_frames(
+    objective: MyopicObjective, state: State, tried: Tensor, seed: int, schedule: Schedule, minimizer: Minimizer
+) -> _Trial:
+    """Retrieve the phases of the frames `tried` (n,) from random ones, for the object of the calibrated `state`."""
+    spent = 0
+
+    def count(cost: float, evaluations: int, variables: Variables) -> None:
+        nonlocal spent
+        spent += evaluations
+
+    # aberrations in common stay as they are, since only some frames may change
+    part, now = objective.of_frames(tried, free=Free.ABERRATIONS), share_noise_inflation(state).of_frames(tried)
+    fresh = random_candidates(part, now, 1, schedule.start_rms, seed).state
+    fields = retrieve_fields(part, fresh, schedule.reflections)
+    trial = replace(now, z=parameters_of_fields(part, fields, now.z))
+    trial = descend(part, trial, schedule.retrieved_iterations, minimizer, count)
+    after, before = (part.frame_costs(now.image, z, now.calibration) for z in (trial.z, now.z))
+    left, least = (s.calibration.noise_inflation for s in (calibrate(part, trial), state.of_frames(tried)))
+    z = state.z.clone()
+    z[tried] = torch.where((after < _LOWER * before)[:, None], trial.z, now.z)
+    return _Trial(replace(state, z=z), left - 1 < _FOUND * (least - 1), left < _AGAIN * least, spent)
+
+
+def _descend_together(
     objective: MyopicObjective,
     state: State,
+    traits: Traits,
     schedule: Schedule,
     minimizer: Minimizer,
     listen: Listener,
-    *,
-    follow_r0: bool,
-) -> tuple[State, int]:
-    """Return the calibrated state after one round, and the number of frames that phase retrieval has brought lower."""
-    shared = share_noise_inflation(state)
-    fields = retrieve_fields(objective, shared, schedule.reflections)
-    known_object = objective.with_changes(free=Free.ABERRATIONS)  # those in common stay, as only some frames may change
-    trial = replace(shared, z=parameters_of_fields(objective, fields, shared.z))
-    trial = descend(known_object, trial, schedule.retrieved_iterations, minimizer, listen)
-    after, before = (objective.frame_costs(shared.image, z, shared.calibration) for z in (trial.z, shared.z))
-    better = after < _LOWER * before
-    state = replace(state, z=torch.where(better[:, None], trial.z, state.z))
-    for _ in range(schedule.retrieved_segments):
-        state = recalibrate(objective, state, power=2, follow_r0=follow_r0)
+) -> State:
+    """Return the calibrated state after a descent of object and aberrations.
+
+    The sharper the object, the more it matters where it lies on the pixels, and random tilts have moved the frames.
+    """
+    for number in range(schedule.retrieved_segments):
+        state = recalibrate(objective, state, traits.fit_power, follow_r0=traits.r0_is_open)
+        if number == 0:
+            state = centre_on_pixels(objective, state, schedule)
+        state = settle(objective, state, schedule.retrieved_settling)
         state = descend(objective, state, schedule.segment, minimizer, listen)
-    return calibrate(objective, state), int(better.sum())
+    return calibrate(objective, state)
 
 
 def parameters_of_fields(objective: MyopicObjective, fields: Tensor, z: Tensor) -> Tensor:

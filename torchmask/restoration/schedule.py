@@ -89,10 +89,11 @@ class Schedule:
     last_modes_full : the same of a full pupil, however faint
     last_segments : maximum number of segments of that descent; 0: there is none
     last_gain : it ends when the second half of a segment lowers the cost by less than this fraction
-    retrievals : for a full pupil, maximum number of rounds of phase retrieval at the end; 0: there is none
+    retrievals : for a full pupil, maximum number of rounds of phase retrieval after the first start; 0: there is none
     retrieved_from : a round is made while the mean chi-square is above that of noise by more than this
     reflections : number of reflections of a round
     retrieved_iterations : maximum number of iterations that fit the modes of the phases retrieved
+    retrieved_settling : maximum number of iterations that then settle the object, before each segment
     retrieved_segments : number of segments in which object and aberrations then descend
     retrieved_gain : what the rounds have found is kept if the excess chi-square falls below this fraction
     """
@@ -144,10 +145,11 @@ class Schedule:
     last_modes_full: int = 351
     last_segments: int = 20
     last_gain: float = 0.003
-    retrievals: int = 3
+    retrievals: int = 8
     retrieved_from: float = 0.5
-    reflections: int = 100
+    reflections: int = 600
     retrieved_iterations: int = 60
+    retrieved_settling: int = 80
     retrieved_segments: int = 2
     retrieved_gain: float = 0.7
 
@@ -202,11 +204,6 @@ class Schedule:
     def n_candidates(self) -> int:
         """Number of candidates at the beginning of a tournament; 1 without a tournament."""
         return self.candidates[0][0] if self.candidates else 1
-
-    @property
-    def finishes_full_pupils(self) -> bool:
-        """Whether anything follows the search of a full pupil."""
-        return self.retrievals > 0 or self.last_segments > 0
 
     def most_modes(self, of_full_pupil: bool) -> int:
         """Return the number of modes of each sub-aperture in the last descent."""

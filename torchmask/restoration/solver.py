@@ -5,10 +5,10 @@ proceeds in segments. Between two of them, the scales of the variables, the tran
 turbulence and the noise are updated; the assumed noise falls from the residual of the mean frame to the true noise, or
 to the residual of the model, if that is larger. Once the object is sharp, frames and object escape from local minima;
 when nothing changes any more, each frame is weighted by how well it fits. A start ends when a segment gains nothing, or
-little if it explains the frames, or its iterations are used up. If its verdict is that it missed the object, or in
-faint frames, others start, from random aberrations or, for a mask, from twins of the object, and the best is kept. Then
-aberrations of faint frames are integrated out, those of others gain modes. The starts of a full pupil are averaged and
-its phases retrieved first, then it gains modes too.
+little if it explains the frames, or its iterations are used up. Phases of a full pupil's bright frames are retrieved
+after the first. If it missed the object, or frames are faint, others start, from random aberrations or, for a mask,
+from twins of the object; the best is kept, or the mean for a full pupil. Then aberrations of faint frames are
+integrated out, those of others gain modes.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.placement import distance, is_misplaced
 from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.result import RestorationResult
+from torchmask.restoration.retrieval import retrieve_phases
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.starts import (
     Known,
@@ -47,7 +48,6 @@ from torchmask.restoration.starts import (
 from torchmask.restoration.state import Modes, State
 from torchmask.restoration.traits import End, Refinement, Traits
 from torchmask.restoration.twins import twin_of
-from torchmask.restoration.verdict import Verdict
 
 
 class Solver:
@@ -89,14 +89,16 @@ class Solver:
         self.schedule: Schedule = schedule
         self.minimizer: Minimizer = minimizer
         self.callback: Callback | None = callback
+        self._how: tuple[Traits, Schedule, Minimizer] = (traits, schedule, minimizer)
         self.first_inflation: float = max(1.0, stack.change / schedule.first_inflation)
         turbulent = Free.ABERRATIONS in objective.free and traits.prior_on_aberrations and not traits.estimated
         self.prior_r0: float | None = traits.r0 if turbulent else None  # of the aberrations' prior, at first [m]
         is_open = traits.prior_on_aberrations and Free.OBJECT | Free.ABERRATIONS in objective.free
         many_ends = is_open and traits.many_minima and not traits.estimated
         self.averages: bool = many_ends and schedule.averaged > 1
-        of_mask = End.of(stack.change, schedule) if is_open and not traits.many_minima else End.NONE
-        self.end: End = End.FULL_PUPIL if many_ends and schedule.finishes_full_pupils else of_mask
+        self.retrieves: bool = many_ends and schedule.retrievals > 0 and objective.model.pupil.n_rasters == 1
+        goes_on = many_ends or (is_open and not traits.many_minima)
+        self.end: End = End.of(stack.change, schedule, of_mask=not traits.many_minima) if goes_on else End.NONE
         self.judge: Judge = Judge(self.setting, stack, traits, schedule, self.end)
 
     def solve(self, known: Known, start: RestorationResult | None = None, file: Checkpoint | None = None) -> Progress:
@@ -140,12 +142,13 @@ class Solver:
     def run(self, progress: Progress, may_start_again: bool, save: Callable[[Progress], None]) -> Progress:
         """Continue until the restoration ends; `save` is called after every segment."""
         while progress.status is Status.RUNNING:
-            if progress.candidates.n_each > 1:
-                self._play(progress)
-            else:
-                self._advance(progress)
-            if progress.status is not Status.RUNNING and may_start_again:
-                self._judge_start(progress)
+            go_on = self._play if progress.candidates.n_each > 1 else self._advance
+            go_on(progress)
+            if progress.status is not Status.RUNNING:
+                if self.retrieves and progress.starts == 1 and progress.status is not Status.ITERATION_LIMIT:
+                    retrieve_phases(self.objective, progress, *self._how, self.callback)
+                if may_start_again and not progress.retrieved:
+                    self._judge_start(progress)
             save(progress)
         if progress.status is Status.ITERATION_LIMIT and progress.rival is not None:  # the last start was cut short
             progress.state = self.judge.compare(self.objective, progress.ending, progress.rival).best.state
@@ -245,12 +248,12 @@ class Solver:
         return descend(objective, state, min(n_iterations, left), self.minimizer, listen)
 
     def _recalibrate(self, objective: MyopicObjective, state: State, *, sharpen: bool) -> State:
-        power = (2 if self.traits.many_minima else 1) if sharpen else None
+        power = self.traits.fit_power if sharpen else None
         return recalibrate(objective, state, power, follow_r0=self.traits.r0_is_open)
 
     def _escape(self, progress: Progress) -> None:
-        progress.escapes, how = progress.escapes + 1, (self.traits, self.schedule, self.minimizer)
-        state, evaluations = escape(self.objective, progress.state, self.first_inflation, *how, progress.escapes)
+        progress.escapes += 1
+        state, evaluations = escape(self.objective, progress.state, self.first_inflation, *self._how, progress.escapes)
         progress.n_evaluations += evaluations
         if state is progress.state:  # nothing has changed: no further attempt
             progress.escapes = self.schedule.escapes
@@ -284,10 +287,6 @@ class Solver:
             objective = self._place(replace(state, modes=Modes.STILL))
             first = replace(self._first_state(Known()), geometry=state.geometry)
             progress.candidates = first_candidates(objective, first, self.traits, self.schedule, seed)
-
-    def verdict(self, ending: Ending) -> Verdict:
-        """Return the verdict on the ending of one start, or of all."""
-        return self.judge.verdict(self.objective, ending)
 
     def _report(self, progress: Progress, variables: Variables) -> None:
         if self.callback is None:

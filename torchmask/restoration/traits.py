@@ -17,11 +17,13 @@ class End(Enum):
     INTEGRATION = "the aberrations of faint frames are integrated out"
     LAST_DESCENT = "object and aberrations descend once more, with more modes"
     BOTH = "the aberrations of noisy frames are integrated out after a last descent"
-    FULL_PUPIL = "phases of frames of a full pupil are retrieved for the sharp object, and a last descent follows"
+    FULL_PUPIL = "object and aberrations of a full pupil descend once more, with more modes and the object settled"
 
     @classmethod
-    def of(cls, change: float, schedule: Schedule) -> End:
-        """Return the end for a mask whose frames change from one to the next by so many noise variances."""
+    def of(cls, change: float, schedule: Schedule, *, of_mask: bool) -> End:
+        """Return the end for frames that change from one to the next by so many noise variances."""
+        if not of_mask:
+            return cls.FULL_PUPIL if schedule.last_segments else cls.NONE
         if change < schedule.faint:
             return cls.INTEGRATION
         if not schedule.last_segments:
@@ -91,6 +93,15 @@ class Traits:
     seed: int
     refinement: Refinement
     exposure_tau0: float = 0.0
+
+    @property
+    def fit_power(self) -> int:
+        """Power of their residual variance by which frames are weighted once the object has been found.
+
+        2 for a full pupil, where residuals come from poor minima and are more harmful than white noise of that
+        variance; 1 for a mask, where they come from modes left out.
+        """
+        return 2 if self.many_minima else 1
 
 
 def check_numbers(readout_noise: float | None, max_iterations: int, tolerance: float) -> None:
