@@ -200,7 +200,7 @@ def test_two_starts_of_a_full_pupil_that_end_alike_are_the_last(alike, full, n_s
     poor = replace(truth, z=0 * truth.z)
 
     def run(starts: int, rival: Ending | None) -> Progress:
-        brief = {"start_iterations": 1, "candidates": (), **ALL_MISSED, **BRISK | {"sharp_after": 0}}
+        brief = {"start_iterations": 1, "candidates": (), "retrievals": 0, **ALL_MISSED, **BRISK | {"sharp_after": 0}}
         begun = Progress(Candidates(poor, 1), [1.0], starts=min(starts, 2), began=1, rival=rival)
         solver = solver_of(objective, schedule=Schedule(starts=starts, alike=alike, **brief), many_minima=full)
         return solver.run(begun, True, lambda _: None)
@@ -322,7 +322,7 @@ def test_a_sensor_that_saw_a_full_pupil_makes_candidates_needless(explain):
 def test_a_tournament_counts_what_its_candidates_cost(explain):
     """Costs are those of one candidate for each frame; evaluations are of the stack, so those of four count four."""
     objective, _ = full_pupil(explain)
-    schedule = Schedule(candidates=((4, 30), (2, 20)), segment=10, start_iterations=6, **NONE_MISSED)
+    schedule = Schedule(candidates=((4, 30), (2, 20)), segment=10, start_iterations=6, retrievals=0, **NONE_MISSED)
     records: list[Record] = []
     solver = solver_of(objective, records.append, idle, schedule, many_minima=True)
     begun = solver.begin(Known(), None)
