@@ -64,7 +64,7 @@ def test_a_result_is_in_electrons_and_rad(ended):
         (
             {"status": Status.START_LIMIT, "starts": 4, "averaged": 3, "retrieved": True},
             "stopped at the limit of iterations for a start; the mean object of 3 starts, of 4 made; then phases were "
-            "retrieved for its object",
+            "retrieved for the object found",
         ),
         (
             {"decrease": 0.0, "starts": 2, "alike": True},

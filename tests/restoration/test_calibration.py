@@ -127,10 +127,18 @@ def inflated(*values):
     return State(torch.ones(2, 2), torch.zeros(len(values), 1), Calibration(ones, inflation, 1.0))
 
 
-@pytest.mark.parametrize(("power", "expected"), [(2, [2.0, 2.0, 8.0, 18.0, 32.0]), (1, [1.0, 2.0, 4.0, 6.0, 8.0])])
-def test_frames_are_weighed_by_how_well_they_fit(power, expected):
+@pytest.mark.parametrize(
+    ("power", "given", "expected"),
+    [
+        (2, (1, 2, 4, 6, 8), [2.0, 2.0, 8.0, 18.0, 32.0]),
+        (1, (1, 2, 4, 6, 8), [1.0, 2.0, 4.0, 6.0, 8.0]),
+        (2, (2, 4), [2.0, 8.0]),  # a quarter of few frames is one
+        (2, (2, 4, 6, 8), [2.0, 8.0, 18.0, 32.0]),
+    ],
+)
+def test_frames_are_weighed_by_how_well_they_fit(power, given, expected):
     """Through a full pupil by the square, against the best quarter of the frames, which count alike."""
-    assert sharpen_noise_inflation(inflated(1, 2, 4, 6, 8), power).calibration.noise_inflation.tolist() == expected
+    assert sharpen_noise_inflation(inflated(*given), power).calibration.noise_inflation.tolist() == expected
 
 
 def test_shared_noise_is_the_mean_of_all():

@@ -101,5 +101,5 @@ def _message(progress: Progress) -> str:
         message += f"; the mean object of {progress.averaged} starts, of {progress.starts} made"
     elif progress.starts > 1:
         message += f"; the best of {progress.starts} starts" + (", two of which ended alike" if progress.alike else "")
-    message += "; then phases were retrieved for its object" if progress.retrieved else ""
+    message += "; then phases were retrieved for the object found" if progress.retrieved else ""
     return message + ("; then the aberrations were integrated out" if progress.integrated else "")

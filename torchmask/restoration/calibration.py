@@ -104,7 +104,7 @@ def sharpen_noise_inflation(state: State, power: int) -> State:
     With powers above 1 these are the best quarter, which count alike: a single frame would soon rule the object.
     """
     inflation = state.calibration.noise_inflation
-    best = inflation.quantile(0.25) if power > 1 else inflation.min()
+    best = inflation.quantile(0.25, interpolation="lower") if power > 1 else inflation.min()
     return state.calibrated(noise_inflation=inflation.clamp(min=best) ** power / best ** (power - 1))
 
 

@@ -89,8 +89,8 @@ class MyopicDeconvolution:
     aberration_prior : bool
         False: leave out 1/2 ||z||^2; z are then the Zernike coefficients themselves.
     max_iterations : int
-        Maximum number over all starts, each of at most 1000. A full pupil gets three, or one in bright light, faint
-        frames through a mask up to six, and up to nine are made while none explains the frames.
+        Maximum number over all starts, each of at most 1000. A full pupil gets three, or one if phases are retrieved;
+        faint frames through a mask up to six. Else up to nine are made while none explains the frames.
     tolerance : float
         A start has converged when 100 iterations gain less than this part of the cost (see `Schedule.nearly_at_rest`).
     minimizer : Minimizer
@@ -240,7 +240,7 @@ class MyopicDeconvolution:
         seed : int
             Seed of the random starts and candidates, and of the samples of aberrations that are integrated out.
         checkpoint : path, optional
-            An .npz file, written every 100 iterations. If it exists, the restoration resumes from it to the same end.
+            An .npz file, written every 100 iterations, not of phase retrieval, from which a restoration resumes.
         callback : callable, optional
             Called with a `Record` after every iteration; every tenth includes the object and the coefficients.
 

@@ -32,9 +32,10 @@ from torchmask.restoration.traits import Traits
 
 _LOWER = 0.99  # of its cost before: a frame that comes back to where it was is no gain
 _FOUND = 0.75  # of a frame's excess chi-square before: with no more left, its phases have been found
-_AGAIN = 1.1  # of its chi-square before: a frame that random phases lead back to where it was had been found before
+_AGAIN = 1.1  # of its chi-square before: with no more left,
+_ALIKE = 0.8  # and fields that agree so far (1: all over the pupil), random phases have led back to where a frame was
 _POOR = 2.0  # of the median chi-square: a frame with more is tried again, whatever was found
-_IN_VAIN = 1.0  # tries of all frames, without one that is found in between, after which there are no more
+_IN_VAIN = 2  # tries of every frame without one that is found in between, after which there are no more
 _CORRECTIONS = 3  # of the modes by the phase that is left
 _EVALUATIONS = STEPS / 2 + 1  # whose FFTs a reflection makes
 
@@ -49,26 +50,26 @@ def retrieve_phases(
 ) -> None:
     """Give `ended` the state to which phase retrieval leads, if that leaves clearly less of the frames unexplained.
 
-    A round tries the frames whose phases have not been found. There are rounds while such frames are left, some are
-    found from time to time, and more is left of the frames than the noise.
+    A round tries the frames that leave more than the noise and whose phases have not been found. There are rounds while
+    more is left of all frames than the noise, until twice as many tries as frames were in vain. The best is kept.
     """
-    first = state = calibrate(objective, ended.state)
-    listen = ended.reporter(
-        "phase retrieval", schedule.retrievals * schedule.retrieved_segments * schedule.segment, callback
-    )
-    missing, in_vain = torch.ones_like(state.calibration.noise_inflation, dtype=torch.bool), 0.0
+    first = best = state = calibrate(objective, ended.state)
+    n_iterations = schedule.retrieved_segments * schedule.segment
+    listen = ended.reporter("phase retrieval", schedule.retrievals * n_iterations, callback)
+    missing, in_vain = state.calibration.noise_inflation - 1 > schedule.retrieved_from, 0
     for number in range(schedule.retrievals):
         tried = (missing | _is_poor(state)).nonzero().flatten()
-        if _excess(state) <= schedule.retrieved_from or in_vain >= _IN_VAIN or not len(tried):
+        if _excess(state) <= schedule.retrieved_from or in_vain >= _IN_VAIN * len(missing) or not len(tried):
             break
         trial = _try_frames(objective, state, tried, traits.seed + number, schedule, minimizer)
-        share = len(tried) / len(missing)
-        ended.n_evaluations += round(share * (trial.evaluations + schedule.reflections * _EVALUATIONS))
-        missing[tried] = ~(trial.found | trial.found_again)
-        in_vain = 0.0 if bool(trial.found.any()) else in_vain + share
+        spent = trial.evaluations + schedule.reflections * _EVALUATIONS
+        ended.n_evaluations += round(spent * len(tried) / len(missing))
+        missing[tried] = trial.missing
+        in_vain = 0 if trial.n_found else in_vain + len(tried)
         state = _descend_together(objective, trial.state, traits, schedule, minimizer, listen)
-    if _excess(state) < schedule.retrieved_gain * _excess(first):
-        ended.state, ended.retrieved = state, True
+        best = min(best, state, key=_excess)
+    if _excess(best) < schedule.retrieved_gain * _excess(first):
+        ended.state, ended.retrieved = best, True
 
 
 def _excess(state: State) -> float:
@@ -86,27 +87,30 @@ class _Trial(NamedTuple):
     """The state after a round's retrieval, and what has become of the frames that were tried.
 
     state : state with the aberrations of the frames that end lower
-    found, found_again : (n,) whether better phases have been found, or those that a frame had
+    n_found : number of frames for which better phases have been found
+    missing : (n,) whether neither better phases have been found nor those that a frame had
     evaluations : number of evaluations of these frames
     """
 
     state: State
-    found: Tensor
-    found_again: Tensor
+    n_found: int
+    missing: Tensor
     evaluations: int
 
 
 def _try_frames(
     objective: MyopicObjective, state: State, tried: Tensor, seed: int, schedule: Schedule, minimizer: Minimizer
 ) -> _Trial:
-    """Retrieve the phases of the frames `tried` (n,) from random ones, for the object of the calibrated `state`."""
+    """Retrieve the phases of the frames `tried` (n,) from random ones, for the object of the calibrated `state`.
+
+    Aberrations in common stay as they are, since only some frames may change.
+    """
     spent = 0
 
     def count(cost: float, evaluations: int, variables: Variables) -> None:
         nonlocal spent
         spent += evaluations
 
-    # aberrations in common stay as they are, since only some frames may change
     part, now = objective.of_frames(tried, free=Free.ABERRATIONS), share_noise_inflation(state).of_frames(tried)
     fresh = random_candidates(part, now, 1, schedule.start_rms, seed).state
     fields = retrieve_fields(part, fresh, schedule.reflections)
@@ -114,9 +118,19 @@ def _try_frames(
     trial = descend(part, trial, schedule.retrieved_iterations, minimizer, count)
     after, before = (part.frame_costs(now.image, z, now.calibration) for z in (trial.z, now.z))
     left, least = (s.calibration.noise_inflation for s in (calibrate(part, trial), state.of_frames(tried)))
+    lower = after < _LOWER * before
+    found = lower & (left - 1 < _FOUND * (least - 1))
+    again = (left < _AGAIN * least) & (_agreement(part, trial.z - now.z) > _ALIKE)
     z = state.z.clone()
-    z[tried] = torch.where((after < _LOWER * before)[:, None], trial.z, now.z)
-    return _Trial(replace(state, z=z), left - 1 < _FOUND * (least - 1), left < _AGAIN * least, spent)
+    z[tried] = torch.where(lower[:, None], trial.z, now.z)
+    return _Trial(replace(state, z=z), int(found.sum()), ~(found | again), spent)
+
+
+def _agreement(objective: MyopicObjective, z: Tensor) -> Tensor:
+    """Return how far fields agree (T,) whose aberrations differ by `z` (T, K): 1 if but for a constant phase."""
+    samples = objective.model.pupil.samples()
+    fields = samples.field(samples.phase(z))
+    return fields.sum(1).abs() / samples.weights.sum()
 
 
 def _descend_together(
@@ -135,7 +149,7 @@ def _descend_together(
         state = recalibrate(objective, state, traits.fit_power, follow_r0=traits.r0_is_open)
         if number == 0:
             state = centre_on_pixels(objective, state, schedule)
-        state = settle(objective, state, schedule.retrieved_settling)
+        state = settle(objective, state, schedule.last_settling)
         state = descend(objective, state, schedule.segment, minimizer, listen)
     return calibrate(objective, state)
 

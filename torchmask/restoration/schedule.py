@@ -63,7 +63,8 @@ class Schedule:
     promising : a twin is, unless its excess chi-square is below this fraction of that of the best start so far
     hopeless : a start in faint frames is, if its cost exceeds that of the best so far by more than this for each
         aberration of all frames
-    averaged : for a full pupil, number of starts that explain the frames, from the mean of whose objects the end begins
+    averaged : for a full pupil, number of starts that explain the frames, from the mean of whose objects the end
+        begins; if phases have been retrieved, there is one start only
     alike : relative difference of the excess chi-square of two starts of a full pupil below which they are the same
     outlying : a frame is outlying if its residual variance is larger than this number times that of well-fitted frames
     restarts : number of random starts of the aberrations of an outlying frame
@@ -84,7 +85,8 @@ class Schedule:
     move_size : size of the first moves, in standard deviations of Laplace's approximation
     renewal : number of rounds after which that approximation is recomputed
     settling : maximum number of iterations that fit the object in a round
-    last_settling : the same after the last descent, and for a full pupil before each of its segments
+    last_settling : the same after the last descent, and for a full pupil before each of its segments and of those
+        between rounds of phase retrieval
     last_modes : number of modes of each sub-aperture of a mask in the last descent of frames that are not faint
     last_modes_full : the same of a full pupil, however faint
     last_segments : maximum number of segments of that descent; 0: there is none
@@ -93,7 +95,6 @@ class Schedule:
     retrieved_from : a round is made while the mean chi-square is above that of noise by more than this
     reflections : number of reflections of a round
     retrieved_iterations : maximum number of iterations that fit the modes of the phases retrieved
-    retrieved_settling : maximum number of iterations that then settle the object, before each segment
     retrieved_segments : number of segments in which object and aberrations then descend
     retrieved_gain : what the rounds have found is kept if the excess chi-square falls below this fraction
     """
@@ -149,7 +150,6 @@ class Schedule:
     retrieved_from: float = 0.5
     reflections: int = 600
     retrieved_iterations: int = 60
-    retrieved_settling: int = 80
     retrieved_segments: int = 2
     retrieved_gain: float = 0.7
 

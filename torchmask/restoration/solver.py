@@ -96,7 +96,8 @@ class Solver:
         is_open = traits.prior_on_aberrations and Free.OBJECT | Free.ABERRATIONS in objective.free
         many_ends = is_open and traits.many_minima and not traits.estimated
         self.averages: bool = many_ends and schedule.averaged > 1
-        self.retrieves: bool = many_ends and schedule.retrievals > 0 and objective.model.pupil.n_rasters == 1
+        retrievable = objective.model.pupil.n_rasters == 1 and len(objective.frames) > 1
+        self.retrieves: bool = many_ends and schedule.retrievals > 0 and retrievable
         goes_on = many_ends or (is_open and not traits.many_minima)
         self.end: End = End.of(stack.change, schedule, of_mask=not traits.many_minima) if goes_on else End.NONE
         self.judge: Judge = Judge(self.setting, stack, traits, schedule, self.end)
