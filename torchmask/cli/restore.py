@@ -86,7 +86,7 @@ class Options(BandOptions, StackOptions, OIFITSOptions, WorkerOptions, RunOption
     """Weight of the total variation of the object, dimensionless; a larger weight gives a smoother image."""
     max_iterations: int = 4000
     """Maximum number of iterations over all starts, each of at most 1000; a full pupil averages three starts, unless
-    its phases are retrieved after the first."""
+    its phases are retrieved before."""
     tolerance: float = 1e-4
     """Converged when 100 iterations lower the cost by less than this fraction; behind a mask, 0.001 is enough where
     bright frames are explained, as another descent follows."""

@@ -69,7 +69,7 @@ class Progress:
     last_segments : number of segments of the last descent that are done; all there may be, once it gains no more
     integrated : whether the aberrations have been integrated out, which is done at the end and not stored
     averaged : number of starts whose objects have been averaged, before the last descent
-    retrieved : whether phases have been retrieved, after the first start
+    retrieved : whether phases have been retrieved, after the present start
     """
 
     candidates: Candidates

@@ -35,7 +35,6 @@ _FOUND = 0.75  # of a frame's excess chi-square before: with no more left, its p
 _AGAIN = 1.1  # of its chi-square before: with no more left,
 _ALIKE = 0.8  # and fields that agree so far (1: all over the pupil), random phases have led back to where a frame was
 _POOR = 2.0  # of the median chi-square: a frame with more is tried again, whatever was found
-_IN_VAIN = 2  # tries of every frame without one that is found in between, after which there are no more
 _CORRECTIONS = 3  # of the modes by the phase that is left
 _EVALUATIONS = STEPS / 2 + 1  # whose FFTs a reflection makes
 
@@ -51,7 +50,7 @@ def retrieve_phases(
     """Give `ended` the state to which phase retrieval leads, if that leaves clearly less of the frames unexplained.
 
     A round tries the frames that leave more than the noise and whose phases have not been found. There are rounds while
-    more is left of all frames than the noise, until twice as many tries as frames were in vain. The best is kept.
+    more is left of all frames than the noise, until as many tries as there are frames were in vain. The best is kept.
     """
     first = best = state = calibrate(objective, ended.state)
     n_iterations = schedule.retrieved_segments * schedule.segment
@@ -59,7 +58,7 @@ def retrieve_phases(
     missing, in_vain = state.calibration.noise_inflation - 1 > schedule.retrieved_from, 0
     for number in range(schedule.retrievals):
         tried = (missing | _is_poor(state)).nonzero().flatten()
-        if _excess(state) <= schedule.retrieved_from or in_vain >= _IN_VAIN * len(missing) or not len(tried):
+        if _excess(state) <= schedule.retrieved_from or in_vain >= len(missing) or not len(tried):
             break
         trial = _try_frames(objective, state, tried, traits.seed + number, schedule, minimizer)
         spent = trial.evaluations + schedule.reflections * _EVALUATIONS

@@ -64,7 +64,7 @@ class Schedule:
     hopeless : a start in faint frames is, if its cost exceeds that of the best so far by more than this for each
         aberration of all frames
     averaged : for a full pupil, number of starts that explain the frames, from the mean of whose objects the end
-        begins; if phases have been retrieved, there is one start only
+        begins; no other start is made once phases have been retrieved
     alike : relative difference of the excess chi-square of two starts of a full pupil below which they are the same
     outlying : a frame is outlying if its residual variance is larger than this number times that of well-fitted frames
     restarts : number of random starts of the aberrations of an outlying frame
@@ -91,7 +91,8 @@ class Schedule:
     last_modes_full : the same of a full pupil, however faint
     last_segments : maximum number of segments of that descent; 0: there is none
     last_gain : it ends when the second half of a segment lowers the cost by less than this fraction
-    retrievals : for a full pupil, maximum number of rounds of phase retrieval after the first start; 0: there is none
+    retrievals : for a full pupil, maximum number of rounds of phase retrieval after a start; 0: there is none
+    retrieved_starts : number of starts after which phases are retrieved, until they are found
     retrieved_from : a round is made while the mean chi-square is above that of noise by more than this
     reflections : number of reflections of a round
     retrieved_iterations : maximum number of iterations that fit the modes of the phases retrieved
@@ -147,6 +148,7 @@ class Schedule:
     last_segments: int = 20
     last_gain: float = 0.003
     retrievals: int = 8
+    retrieved_starts: int = 2
     retrieved_from: float = 0.5
     reflections: int = 600
     retrieved_iterations: int = 60

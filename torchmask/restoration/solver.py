@@ -5,10 +5,9 @@ proceeds in segments. Between two of them, the scales of the variables, the tran
 turbulence and the noise are updated; the assumed noise falls from the residual of the mean frame to the true noise, or
 to the residual of the model, if that is larger. Once the object is sharp, frames and object escape from local minima;
 when nothing changes any more, each frame is weighted by how well it fits. A start ends when a segment gains nothing, or
-little if it explains the frames, or its iterations are used up. Phases of a full pupil's bright frames are retrieved
-after the first. If it missed the object, or frames are faint, others start, from random aberrations or, for a mask,
-from twins of the object; the best is kept, or the mean for a full pupil. Then aberrations of faint frames are
-integrated out, those of others gain modes.
+little if it explains the frames, or its iterations are used up. Then phases of a full pupil's bright frames are
+retrieved. If it missed the object, or frames are faint, others start, from random aberrations or twins of the object;
+the best is kept, or the mean for a full pupil. Then aberrations of faint frames are integrated out, others gain modes.
 """
 
 from __future__ import annotations
@@ -146,7 +145,8 @@ class Solver:
             go_on = self._play if progress.candidates.n_each > 1 else self._advance
             go_on(progress)
             if progress.status is not Status.RUNNING:
-                if self.retrieves and progress.starts == 1 and progress.status is not Status.ITERATION_LIMIT:
+                among_first = progress.starts <= self.schedule.retrieved_starts
+                if self.retrieves and among_first and progress.status is not Status.ITERATION_LIMIT:
                     retrieve_phases(self.objective, progress, *self._how, self.callback)
                 if may_start_again and not progress.retrieved:
                     self._judge_start(progress)
