@@ -206,11 +206,12 @@ class Script:
     """
 
     def __init__(self, monkeypatch, results):
-        self.results, self.tried = results, []
+        self.results, self.tried, self.seeds = results, [], []
         monkeypatch.setattr(retrieval, "_try_frames", self.try_frames)
         monkeypatch.setattr(retrieval, "_descend_together", lambda objective, state, *given, **more: state)
 
-    def try_frames(self, objective, state, tried, *given):
+    def try_frames(self, objective, state, tried, seed, *given):
+        self.seeds.append(seed)
         found = self.results[len(self.tried)]
         self.tried.append(tried.tolist())
         said = [found[number] for number in self.tried[-1]]
@@ -271,6 +272,18 @@ def test_a_frame_is_found_where_clearly_less_is_left_and_again_where_as_much_is(
     torch.testing.assert_close(trial.state.z, truth.z, rtol=1e-12, atol=1e-12)
 
 
+def test_a_frame_that_is_hardly_better_has_not_been_found(monkeypatch):
+    """It keeps what it gains: a step of a twentieth towards the truth leaves 0.9 of the excess, to second order."""
+    objective, truth = problem(4, rms=0.1, noise=0.1)
+    start = calibrate(objective, lost(truth))
+    z = start.z + 0.05 * (truth.z - start.z)
+    monkeypatch.setattr(retrieval, "parameters_of_fields", lambda part, fields, now: z)
+    schedule = Schedule(retrieved_iterations=0, reflections=1)
+    trial = retrieval._try_frames(objective, start, torch.arange(4), 0, schedule, ProjectedLBFGS())
+    assert trial.n_found == 0
+    torch.testing.assert_close(trial.state.z, z, rtol=1e-12, atol=1e-12)
+
+
 def test_a_frame_that_fits_as_badly_with_other_phases_is_missing_still(monkeypatch):
     """Only the fields tell that from one which comes back to where it was."""
     objective, truth = problem(3, rms=0.2, noise=0.1)
@@ -290,8 +303,10 @@ def test_frames_at_the_noise_are_not_tried(monkeypatch):
     objective, truth = problem(4, rms=0.2)
     monkeypatch.setattr(retrieval, "calibrate", lambda objective, state: state)
     script = Script(monkeypatch, [(NO, NO, NO, NO)] * 9)
-    retrieve(objective, left(truth, 0.4, 3.0, 0.1, 0.45), retrievals=9)
+    ended = retrieve(objective, left(truth, 0.4, 3.0, 0.1, 0.45), retrievals=9, reflections=60)
     assert script.tried == [[1]] * 4
+    assert script.seeds == [0, 1, 2, 3]  # other phases each time
+    assert ended.n_evaluations == 4 * 60 * (STEPS + 2) / 2 / 4  # of one frame of four
 
 
 def test_the_best_of_all_rounds_is_kept(monkeypatch):
@@ -344,6 +359,7 @@ def test_objects_are_moved_to_where_they_fit_best_between_rounds(monkeypatch):
         ({"max_iterations": 7}, True, [], 7),  # a start that was cut short may go on
         ({"wavelengths": (550e-9, 600e-9)}, True, [], 24),  # a field of one wavelength is no start for two
         ({"retrievals": 0}, True, [], 24),
+        ({"n_frames": 1}, True, [], 8),  # the object of one frame is no help for its phases
         ({"known": True}, True, [], 8),
         ({"aperture": SparseAperture([[0.0, 0.3], [0.3, -0.2], [-0.3, -0.2]], 0.2, 1.0)}, True, [], 8),
     ],
@@ -356,7 +372,7 @@ def test_phases_are_retrieved_after_the_first_starts_of_a_full_pupil(change, fin
         ended.retrieved = finds
 
     monkeypatch.setattr(solver, "retrieve_phases", stand_in)
-    objective, truth = problem(3, rms=0.2)
+    objective, truth = problem(change.get("n_frames", 3), rms=0.2)
     options = {"candidates": ((2, 4),), "segment": 4, "sharp_after": 4, "escapes": 0, "start_iterations": 8}
     options |= {"chance": 1e9, "alike": -1.0, "last_segments": 0, "retrievals": change.get("retrievals", 8)}
     options |= {"retrieved_starts": change.get("retrieved_starts", 2)}
