@@ -11,20 +11,20 @@ from torchmask.optics.aperture import SparseAperture
 from torchmask.restoration.aberrations import turbulent_basis
 from torchmask.restoration.calibration import fit_of_frames
 from torchmask.restoration.forward import ExposureModel
-from torchmask.restoration.twins import piston_parameters, twin_of
+from torchmask.restoration.twins import twin_of
 
 PISTONS = torch.tensor([2.0, -1.0, 0.5, 0.0, -2.5], dtype=torch.float64)
 
 
 def test_pistons_leave_all_other_modes_alone(five_hole_basis):
-    found = five_hole_basis.coefficients(piston_parameters(five_hole_basis, PISTONS))
+    found = five_hole_basis.coefficients(five_hole_basis.parameters_of_pistons(PISTONS))
     torch.testing.assert_close(found[:, 0], PISTONS - PISTONS.mean())  # the mean piston cannot be seen
     assert float(found[:, 1:].abs().max()) < 1e-12
 
 
 def test_common_modes_keep_out_of_it(five_holes):
     basis = turbulent_basis(five_holes, 3, 2, 0.2, 20.0)
-    found = piston_parameters(basis, PISTONS)
+    found = basis.parameters_of_pistons(PISTONS)
     assert len(found) == basis.n_parameters
     assert not found[basis.n_own :].any()
     torch.testing.assert_close(basis.coefficients(found)[:, 0], PISTONS - PISTONS.mean())
@@ -40,7 +40,7 @@ def test_pistons_turn_the_phases_of_isolated_baselines_and_nothing_else(isolated
     model = ExposureModel(mask, grid, basis)
     z = torch.randn(2, basis.n_parameters, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     pistons = torch.tensor([1.0, -0.7, 0.2], dtype=torch.float64)
-    before, after = (torch.fft.fft2(model.psf(one)) for one in (z, z + piston_parameters(basis, pistons)))
+    before, after = (torch.fft.fft2(model.psf(one)) for one in (z, z + basis.parameters_of_pistons(pistons)))
     off = (before.abs() - after.abs()).abs().max() / before.abs().max()
     if not isolated:
         assert off > 0.01

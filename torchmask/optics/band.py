@@ -132,7 +132,7 @@ class Band:
         >>> round(1e9 * Band.top_hat(550e-9, 55e-9).width, 6)
         55.0
         """
-        mean, pairs = self._mean, zip(self.wavelengths, self.shares, strict=True)
+        mean, pairs = self.mean, zip(self.wavelengths, self.shares, strict=True)
         return math.sqrt(12 * math.fsum(share * (wavelength - mean) ** 2 for wavelength, share in pairs))
 
     @property
@@ -142,10 +142,15 @@ class Band:
         >>> round(Band.top_hat(550e-9, 55e-9).relative_width, 6)
         0.1
         """
-        return self.width / self._mean
+        return self.width / self.mean
 
     @property
-    def _mean(self) -> float:
+    def mean(self) -> float:
+        """Mean wavelength of the light [m].
+
+        >>> round(1e9 * Band.of([500e-9, 600e-9], [3, 1]).mean, 6)
+        525.0
+        """
         return math.fsum(share * wavelength for wavelength, share in zip(self.wavelengths, self.shares, strict=True))
 
 

@@ -115,6 +115,11 @@ class AberrationBasis(nn.Module):
         z = (flat - shared @ common.T) @ torch.linalg.pinv(own).T
         return torch.cat([z, shared.expand(len(z), -1)], dim=1)
 
+    def parameters_of_pistons(self, pistons: Tensor) -> Tensor:
+        """Return the parameters (..., K) whose coefficients are closest to pistons (..., N) [rad] and nothing else."""
+        own = torch.linalg.pinv(self.mixing[:, : self.n_own].double())[:, :: self.n_modes]
+        return nn.functional.pad(pistons.to(own) @ own.T, (0, self.n_common))
+
     def with_common_of(self, z: Tensor, other: Tensor) -> Tensor:
         """Return z (..., T, K) with the common parameters of `other` (..., T or 1, K)."""
         if not self.n_common:

@@ -1,10 +1,10 @@
-"""Two ways out of local minima that a descent does not find.
+"""Ways out of local minima that a descent does not find.
 
 Outlying frames: for a fixed object, the aberrations of a frame are a small separate problem, for which several random
-starts are cheap. Sub-pixel position of the object: the frames do not constrain it, as a shift of the object and the
-opposite tilt of all frames give the same images. The prior on the object does, because edges and points that are
-centred on pixels have the least total variation and no negative side lobes. A descent hardly moves along this
-direction, so the best position is searched directly.
+starts are cheap. Fringes: in a band, pistons may be whole waves off (`fringes`). Sub-pixel position of the object: the
+frames do not constrain it, as a shift of the object and the opposite tilt of all frames give the same images. The prior
+on the object does, because edges and points that are centred on pixels have the least total variation and no negative
+side lobes. A descent hardly moves along this direction, so the best position is searched directly.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from torchmask.metrics import shift
 from torchmask.restoration.calibration import calibrate
 from torchmask.restoration.descent import Variables, descend
 from torchmask.restoration.forward import ExposureModel
+from torchmask.restoration.fringes import change_fringes
 from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.priors import ObjectPrior
 from torchmask.restoration.projected_lbfgs import Minimizer, minimize_bounded
@@ -36,7 +37,7 @@ def escape(
     minimizer: Minimizer,
     number: int,
 ) -> tuple[State, int]:
-    """Try both ways out, for the `number`-th time; return the state, itself if neither gains, and the evaluations.
+    """Try all ways out, for the `number`-th time; return the state, itself if none gains, and the evaluations.
 
     Frames of a full pupil already had many starts in the tournament, unless they started from a sensor's estimate.
     """
@@ -44,6 +45,8 @@ def escape(
     if traits.estimated or not traits.many_minima:
         seed = traits.seed + number
         state, evaluations = restart_outlier_frames(objective, state, first_inflation, schedule, minimizer, seed)
+        state, tried = change_fringes(objective, state)
+        evaluations += tried
     if Free.OBJECT in objective.free:
         state = centre_on_pixels(objective, state, schedule)
     return state, evaluations

@@ -13,9 +13,7 @@ import math
 from dataclasses import replace
 
 import torch
-from torch import Tensor
 
-from torchmask.restoration.aberrations import AberrationBasis
 from torchmask.restoration.escapes import settle
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.state import State
@@ -32,11 +30,5 @@ def twin_of(objective: MyopicObjective, state: State, inflation: float, seed: in
     generator = torch.Generator().manual_seed(seed)
     uniform = torch.rand(basis.n_subapertures, dtype=torch.float64, device="cpu", generator=generator)
     pistons = math.pi * (2 * uniform - 1)
-    z = state.z + piston_parameters(basis, pistons).to(state.z)
+    z = state.z + basis.parameters_of_pistons(pistons).to(state.z)
     return settle(objective, replace(state, z=z).with_noise_inflation(inflation), _SETTLING)
-
-
-def piston_parameters(basis: AberrationBasis, pistons: Tensor) -> Tensor:
-    """Return the parameters (K,) whose coefficients are closest to the given `pistons` (N,) [rad]."""
-    own = torch.linalg.pinv(basis.mixing[:, : basis.n_own].double())[:, :: basis.n_modes]
-    return torch.cat([own @ pistons.to(own), own.new_zeros(basis.n_common)])
