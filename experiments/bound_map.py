@@ -21,8 +21,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
+from map_draws import DIAMETER, FILL_FACTOR, OUTER_SCALE, READOUT_NOISE, WAVELENGTH, of_pupil
 from searched_masks import search_masks
-from success_map import DIAMETER, FILL_FACTOR, OUTER_SCALE, READOUT_NOISE, WAVELENGTH, of_mask
 
 from torchmask.cli.options import SweepOptions
 from torchmask.cli.program import run_script
@@ -80,7 +80,7 @@ def bound(task: Mapping[str, Any]) -> dict[str, Any]:
 
 def measure(options: Options, mask: SparseAperture, callback: Callback) -> list[dict[str, Any]]:
     """Return a row for each bound."""
-    common = {"strength": options.strength, "n_pixels": options.n_pixels} | of_mask(mask)
+    common = {"strength": options.strength, "n_pixels": options.n_pixels} | of_pupil(mask)
     points = [
         dict(zip(KEYS, (modes, n_frames, photons), strict=True)) | {"draw": draw}
         for n_frames, draws in zip(options.frames, options.draws, strict=True)

@@ -84,6 +84,8 @@ def figure(cells: Sequence[Mapping[str, Any]]) -> Figure:
     """Draw what is expected of instants in narrow light, what was restored, and what a plan makes of the first."""
     sheet = new_figure(6.4, 4.0)
     axes = sheet.subplots(1, 2, sharey=True)
+    least = min(cell["restored"] for cell in cells)
+    ticks = [tick for tick in (0.02, 0.05, 0.1, 0.2, 0.3, 0.4) if tick > least]
     for ax, (axis, label) in zip(axes, AXES.items(), strict=True):
         for color, photons in zip(COLORS, sorted({cell["n_photons"] for cell in cells}), strict=False):
             own = [cell for cell in cells if (cell["axis"], cell["n_photons"]) == (axis, photons)]
@@ -95,7 +97,7 @@ def figure(cells: Sequence[Mapping[str, Any]]) -> Figure:
             ax.plot(amounts, expected, ":", color=color, lw=1.1)
             ax.plot(amounts, [cell["ratio"] * cell["expected"] for cell in own], "-", color=color, lw=1.2)
         ax.set(yscale="log", xlabel=label)
-        ax.set_yticks(ticks := (0.1, 0.2, 0.3, 0.4), map(str, ticks))
+        ax.set_yticks(ticks, map(str, ticks))
         ax.minorticks_off()
     axes[0].set_ylabel("score (0 is perfect)")
     axes[0].plot([], [], ":", color=FAINT, lw=1.1, label="expected of instants in narrow light")

@@ -26,6 +26,7 @@ def summarise(rows: Sequence[Mapping[str, Any]], factors: Mapping[tuple[Any, ...
             dict(zip(KEYS, key, strict=True))
             | {"tried": len(own), "succeeded": sum(ratio <= SUCCESS for ratio in ratios)}
             | {"cost": statistics.median(ratios), "bound": factors.get(key)}
+            | {"level": statistics.geometric_mean(row["known"] / row["predicted"] for row in own)}
             | {name: statistics.geometric_mean(row[name] for row in own) for name in ("known", "score")}
         )
     return cells
@@ -48,28 +49,29 @@ def markdown(setting: str, cells: Sequence[Mapping[str, Any]]) -> str:
 
 
 @styled
-def figure(rows: Sequence[Mapping[str, Any]], cells: Sequence[Mapping[str, Any]]) -> Figure:
-    """Known, bound and blind over the photons: a column for each number of frames, a row for each d/r0 with a bound."""
-    sizes = sorted({cell["d_over_r0"] for cell in cells if cell["bound"]})
+def figure(rows: Sequence[Mapping[str, Any]], cells: Sequence[Mapping[str, Any]], sizes: Sequence[float]) -> Figure:
+    """Known, bound and blind over the photons: a column for each number of frames, a row for each of some d/r0."""
     numbers = sorted({cell["n_frames"] for cell in cells})
     sheet = new_figure(5.2, 0.9 + 1.8 * len(sizes))
     axes = sheet.subplots(len(sizes), len(numbers), sharex=True, sharey=True, squeeze=False)
+    least = min(cell["known"] for cell in cells)
+    ticks = [tick for tick in (0.02, 0.05, 0.1, 0.2, 0.5) if tick > least]
     for (i, size), (j, n_frames) in itertools.product(enumerate(sizes), enumerate(numbers)):
         ax, place = axes[i][j], (n_frames, size)
         own = [cell for cell in cells if (cell["n_frames"], cell["d_over_r0"]) == place]
         every = [row for row in rows if (row["n_frames"], row["d_over_r0"]) == place]
         photons = [cell["n_photons"] for cell in own]
         known = [cell["known"] for cell in own]
-        least = [cell["known"] * cell["bound"] for cell in own]
         ax.plot(
             [row["n_photons"] for row in every], [row["score"] for row in every], ".", color=COLORS[1], alpha=0.35, ms=4
         )
         ax.plot(photons, [cell["score"] for cell in own], "o-", color=COLORS[1], ms=4, label="blind")
-        ax.plot(photons, least, "-", color=COLORS[0], label="bound")
+        if all(cell["bound"] for cell in own):
+            ax.plot(photons, [cell["known"] * cell["bound"] for cell in own], "-", color=COLORS[0], label="bound")
         ax.plot(photons, known, "--", color=INK, lw=1.1, label="known PSFs")
         ax.set(xscale="log", yscale="log")
         ax.set_title(f"{n_frames} frame{'s' * (n_frames > 1)}, {size:g} r$_0$")
-        ax.set_yticks([0.05, 0.1, 0.2, 0.5], ["0.05", "0.1", "0.2", "0.5"])
+        ax.set_yticks(ticks, map(str, ticks))
         ax.minorticks_off()
     sheet.supxlabel("photons per frame", fontsize=9)
     sheet.supylabel("score (0 is perfect)", fontsize=9)

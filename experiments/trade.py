@@ -51,7 +51,7 @@ class Trade:
     where: str
 
     def summarise(
-        self, rows: Sequence[Mapping[str, Any]], predicted: Mapping[tuple[str, float], Mapping[str, float | None]]
+        self, rows: Sequence[Mapping[str, Any]], predicted: Mapping[tuple[str, float], Mapping[str, float]]
     ) -> list[dict[str, Any]]:
         """Return one cell for each instrument and amount, with the scores that `predictions` give."""
         keys = dict.fromkeys((row["instrument"], row[self.key]) for row in rows)
@@ -68,14 +68,12 @@ class Trade:
             own = [cell for cell in cells if cell["instrument"] == which]
             if own:
                 best = min(own, key=lambda cell: cell["score"])
-                blind = ""
-                if best["predicted_blind"] is not None:
-                    blind = f", or {between(own, self.key, 'predicted_blind'):.2g} with what restorations lose"
                 lines.append(
                     f"The {name} is best at {self.name} = {optimum(own, self.key)}, with a score of "
                     f"{best['score']:.3f}; {best['kept']:.3f} of V^2 is kept {self.where} there. "
                     f"Between the amounts the best is {between(own, self.key, 'score'):.2g}, and that predicted for "
-                    f"known PSFs {between(own, self.key, 'predicted'):.2g}{blind}."
+                    f"known PSFs {between(own, self.key, 'predicted'):.2g}, or "
+                    f"{between(own, self.key, 'predicted_blind'):.2g} with what restorations lose."
                 )
         return lines
 
@@ -109,10 +107,19 @@ def predict(task: Mapping[str, Any]) -> dict[str, Any]:
 
 def criterion(task: Mapping[str, Any]) -> TurbulentMSE:
     """Return the criterion at the conditions of a task, for what lies within the diffraction limit."""
+    return criterion_of(task, light(task))
+
+
+def light(task: Mapping[str, Any]) -> float:
+    """Return the electrons per frame through the aperture of a task, which tells those through the mask."""
     aperture, mask = instrument(task), instrument({**task, "instrument": "mask"})
+    return float(task["n_photons"] * aperture.area / mask.area)
+
+
+def criterion_of(task: Mapping[str, Any], photons: float) -> TurbulentMSE:
+    """Return the criterion at the conditions of a task, with so many electrons in each frame."""
     side, r0 = task["n_pixels"], DIAMETER / task["d_over_r0"]
     grid = Grid.nyquist(DIAMETER, WAVELENGTH, 2 * side, task.get("oversampling", 1.0))
-    photons = float(task["n_photons"] * aperture.area / mask.area)
     exposure = task.get("exposure", 0.0) * Seeing(r0, wind=WIND).tau0
     band = Band.top_hat(WAVELENGTH, task["band"] * WAVELENGTH, 5) if "band" in task else Band.of([WAVELENGTH])
     signal = PowerLawPSD(1.5, photons, 1 / (SIZE * side))(grid)
@@ -127,7 +134,7 @@ def criterion(task: Mapping[str, Any]) -> TurbulentMSE:
 
 def predictions(
     options: ObservingOptions, key: str, settings: Iterable[Mapping[str, Any]], callback: Callback
-) -> dict[tuple[str, float], dict[str, float | None]]:
+) -> dict[tuple[str, float], dict[str, float]]:
     """Return the predicted scores for each instrument and amount: for known PSFs, and blind as a plan says it."""
     common, cases = shared(options, callback), list(itertools.product(options.instruments, settings))
     tasks: list[dict[str, Any]] = [common | dict(setting) | {"instrument": which} for which, setting in cases]
@@ -138,18 +145,16 @@ def predictions(
     }
 
 
-def blind(task: Mapping[str, Any], instants: float) -> float | None:
-    """Return what a plan makes of the score predicted for instants in narrow light; None for a full pupil.
+def blind(task: Mapping[str, Any], instants: float) -> float:
+    """Return what a plan makes of the score predicted for instants in narrow light.
 
     Beyond what was tried, the nearest edge is taken.
     """
-    if task["instrument"] != "mask":
-        return None
-    size, photons = task["subaperture_diameter"] / DIAMETER * task["d_over_r0"], task["n_photons"]
+    size, photons = instrument(task).subaperture_diameter / DIAMETER * task["d_over_r0"], light(task)
     exposure, spread = task.get("exposure", 0.0), phase_spread(task.get("band", 0.0), task["d_over_r0"])
     with warnings.catch_warnings(action="ignore", category=UserWarning):
-        found = success_map().outlook(size, photons, task["n_frames"])
-        outlook = smearing_map().outlook(found, n_photons=photons, exposure=exposure, spread=spread)
+        found = success_map(task["instrument"]).outlook(size, photons, task["n_frames"])
+        outlook = smearing_map(task["instrument"]).outlook(found, n_photons=photons, exposure=exposure, spread=spread)
     return math.sqrt(outlook.mse(instants**2, instants**2))
 
 
@@ -162,9 +167,8 @@ def figure(trade: Trade, cells: Sequence[Mapping[str, Any]]) -> Figure:
     for (which, name), color in zip(INSTRUMENTS.items(), COLORS, strict=False):
         own = [cell for cell in cells if cell["instrument"] == which]
         for key, style, told in (("predicted", ":", "known PSFs"), ("predicted_blind", "-.", "blind")):
-            drawn = [cell for cell in own if cell[key] is not None]
-            if drawn:
-                x, y = ([cell[axis] for cell in drawn] for axis in (trade.key, key))
+            if own:
+                x, y = ([cell[axis] for cell in own] for axis in (trade.key, key))
                 ax.plot(x, y, style, color=color, linewidth=1.1, label=f"{name}, predicted, {told}")
     ax.set(xscale="log", xlabel=trade.label, ylabel="score (0 is perfect)")
     ticks = sorted({cell[trade.key] for cell in cells})

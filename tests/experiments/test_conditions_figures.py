@@ -94,12 +94,20 @@ def test_a_predicted_score_is_that_of_the_criterion_for_the_same_light(monkeypat
 
 def test_a_blind_prediction_is_what_a_plan_makes_of_instants():
     """The square of a score is an error; beyond what was tried (2e3 photons) its edge counts, without a warning."""
-    task = {"instrument": "mask", "subaperture_diameter": 0.2, "d_over_r0": 4.0, "n_photons": 2e3, "n_frames": 8}
-    task |= {"exposure": 2.0, "band": 0.1}
+    task = {"instrument": "mask", "centers": [[-0.4, 0.0], [0.4, 0.0]], "subaperture_diameter": 0.2}
+    task |= {"d_over_r0": 4.0, "n_photons": 2e3, "n_frames": 8, "exposure": 2.0, "band": 0.1}
     found = success_map().outlook(0.8, 1e4, 8)
     outlook = smearing_map().outlook(found, n_photons=1e4, exposure=2.0, spread=phase_spread(0.1, 4.0))
     assert trade.blind(task, 0.3) == pytest.approx(0.3 * found.cost * outlook.restored, rel=1e-12)
-    assert trade.blind(task | {"instrument": "full"}, 0.3) is None
+
+
+def test_a_blind_prediction_for_a_full_pupil_is_that_of_its_own_light_and_diameter():
+    centers = [[-0.4, 0.0], [0.4, 0.0]]  # the full pupil is as wide as they reach, 1, and has 12.5 times their light
+    task = {"instrument": "full", "centers": centers, "subaperture_diameter": 0.2, "d_over_r0": 4.0, "n_frames": 8}
+    found = success_map("full").outlook(4.0, 12.5e5, 8)
+    outlook = smearing_map("full").outlook(found, n_photons=12.5e5, exposure=0.0, spread=phase_spread(0.1, 4.0))
+    expected = 0.3 * max(1.0, found.cost) * outlook.restored
+    assert trade.blind(task | {"n_photons": 1e5, "band": 0.1}, 0.3) == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize("name", SCRIPTS)

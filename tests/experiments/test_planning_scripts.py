@@ -4,6 +4,7 @@ import json
 import statistics
 
 import bound_map
+import map_draws
 import number_of_holes
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import smearing_map_report
 import success_map
 import torch
 
+import torchmask
 from torchmask.optics.aperture import SparseAperture
 from torchmask.planning.smearing import SmearingMap, phase_spread
 from torchmask.planning.success import SuccessMap
@@ -24,7 +26,7 @@ def test_a_tiny_map_is_what_the_plan_can_read(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert success_map.main(["--smoke", "--workers", "1", "--out", "run"]) == 0
     result = json.loads((tmp_path / "run/success_map.json").read_text())
-    measured = SuccessMap(**json.loads((tmp_path / "run/success.json").read_text()))
+    measured = SuccessMap(**json.loads((tmp_path / "run/success_mask.json").read_text()))
     assert measured.tried.sum() == len(result["rows"]) == 8
     for cell in result["cells"]:
         (row,) = (row for row in result["rows"] if all(row[key] == cell[key] for key in success_map.KEYS))
@@ -32,8 +34,36 @@ def test_a_tiny_map_is_what_the_plan_can_read(tmp_path, monkeypatch):
         assert outlook.cost == pytest.approx(row["score"] / row["known"])
         assert outlook.success == (row["score"] <= 1.3 * row["known"])
         assert cell["bound"] >= 1
+        assert outlook.restored == pytest.approx(row["known"] / row["predicted"])
     assert (tmp_path / "run/success_map.png").read_bytes().startswith(b"\x89PNG")
     assert sum(line.startswith("| ") for line in (tmp_path / "run/success_map.md").read_text().splitlines()) == 5
+
+
+def test_a_full_pupil_is_observed_without_a_search_and_without_a_bound():
+    options = success_map.Options(pupil="full")
+    (pupil,) = map_draws.choose_pupils("full", 1, options, None)
+    task = map_draws.of_pupil(pupil) | {"draw": 1, "n_photons": 1e6, "d_over_r0": 2.0, "n_frames": 2, "n_pixels": 32}
+    observation = success_map.observe(task)
+    assert observation.aperture.is_full
+    assert float(observation.aperture.subaperture_diameter) == map_draws.DIAMETER
+    # D/r0 = 2: the phase is that of r0 = D / 2 (1.03 (D/r0)^(5/3) rad^2 without piston, for an endless outer scale)
+    variance = float(success_map.fit_modes(observation, 10)[..., 1:].square().sum(-1).mean())
+    assert 0.2 < variance / (1.03 * 2 ** (5 / 3)) < 3
+    assert success_map.bounds(options, pupil, None) == {}
+    told = success_map.setting(options, [{"tried": 8}])
+    assert "at each point: a full pupil, a satellite" in told
+    assert "mask" not in told.removesuffix(f"torchmask {torchmask.__version__}.")
+
+
+def test_predictions_are_for_the_turbulence_over_the_telescope(monkeypatch):
+    def answer(function, tasks, folder, **settings):
+        assert function is map_draws.predict
+        return [{"scores": [task["d_over_r0"], 10 * task["d_over_r0"]]} for task in tasks]
+
+    monkeypatch.setattr(success_map, "run_tasks", answer)
+    options = success_map.Options(d_over_r0=(0.5,), photons=(1e4, 1e5), frames=(3,), draws=(1,))
+    found = success_map.predictions(options, [THREE], None)  # holes of a quarter of the telescope: D/r0 = 2
+    assert found == {(0, 3, 1e4, 0.5): 2.0, (0, 3, 1e5, 0.5): 20.0}
 
 
 def test_the_map_of_smearing_is_what_the_plan_can_read(tmp_path, monkeypatch):
@@ -43,12 +73,12 @@ def test_the_map_of_smearing_is_what_the_plan_can_read(tmp_path, monkeypatch):
         return {"score": 0.2 * (1 + task["exposure"] + 10 * task["width"]) ** 0.5 * (task["n_photons"] / 1e5) ** -0.4}
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(smearing_map, "choose_masks", lambda n_draws, options, callback: [THREE])
-    monkeypatch.setattr(smearing_map, "success_map", lambda: ATLAS)
+    monkeypatch.setattr(smearing_map, "choose_pupils", lambda pupil, n_draws, options, callback: [THREE])
+    monkeypatch.setattr(smearing_map, "success_map", lambda pupil: ATLAS)
     monkeypatch.setattr(smearing_map, "predict", lambda task: {"scores": [0.1 * task["oversampling"]] * 2})
     monkeypatch.setattr(smearing_map, "measure", restored)
     assert smearing_map.main(["--smoke", "--workers", "1", "--out", "run"]) == 0
-    measured = SmearingMap(**json.loads((tmp_path / "run/smearing.json").read_text()))
+    measured = SmearingMap(**json.loads((tmp_path / "run/smearing_mask.json").read_text()))
     assert (measured.exposures, measured.n_photons) == ([0.0, 2.0], [1e5, 1e6])
     assert measured.spreads == [phase_spread(width, 4.0) for width in (0.02, 0.2)]
     levels = np.array([[2 / 1.5], [2 * 0.1**0.4 / 1.5]])
@@ -61,7 +91,7 @@ def test_the_map_of_smearing_is_what_the_plan_can_read(tmp_path, monkeypatch):
 
 def test_a_point_of_smearing_is_restored_in_its_band():
     task = {"draw": 1, "n_photons": 1e6, "exposure": 0.0, "width": 0.1, "d_over_r0": 2.0, "n_frames": 2}
-    task |= {"n_pixels": 24, "iterations": 4} | success_map.of_mask(THREE)
+    task |= {"n_pixels": 24, "iterations": 4} | map_draws.of_pupil(THREE)
     assert 0 < smearing_map.measure(task)["score"] < 1
 
 
@@ -85,7 +115,7 @@ def test_ratios_of_smearing_are_means_of_draws_that_do_not_fall():
 
 
 def test_scenes_differ_and_hold_the_light():
-    scenes = [success_map.scene_of(draw, (32, 32), 1e6) for draw in range(4)]
+    scenes = [map_draws.scene_of(draw, (32, 32), 1e6) for draw in range(4)]
     for i, scene in enumerate(scenes):
         assert float(scene.sum()) == pytest.approx(1e6, rel=1e-9)
         assert float(scene.min()) >= 0

@@ -23,8 +23,8 @@ from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.pixel import SquarePixel
 from torchmask.planning.plan import plan_observation
 from torchmask.planning.result import Choice, ObservationPlan
-from torchmask.planning.smearing import SmearingMap, phase_spread
-from torchmask.planning.success import BlindOutlook, SuccessMap
+from torchmask.planning.smearing import SmearingMap, phase_spread, smearing_map
+from torchmask.planning.success import BlindOutlook, SuccessMap, success_map
 from torchmask.spectra import NoisePSD, PowerLawPSD
 from torchmask.viz.planning import plan_figure
 
@@ -32,15 +32,17 @@ MASK = SparseAperture.from_catalog("golay6", 1.0, 0.05)
 WIDE = SparseAperture([[-0.45, 0.0], [0.45, 0.0], [0.1, 0.2]], 0.1, 1.0)
 TINY = {"n_frequencies": 32, "budget": 64}
 AXES = {"n_subapertures": (3, 7), "hole_diameters": (0.09, 0.15, 0.35), "exposures": (2e-3, 6e-3)}
+FULL = 0.6  # relative error, where one is made up
+SURE = BlindOutlook(cost=1.0, success=1.0, low=1.0, high=1.0)
 EVERYWHERE = {"n_frames": (1, 1e6), "n_photons": (1, 1e12), "d_over_r0": (0.1, 10)}
 
 
-def lossless():
+def lossless(pupil="mask"):
     """A map on which blind restorations always succeed and lose nothing."""
     return SuccessMap(**EVERYWHERE, tried=np.ones((2, 2, 2)), succeeded=np.ones((2, 2, 2)), cost=np.ones((2, 2, 2)))
 
 
-def sharp():
+def sharp(pupil="mask"):
     """Tables in which restorations are as good as predicted, and exposure and band cost nothing."""
     axes = {"n_photons": (1, 1e12), "exposures": (0, 100), "spreads": (0, 100)}
     return SmearingMap(**axes, exposure_ratio=np.ones((2, 2)), band_ratio=np.ones((2, 2)))
@@ -53,9 +55,15 @@ def lose_nothing(patch):
 
 
 def without_turbulence(patch):
-    """Predict by pistons alone."""
+    """Predict by pistons alone, which cannot tell of a full pupil: of that the error is made up."""
+    of_mask = TurbulentMSE.forward
+
+    def forward(self, aperture):
+        return FULL * self.object_psd.mean() if aperture.is_full else of_mask(self, aperture)
+
     for name in ("instrument_criterion", "instant_criterion"):
         patch.setattr(torchmask.planning.plan, name, functools.partial(instrument_criterion, turbulence=False))
+    patch.setattr(TurbulentMSE, "forward", forward)
 
 
 def make(**changes):
@@ -196,6 +204,21 @@ def test_masks_are_those_of_the_axes_and_what_does_not_fit_is_told(plan):
     assert len(plan.choices) == 10
 
 
+def test_the_full_pupil_stands_beside_the_masks(plan):
+    """With the telescope's light, at the same exposures, and never among the masks."""
+    full = plan.full_pupil
+    assert full is not None
+    assert full.mask.is_full
+    assert full.full_pupil is None
+    assert [choice.exposure for choice in full.choices] == list(AXES["exposures"])
+    for choice in full.choices:
+        assert choice.photons == pytest.approx(3e8 * 0.5 * np.pi / 4 * choice.exposure, rel=1e-9)
+        assert choice.blind_mse == pytest.approx(FULL, rel=1e-9)  # what restorations lose is taken away
+    assert not any(mask.is_full for mask in plan.masks.values())
+    assert "Without a mask the least is 0.6, with the full pupil of 1 m, 166 frames of 2 ms." in str(plan)
+    assert "full pupil" not in str(dataclasses.replace(plan, full_pupil=None))
+
+
 def test_masks_keep_clear_of_the_obstruction_and_its_vanes(quick):
     spider = {"vane_width": 0.05, "vane_angles": (0.0, 180.0)}
     blocked = make(telescope=Telescope(diameter=1.0, central_obstruction=0.3, **spider))
@@ -226,8 +249,8 @@ def test_no_point_beyond_what_was_tried_is_the_best(monkeypatch, quick):
     """Without turbulence in the prediction more light always wins, so the widest holes and longest exposures would."""
     tried = SuccessMap((1, 1e6), (1, 1e12), (0.1, 1.0), *np.ones((3, 2, 2, 2)))
     known = SmearingMap((1, 1e12), (0, 2.0), (0, 100), np.ones((2, 2)), np.ones((2, 2)))
-    monkeypatch.setattr(torchmask.planning.plan, "success_map", lambda: tried)
-    monkeypatch.setattr(torchmask.planning.plan, "smearing_map", lambda: known)
+    monkeypatch.setattr(torchmask.planning.plan, "success_map", lambda pupil: tried)
+    monkeypatch.setattr(torchmask.planning.plan, "smearing_map", lambda pupil: known)
     instrument, holes = make(), (0.09, 0.15, 0.35)
     tau0 = instrument.seeing.tau0
     exposures = (tau0, 2 * tau0, 9 * tau0)
@@ -242,6 +265,8 @@ def test_no_point_beyond_what_was_tried_is_the_best(monkeypatch, quick):
     assert least.blind_mse < found.best.blind_mse
     assert set(least.blind.harder) == {"d_over_r0", "exposure"}
     text = str(found)
+    assert "Without a mask the least is at least 0.6, with the full pupil" in text
+    assert "; such restorations were tried under easier conditions only, up to D/r0 = 1." in text
     assert "The best hole diameter, 0.15 m, is the largest on the map at which blind restorations were tried" in text
     assert "beyond they lose more" in text
     assert "a larger one may be better" not in text  # both are where trials end
@@ -263,7 +288,7 @@ def test_what_blind_restorations_lose_moves_the_best_point(monkeypatch, plan, qu
     """Holes of more than 0.8 r0 lose a factor of 2 or more: the smaller ones win, though known PSFs favour the wide."""
     cost = np.broadcast_to([1.0, 4.0], (2, 2, 2))
     steep = SuccessMap((1, 1e6), (1, 1e12), (0.6, 1.0), np.full((2, 2, 2), 4), np.full((2, 2, 2), 3), cost)
-    monkeypatch.setattr(torchmask.planning.plan, "success_map", lambda: steep)
+    monkeypatch.setattr(torchmask.planning.plan, "success_map", lambda pupil: steep)
     with pytest.warns(UserWarning, match="for d/r0 from 0.6 to 1"):
         found = plan_observation(make(), **AXES, **TINY)
     assert found.best_known.hole_diameter == plan.best.hole_diameter == 0.35
@@ -296,7 +321,7 @@ def test_less_light_than_was_tried_loses_the_share_that_the_linear_estimate_lose
     """Down to the least light tried errors are a quarter of those predicted; from no light nothing is expected."""
     axes = {"n_photons": (1e5, 1e12), "exposures": (0, 100), "spreads": (0, 100)}
     halves = SmearingMap(**axes, exposure_ratio=np.full((2, 2), 0.5), band_ratio=np.full((2, 2), 0.5))
-    monkeypatch.setattr(torchmask.planning.plan, "smearing_map", lambda: halves)
+    monkeypatch.setattr(torchmask.planning.plan, "smearing_map", lambda pupil: halves)
     quiet = {"site": Site(r0=0.15, wind=10.0), "camera": Camera(n_pixels=64), "observing_time": None, "n_frames": 10}
 
     def plan(photons, frames=10, **changes):
@@ -343,7 +368,7 @@ def test_exposure_and_width_are_best_where_light_balances_what_their_smearing_co
     steps, spreads = 1.02 ** np.arange(5.0), phase_spread(0.03, 1 / 0.15) * np.arange(5.0)
     axes = {"n_photons": (1, 1e12), "exposures": (0, 1, 2, 3, 4), "spreads": spreads}
     tables = {"exposure_ratio": np.tile(steps, (2, 1)), "band_ratio": np.tile(steps, (2, 1))}
-    monkeypatch.setattr(torchmask.planning.plan, "smearing_map", lambda: SmearingMap(**axes, **tables))
+    monkeypatch.setattr(torchmask.planning.plan, "smearing_map", lambda pupil: SmearingMap(**axes, **tables))
     known = make(source=Source(photon_rate=3e9), n_wavelengths=2, n_frames=20, observing_time=None)
     tau0 = 0.314 * 0.15 / 10  # r0 / wind
     times, widths = [factor * tau0 for factor in (0.05, 0.2, 0.8, 3.2)], [5e-9, 20e-9, 60e-9]
@@ -371,7 +396,7 @@ def test_the_best_exposure_is_the_vertex_of_a_parabola_of_logarithms():
         return 0.3 * 10 ** (0.2 * (torch.tensor(exposure / 5e-3).log10()) ** 2)
 
     choices = tuple(
-        Choice(3, 0.1, time, 20e-9, 10, 1e3, 0.0, 0.2, 0.1, float(error(time))) for time in (2e-3, 4e-3, 9e-3)
+        Choice(3, 0.1, time, 20e-9, 10, 1e3, 0.0, 0.2, 0.1, float(error(time)), SURE) for time in (2e-3, 4e-3, 9e-3)
     )
     plan = ObservationPlan(make(), choices, {(3, 0.1): MASK})
     assert plan.best_exposure == pytest.approx(5e-3, rel=1e-5)
@@ -434,8 +459,12 @@ def test_the_picture_shows_the_map_and_the_exposures(plan):
     assert f"{plan.best.blind_mse:.3f}" in texts
     assert "does not fit" in texts
     best = plan.best
+    assert plan.full_pupil is not None
+    (line,) = (line for line in figure.axes[1].lines if line.get_label() == "full pupil")
+    assert list(line.get_ydata()) == [choice.blind_mse for choice in plan.full_pupil.choices]
     alone = plan_figure(dataclasses.replace(plan, masks={(best.n_subapertures, best.hole_diameter): MASK}))
     assert len(alone.axes) == 1
+    assert [text.get_text() for text in plan_figure(plan.full_pupil).axes[0].get_legend().get_texts()] == ["full pupil"]
 
 
 def test_the_command_writes_plan_mask_and_instrument(quick, tmp_path, capsys):
@@ -446,7 +475,8 @@ def test_the_command_writes_plan_mask_and_instrument(quick, tmp_path, capsys):
     numbers = json.loads((tmp_path / "plan/plan.json").read_text())
     assert numbers["best"] in numbers["map"]
     assert numbers["best"]["relative_mse"] >= numbers["best_known"]["relative_mse"]
-    assert len(numbers["map"]) == 2
+    assert len(numbers["map"]) == len(numbers["full_pupil"]["map"]) == 2
+    assert numbers["full_pupil"]["best"]["hole_diameter"] == 1
     mask = load_mask(tmp_path / "plan/mask.json")
     assert mask.n_subapertures == 3
     instrument = Instrument.load(tmp_path / "plan/instrument.json")
@@ -456,6 +486,7 @@ def test_the_command_writes_plan_mask_and_instrument(quick, tmp_path, capsys):
     told = capsys.readouterr().out
     assert "Least predicted error" in told
     assert "3 holes of 0.6 m do not fit" in told
+    assert "Without a mask the least is" in told
     assert "a larger one may be better, so give --exposures above it too." in " ".join(told.split())
     fill_factor = 3 * 0.15**2
     command = f"--instrument {tmp_path}/plan/instrument.json --n-subapertures 3 --fill-factor {fill_factor:.4g}"
@@ -467,13 +498,21 @@ def test_the_command_writes_plan_mask_and_instrument(quick, tmp_path, capsys):
 
 def test_a_full_pupil_is_planned_without_a_mask(tmp_path, monkeypatch):
     """Its error is made up here, because tables of turbulence take seconds."""
-    monkeypatch.setattr(TurbulentMSE, "forward", lambda self, aperture: 0.3 * self.object_psd.mean())
-    known = "--telescope.diameter 1 --source.photon-rate 3e8 --site.r0 0.15 --site.wind 10 --wavelength 550e-9"
-    known += " --width 2e-8 --exposure 4e-3 --n-frames 20 --mask full --exposures 0.004 --n-frequencies 24"
+    monkeypatch.setattr(TurbulentMSE, "forward", lambda self, aperture: FULL * self.object_psd.mean())
+    known = "--telescope.diameter 1 --source.photon-rate 3e8 --site.r0 0.25 --site.wind 10 --wavelength 550e-9"
+    known += " --width 2e-8 --exposure 4e-3 --n-frames 10 --mask full --exposures 0.004 --n-frequencies 24"
     assert main(["plan", *known.split(), "--out", str(tmp_path / "plan")]) == 0
     numbers = json.loads((tmp_path / "plan/plan.json").read_text())
-    assert numbers["best"]["relative_mse"] == numbers["best"]["blind_mse"] == pytest.approx(0.3)
-    assert numbers["best"]["blind"] is None
-    assert "of a full pupil cost has not been measured" in (tmp_path / "plan/plan.md").read_text()
-    assert numbers["best"]["photons"] == pytest.approx(3e8 * 4e-3 * float(FullAperture(1.0).area))
+    best, photons = numbers["best"], 3e8 * 4e-3 * float(FullAperture(1.0).area)
+    assert best["photons"] == pytest.approx(photons)
+    assert numbers["full_pupil"] is None  # it is the plan itself
+    assert "with the full pupil of 1 m, 10 frames of 4 ms" in (tmp_path / "plan/plan.md").read_text()
+    assert best["relative_mse"] == pytest.approx(FULL)
+    instants = success_map("full").outlook(1 / 0.25, photons, 10)
+    amounts = {"exposure": 4e-3 * 10 / (0.314 * 0.25), "spread": phase_spread(20 / 550, 1 / 0.25)}
+    told = smearing_map("full").outlook(instants, n_photons=photons, **amounts)  # tau0 is 0.314 r0 / wind
+    assert best["blind"]["cost"] == instants.cost
+    assert best["blind"]["restored"] == pytest.approx(told.restored, rel=1e-3)  # 0.314 is rounded
+    floor = instant_criterion(Instrument.load(tmp_path / "plan/instrument.json"), photons, 24).relative_floor(1.0)
+    assert best["blind_mse"] == pytest.approx(told.mse(FULL, FULL - floor), rel=1e-3)
     assert not (tmp_path / "plan/mask.json").exists()

@@ -37,6 +37,12 @@ def test_where_both_tables_agree_on_instants_each_is_followed():
         assert outlook.restored == pytest.approx(measured, rel=1e-12)
 
 
+def test_by_what_known_psfs_differ_from_the_prediction_is_multiplied():
+    levelled = dataclasses.replace(INSTANTS, restored=0.3)
+    outlook = MAP.outlook(levelled, n_photons=1e6, exposure=2.0, spread=2.0)
+    assert outlook.restored == pytest.approx(0.3 * ratio(1e6, 2.0, 2.0), rel=1e-12)
+
+
 def test_between_its_points_it_is_geometric():
     """In exposure and spread themselves, in the logarithm of the photons."""
     halves = [math.sqrt(one * other) for one, other in (LONG[:, 2], WIDE[:, 2], LONG[:, 0], WIDE[:, 0])]

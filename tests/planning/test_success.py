@@ -38,6 +38,16 @@ def test_between_two_points_it_is_even_in_the_logarithms_of_frames_and_photons()
         assert math.log(outlook.cost) == pytest.approx((2 * first[1] + last[1]) / 3, abs=1e-12)
 
 
+def test_the_level_is_that_of_its_points_and_even_in_logarithms():
+    """Where none was measured, it is 1 everywhere."""
+    level = np.linspace(0.2, 0.9, 12).reshape(2, 3, 2)
+    measured = SuccessMap(FRAMES, PHOTONS, SIZES, TRIED, SUCCEEDED, COST, level=level)
+    assert measured.outlook(1.5, 1e6, 1).restored == pytest.approx(level[0, 1, 1], rel=1e-12)
+    between = math.sqrt(level[0, 1, 0] * level[0, 1, 1])
+    assert measured.outlook(1.0, 1e6, 1).restored == pytest.approx(between, rel=1e-12)
+    assert MAP.outlook(1.0, 1e6, 1).restored == 1
+
+
 def test_it_rises_and_falls_as_the_measurements_do():
     """These rise with frames and photons and fall with the size of the holes, at every point of the lattice."""
     for name, values, sign in (
@@ -83,8 +93,10 @@ def test_the_part_of_an_error_that_can_be_avoided_grows_by_the_square():
     assert errors == pytest.approx([0.3, 0.3, 0.1 + 2.25 * 0.2, 1.0], rel=1e-12)
 
 
-def test_the_map_of_the_library_is_as_large_as_it_says():
-    measured = success_map()
+@pytest.mark.parametrize("pupil", ["mask", "full"])
+def test_the_maps_of_the_library_are_as_large_as_they_say(pupil):
+    measured = success_map(pupil)
+    assert ("a full pupil, " in measured.conditions) == (pupil == "full")
     assert measured.conditions.startswith(f"{int(measured.tried.sum())} restorations of 64 x 64 pixels")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -97,6 +109,8 @@ def test_the_map_of_the_library_is_as_large_as_it_says():
         ({"n_frames": (4, 1)}, "rising order"),
         ({"tried": np.ones((2, 3))}, "tried has shape"),
         ({"succeeded": TRIED + 1}, "no more successes"),
+        ({"level": np.ones((2, 3))}, "level has shape"),
+        ({"level": np.zeros((2, 3, 2))}, "positive cost and level"),
     ],
 )
 def test_a_map_that_cannot_be_is_refused(changes, said):

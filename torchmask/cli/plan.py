@@ -31,7 +31,7 @@ class Options(Instrument, CatalogOptions, InstrumentOptions, RunOptions):
     the error of the restored image is predicted from magnitude, band, telescope, site, camera and time. The prediction
     includes what restorations were measured to lose because they have to find the aberrations. Writes all predictions
     and the best of them (plan.md, plan.json, plan.png), its mask (mask.json), and the observation as one file for other
-    commands (instrument.json) to a new folder. Takes minutes.
+    commands (instrument.json) to a new folder. The full pupil stands beside the masks. Takes minutes.
     """
 
     mask: Annotated[Path | None, tyro.conf.arg(metavar="FILE|NAME|full")] = None
@@ -128,4 +128,5 @@ def numbers(plan: ObservationPlan) -> dict[str, object]:
         "at_edge": {name: plan.at_edge(name) for name in AXES},
         "map": [dataclasses.asdict(choice) for choice in plan.choices],
         "left_out": plan.left_out,
+        "full_pupil": None if plan.full_pupil is None else numbers(plan.full_pupil),
     }

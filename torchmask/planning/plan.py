@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 from torchmask.design.constraint_base import Constraint, Infeasible
 from torchmask.design.observed import change_light, instant_criterion, instrument_criterion
@@ -45,7 +46,7 @@ def plan_observation(
     that has to find the aberrations is that error for instants in narrow light, times what such restorations were
     measured to lose, `success_map`, and what light, exposure and band do to them, `smearing_map`. Each mask is searched
     for its number and size of holes by `AsymptoticMSE` (hybrid, `budget` evaluations) at the light of the instrument's
-    own exposure, and kept for all exposures.
+    own exposure, and kept for all exposures. Beside them the full pupil is planned, at the same exposures and widths.
 
     Parameters
     ----------
@@ -61,7 +62,8 @@ def plan_observation(
         Widths of the even band [m], all of them on the pixels that the widest needs, or on those of the camera, without
         bands that they undersample; None: the instrument's band.
     aperture : Aperture, optional
-        A mask that exists, or a full pupil, in place of the searches: only exposure and width are planned then.
+        A mask that exists, or a full pupil, in place of the searches: only exposure and width are planned then, of
+        nothing else.
     constraints : sequence of Constraint
         Rules of the searches; the central obstruction and the vanes of the telescope are among them already.
     n_frequencies : int
@@ -119,11 +121,27 @@ def plan_observation(
             reason, *others = left_out[n_known:]
             more = f"; nor can the other {len(others)}, of more or wider holes" if others else ""
             raise ValueError(f"no point of the map can be built: {reason}{more}")
+        full = _predict(instrument, exposed, _alone(instrument.telescope.pupil()), n_frequencies, callback)
     else:
-        masks = {(aperture.n_subapertures, aperture.subaperture_diameter): aperture}
-    choices = tuple(_measure(exposed, masks, n_frequencies, callback))
-    known = {} if aperture is not None and aperture.is_full else _tried_up_to(instrument)
-    return ObservationPlan(instrument, choices, masks, tuple(dict.fromkeys(left_out)), known)
+        masks, full = _alone(aperture), None
+    plan = _predict(instrument, exposed, masks, n_frequencies, callback)
+    return dataclasses.replace(plan, left_out=tuple(dict.fromkeys(left_out)), full_pupil=full)
+
+
+def _alone(aperture: Aperture) -> dict[tuple[int, float], Aperture]:
+    return {(aperture.n_subapertures, aperture.subaperture_diameter): aperture}
+
+
+def _predict(
+    instrument: Instrument,
+    exposed: Sequence[Instrument],
+    masks: dict[tuple[int, float], Aperture],
+    n_frequencies: int,
+    callback: Callback | None,
+) -> ObservationPlan:
+    """Return the plan of given masks, all of one kind of pupil."""
+    choices, kind = tuple(_measure(exposed, masks, n_frequencies, callback)), _kind(next(iter(masks.values())))
+    return ObservationPlan(instrument, choices, masks, tried_up_to=_tried_up_to(instrument, kind))
 
 
 def _rules(instrument: Instrument, constraints: Sequence[Constraint]) -> tuple[Constraint, ...]:
@@ -180,10 +198,8 @@ def _measure(
             above = error - criterion.relative_floor(instrument.telescope.diameter)
             photons, sky = instrument.photons(area), instrument.sky(area)
             light = instrument.exposure, instrument.width, instrument.frames, photons, sky
-            blind, expected = None, error
-            if not mask.is_full:
-                blind = _blind_outlook(instrument, hole, area)
-                expected = _expected_error(blind, *instants[n, hole, place])
+            blind = _blind_outlook(instrument, mask)
+            expected = _expected_error(blind, *instants[n, hole, place])
             choices.append(Choice(n, hole, *light, error, above, expected, blind))
             _tell(callback, "plan/map", len(choices), n_steps, error)
     return sorted(choices, key=lambda choice: tuple(getattr(choice, name) for name in AXES))
@@ -199,12 +215,12 @@ def _predict_instants(
     """
     errors, criterion = {}, None
     for (n, hole), mask in sorted(masks.items(), key=lambda item: item[0][1]):
-        for place, instrument in enumerate(() if mask.is_full else exposed):
+        for place, instrument in enumerate(exposed):
             area = float(mask.area)
             criterion = criterion or instant_criterion(instrument, area, n_frequencies)
             change_light(criterion, instrument, area)
             error = tried = float(criterion.relative(mask))
-            if (share := instrument.equivalent_photons(area) / smearing_map().n_photons[0]) < 1:
+            if (share := instrument.equivalent_photons(area) / smearing_map(_kind(mask)).n_photons[0]) < 1:
                 criterion.load_state_dict(criterion.state_dict() | {"noise_psd": share * criterion.noise_psd})
                 tried = float(criterion.relative(mask))
             errors[n, hole, place] = error, tried, criterion.relative_floor(instrument.telescope.diameter)
@@ -221,23 +237,26 @@ def _expected_error(blind: BlindOutlook, error: float, tried: float, floor: floa
     return 1 - (1 - blind.mse(tried, tried - floor)) * (1 - error) / (1 - tried)
 
 
-def _blind_outlook(instrument: Instrument, hole: float, area: float) -> BlindOutlook:
-    """Return what was measured of restorations that have to find the aberrations behind holes of this diameter [m].
+def _kind(aperture: Aperture) -> Literal["mask", "full"]:
+    """Return of which kind of pupil the restorations were that tell about an aperture."""
+    return "full" if aperture.is_full else "mask"
 
-    `area` is that of all holes [m^2].
-    """
-    r0, diameter, photons = instrument.site.r0, instrument.telescope.diameter, instrument.equivalent_photons(area)
-    instants = success_map().outlook(hole / r0, photons, instrument.frames)
+
+def _blind_outlook(instrument: Instrument, aperture: Aperture) -> BlindOutlook:
+    """Return what was measured of restorations that have to find the aberrations behind an aperture."""
+    kind, r0, diameter = _kind(aperture), instrument.site.r0, instrument.telescope.diameter
+    photons = instrument.equivalent_photons(float(aperture.area))
+    instants = success_map(kind).outlook(aperture.subaperture_diameter / r0, photons, instrument.frames)
     spread = phase_spread(instrument.band.relative_width, diameter / r0)
     exposure = instrument.exposure / instrument.seeing.tau0
-    return smearing_map().outlook(instants, n_photons=photons, exposure=exposure, spread=spread)
+    return smearing_map(kind).outlook(instants, n_photons=photons, exposure=exposure, spread=spread)
 
 
-def _tried_up_to(instrument: Instrument) -> dict[str, float]:
+def _tried_up_to(instrument: Instrument, kind: Literal["mask", "full"]) -> dict[str, float]:
     """Return the largest hole diameter [m], exposure [s] and band [m] at which blind restorations were tried."""
-    site, smearing = instrument.site, smearing_map()
+    site, smearing = instrument.site, smearing_map(kind)
     most = {
-        "hole_diameter": success_map().d_over_r0[-1] * site.r0,
+        "hole_diameter": success_map(kind).d_over_r0[-1] * site.r0,
         "exposure": smearing.exposures[-1] * instrument.seeing.tau0,
     }
     spread = phase_spread(instrument.band.relative_width, instrument.telescope.diameter / site.r0)

@@ -24,9 +24,8 @@ class Choice:
     electrons per frame (of the sky, per pixel)
     relative_mse, above_floor : predicted for a linear estimate that knows the PSFs, and that less what no mask of this
         diameter can avoid
-    blind_mse : expected where the aberrations have to be found, at least so much where that was not tried;
-        `relative_mse` for a full pupil
-    blind : what was measured of such restorations; None for a full pupil, of which no map is known
+    blind_mse : expected where the aberrations have to be found, at least so much where that was not tried
+    blind : what was measured of such restorations
     """
 
     n_subapertures: int
@@ -39,12 +38,12 @@ class Choice:
     relative_mse: float
     above_floor: float
     blind_mse: float
-    blind: BlindOutlook | None = None
+    blind: BlindOutlook
 
     @property
     def is_limit(self) -> bool:
         """Whether `blind_mse` is only a lower limit, since blind restorations were tried under easier conditions."""
-        return self.blind is not None and bool(self.blind.harder)
+        return bool(self.blind.harder)
 
 
 @dataclass(frozen=True)
@@ -55,7 +54,8 @@ class ObservationPlan:
     choices : every point that can be built
     masks : by number of holes and hole diameter [m]
     left_out : why points of the axes are missing
-    tried_up_to : the largest value of an axis at which blind restorations were tried; empty for a full pupil
+    tried_up_to : the largest value of an axis at which blind restorations were tried
+    full_pupil : the plan of the same telescope without a mask, beside searched masks
 
     Examples
     --------
@@ -82,6 +82,7 @@ class ObservationPlan:
     masks: dict[tuple[int, float], Aperture]
     left_out: tuple[str, ...] = ()
     tried_up_to: Mapping[str, float] = field(default_factory=dict)
+    full_pupil: ObservationPlan | None = None
 
     @property
     def best(self) -> Choice:
@@ -175,13 +176,14 @@ class ObservationPlan:
         lines = [
             f"Least predicted error of a blind restoration, from 0 for a perfect image to 1 for an empty one: "
             f"{best.blind_mse:.4g}, of which no mask of this diameter can avoid "
-            f"{best.relative_mse - best.above_floor:.4g}, with {_point(best)} "
+            f"{best.relative_mse - best.above_floor:.4g}, with {self._point(best)} "
             f"({best.hole_diameter / told.site.r0:.2g} r0, {best.exposure / told.seeing.tau0:.2g} tau0){band} and "
             f"{best.photons:.4g} photons in each.",
             *_limit_line(best),
             _blind_line(best.blind),
+            *self._full_pupil_line(),
             f"Predicted for a linear estimate that knows the PSFs: {best.relative_mse:.4g}; the least would be "
-            f"{self.best_known.relative_mse:.4g}, with {_point(self.best_known)}.",
+            f"{self.best_known.relative_mse:.4g}, with {self._point(self.best_known)}.",
             f"Best exposure between those of the map: {1e3 * self.best_exposure:.4g} ms{width}.",
             *(self._edge(name) for name in AXES if self.at_edge(name)),
             "",
@@ -191,12 +193,24 @@ class ObservationPlan:
         ]
         return "\n".join([*lines, *(["", *(f"- {reason}" for reason in self.left_out)] if self.left_out else [])])
 
+    def _point(self, choice: Choice) -> str:
+        """Return the pupil of a point, and its frames, in words."""
+        pupil = f"{choice.n_subapertures} holes of {choice.hole_diameter:.4g} m"
+        if self.masks[choice.n_subapertures, choice.hole_diameter].is_full:
+            pupil = f"the full pupil of {choice.hole_diameter:.4g} m"
+        return f"{pupil}, {choice.frames} frames of {1e3 * choice.exposure:.4g} ms"
 
-def _point(choice: Choice) -> str:
-    return (
-        f"{choice.n_subapertures} holes of {choice.hole_diameter:.4g} m, {choice.frames} frames of "
-        f"{1e3 * choice.exposure:.4g} ms"
-    )
+    def _full_pupil_line(self) -> list[str]:
+        """Return a sentence on what the telescope attains without a mask."""
+        if self.full_pupil is None:
+            return []
+        full = self.full_pupil.best
+        least, why = f"{full.blind_mse:.4g}", ""
+        if full.is_limit:
+            most = self.full_pupil.tried_up_to["hole_diameter"] / self.instrument.site.r0
+            least = f"at least {least}"
+            why = f"; such restorations were tried under easier conditions only, up to D/r0 = {most:.3g}"
+        return [f"Without a mask the least is {least}, with {self.full_pupil._point(full)}{why}."]
 
 
 def _limit_line(best: Choice) -> list[str]:
@@ -208,9 +222,7 @@ def _limit_line(best: Choice) -> list[str]:
     ]
 
 
-def _blind_line(blind: BlindOutlook | None) -> str:
-    if blind is None:
-        return "What the unknown aberrations of a full pupil cost has not been measured: it is left out."
+def _blind_line(blind: BlindOutlook) -> str:
     return (
         f"There blind restorations of instants in narrow light score {blind.cost:.3g} times as high as with known PSFs "
         f"(median), and {100 * blind.success:.0f} % of them ({100 * blind.low:.0f} to {100 * blind.high:.0f} %) stay "
@@ -261,5 +273,5 @@ def _cells(choice: Choice) -> list[str]:
         f"{choice.relative_mse:.4f}",
         f"{choice.above_floor:.4f}",
         f"{'> ' * choice.is_limit}{choice.blind_mse:.4f}",
-        "-" if choice.blind is None or choice.is_limit else f"{100 * choice.blind.success:.0f} %",
+        "-" if choice.is_limit else f"{100 * choice.blind.success:.0f} %",
     ]

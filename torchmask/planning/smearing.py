@@ -1,6 +1,7 @@
 """What restorations attain in long exposures and wide bands, over what is predicted: measured tables, interpolated.
 
-The tables are `smearing.json` beside this file, written by `experiments/smearing_map.py`; it holds its own conditions.
+The tables are `smearing_mask.json` and `smearing_full.json` beside this file, written by
+`experiments/smearing_map.py`; each holds its own conditions.
 Smearing by time and by bandwidth is what interferometry calls the loss of fringe contrast by either.
 """
 
@@ -12,6 +13,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
+from typing import Literal
 
 import numpy as np
 
@@ -37,8 +39,8 @@ class SmearingMap:
     n_photons, exposures, spreads : the values measured, in rising order, at least two each; exposures over tau0,
         `phase_spread` of the bands [rad]
     exposure_ratio, band_ratio : restored score over the one that `TurbulentMSE` predicts for instants in narrow light
-        times `BlindOutlook.cost`, indexed [photons, exposures] and [photons, spreads]; the exposures were in narrow
-        light, the bands those of instants
+        times `BlindOutlook.cost` and `SuccessMap.level`, indexed [photons, exposures] and [photons, spreads]; the
+        exposures were in narrow light, the bands those of instants
     conditions : what all restorations share, in a sentence
 
     Raises ValueError if a shape or an order is wrong, or a ratio is not finite and positive.
@@ -86,7 +88,7 @@ class SmearingMap:
         instants : BlindOutlook
             What `SuccessMap.outlook` returns.
         n_photons : float
-            Electrons per frame through the mask.
+            Electrons per frame through the aperture.
         exposure : float
             Exposure time of a frame, T / tau0.
         spread : float
@@ -111,14 +113,16 @@ class SmearingMap:
         for ratio, place in ((self.exposure_ratio, long), (self.band_ratio, wide)):
             logarithm += interpolate(np.log(ratio), (light, place)) - interpolate(np.log(ratio), (light, 0)) / 2
         outside = tuple(dict.fromkeys((*instants.outside, *outside)))
-        return replace(instants, restored=math.exp(logarithm), outside=outside, harder=(*instants.harder, *harder))
+        restored = instants.restored * math.exp(logarithm)
+        return replace(instants, restored=restored, outside=outside, harder=(*instants.harder, *harder))
 
 
 @functools.cache
-def smearing_map() -> SmearingMap:
-    """Return the tables that come with the library.
+def smearing_map(pupil: Literal["mask", "full"] = "mask") -> SmearingMap:
+    """Return the tables that come with the library, of masks or of the full pupil.
 
     >>> smearing_map() is smearing_map()  # they are read once
     True
     """
-    return SmearingMap(**json.loads(files("torchmask.planning").joinpath("smearing.json").read_text(encoding="utf-8")))
+    table = files("torchmask.planning").joinpath(f"smearing_{pupil}.json")
+    return SmearingMap(**json.loads(table.read_text(encoding="utf-8")))

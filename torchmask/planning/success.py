@@ -1,6 +1,7 @@
-"""How often a restoration with unknown aberrations succeeds, and what it loses: a measured map, interpolated.
+"""How often a restoration with unknown aberrations succeeds, and what it loses: measured maps, interpolated.
 
-The map is `success.json` beside this file, written by `experiments/success_map.py`; it holds its own conditions.
+The maps are `success_mask.json` and `success_full.json` beside this file, written by `experiments/success_map.py`; each
+holds its own conditions.
 """
 
 from __future__ import annotations
@@ -9,8 +10,9 @@ import functools
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.resources import files
+from typing import Literal
 
 import numpy as np
 
@@ -56,12 +58,14 @@ class BlindOutlook:
 
 @dataclass(frozen=True, eq=False)
 class SuccessMap:
-    """Restorations on a lattice of frames, photons per frame and hole diameter over r0.
+    """Restorations on a lattice of frames, photons per frame and the diameter of a hole, or of a full pupil, over r0.
 
     n_frames, n_photons, d_over_r0 : the values measured, in rising order, at least two each
     tried, succeeded : numbers of restorations, indexed [frames, photons, d_over_r0]
     cost : median over them of the score over that for known PSFs
     conditions : what all of them share, in a sentence
+    level : geometric mean over them of the score for known PSFs over the one that `TurbulentMSE` predicts; a single
+        number where it was not measured, and is taken to be the same at all points
 
     Raises ValueError if a shape or an order is wrong, or a number of restorations cannot be.
 
@@ -79,15 +83,21 @@ class SuccessMap:
     succeeded: np.ndarray
     cost: np.ndarray
     conditions: str = ""
+    level: np.ndarray = field(default_factory=lambda: np.array(1.0))
 
     def __post_init__(self) -> None:
         shape = tuple(len(axis.values) for axis in self._axes)
-        for name in ("tried", "succeeded", "cost"):
+        if np.ndim(self.level) == 0:
+            object.__setattr__(self, "level", np.full(shape, self.level))
+        for name in ("tried", "succeeded", "cost", "level"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), float))
             if getattr(self, name).shape != shape:
                 raise ValueError(f"{name} has shape {getattr(self, name).shape}: {shape} is needed, as by the axes")
-        if not ((self.succeeded >= 0) & (self.succeeded <= self.tried) & (self.tried >= 1) & (self.cost > 0)).all():
-            raise ValueError("each cell needs at least one restoration, no more successes than those, a positive cost")
+        measured = (self.succeeded >= 0) & (self.succeeded <= self.tried) & (self.tried >= 1)
+        if not (measured & (self.cost > 0) & (self.level > 0)).all():
+            raise ValueError(
+                "each cell needs at least one restoration, no more successes than those, a positive cost and level"
+            )
 
     @property
     def _axes(self) -> tuple[Axis, ...]:
@@ -100,16 +110,16 @@ class SuccessMap:
     def outlook(self, d_over_r0: float, n_photons: float, n_frames: float) -> BlindOutlook:
         """Return chance and cost at one point.
 
-        Between the lattice's points the chance is linear and the cost geometric, in the logarithms of photons and
-        frames and in d / r0, so that at its points they are what was measured and between two of them they lie between
-        the two. Of frames that show the same turbulence more than once, count those that differ.
+        Between the lattice's points the chance is linear, cost and level are geometric, in the logarithms of photons
+        and frames and in d / r0, so that at its points they are what was measured and between two of them they lie
+        between the two. Of frames that show the same turbulence more than once, count those that differ.
 
         Parameters
         ----------
         d_over_r0 : float
-            Diameter of a hole over Fried's parameter.
+            Diameter of a hole, or of the full pupil, over Fried's parameter.
         n_photons : float
-            Electrons per frame through the mask.
+            Electrons per frame through the aperture.
         n_frames : float
 
         Raises
@@ -132,15 +142,17 @@ class SuccessMap:
             low=interpolate(low, places),
             high=interpolate(high, places),
             outside=outside,
+            restored=math.exp(interpolate(np.log(self.level), places)),
             harder=harder,
         )
 
 
 @functools.cache
-def success_map() -> SuccessMap:
-    """Return the map that comes with the library.
+def success_map(pupil: Literal["mask", "full"] = "mask") -> SuccessMap:
+    """Return the map that comes with the library, of masks or of the full pupil.
 
     >>> success_map() is success_map()  # it is read once
     True
     """
-    return SuccessMap(**json.loads(files("torchmask.planning").joinpath("success.json").read_text(encoding="utf-8")))
+    table = files("torchmask.planning").joinpath(f"success_{pupil}.json")
+    return SuccessMap(**json.loads(table.read_text(encoding="utf-8")))

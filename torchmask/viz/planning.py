@@ -21,8 +21,9 @@ _RING: dict[str, Any] = {"markersize": 13, "fillstyle": "none", "color": drawing
 def plan_figure(plan: ObservationPlan) -> Figure:
     """Draw the predicted error of blind restorations over number and size of holes, exposure and band width.
 
-    The exposure has a curve for each number of holes. Each panel is at the best of all else; those of one mask or one
-    width are left out. A ring marks the best point, an arrow upwards a lower limit, where nothing was tried.
+    The exposure has a curve for each number of holes, and one for the full pupil. Each panel is at the best of all
+    else; those of one mask or one width are left out. A ring marks the best point, an arrow upwards a lower limit,
+    where nothing was tried.
     """
     several, widths = len(plan.masks) > 1, plan.axis("width")
     panels = [1.25] * several + [1.5] + [1.2] * (len(widths) > 1)
@@ -73,7 +74,10 @@ def _draw_map(figure: Figure, ax: Axes, plan: ObservationPlan) -> None:
 
 
 def _draw_exposures(ax: Axes, plan: ObservationPlan) -> None:
-    best = plan.best
+    best, is_full = plan.best, plan.mask.is_full
+    if plan.full_pupil is not None:
+        line = [choice for choice in plan.full_pupil.choices if choice.width == best.width]
+        _draw_line(ax, line, "exposure", 1e3, drawing.INK, "full pupil")
     for color, n in zip(drawing.colors(), sorted({n for n, _ in plan.masks}), strict=False):
         line = [
             c
@@ -81,7 +85,7 @@ def _draw_exposures(ax: Axes, plan: ObservationPlan) -> None:
             if c.n_subapertures == n and (c.hole_diameter, c.width) == (best.hole_diameter, best.width)
         ]
         line.sort(key=lambda choice: choice.exposure)
-        _draw_line(ax, line, "exposure", 1e3, color, f"{n} holes")
+        _draw_line(ax, line, "exposure", 1e3, color, "full pupil" if is_full else f"{n} holes")
     if any(choice.is_limit for choice in plan.choices):
         ax.plot([], [], "^", color=drawing.FAINT, label="lower limit: not tried")
     ax.plot(1e3 * best.exposure, best.blind_mse, "o", **_RING)
@@ -92,5 +96,6 @@ def _draw_exposures(ax: Axes, plan: ObservationPlan) -> None:
     times = sorted({1e3 * choice.exposure for choice in plan.choices})
     ax.set_xticks(times, [f"{time:.3g}" for time in times])
     ax.minorticks_off()
-    ax.set(xlabel="exposure [ms]", ylabel="relative MSE, blind", title=f"holes of {best.hole_diameter:.3g} m")
+    title = "" if is_full else f"holes of {best.hole_diameter:.3g} m"
+    ax.set(xlabel="exposure [ms]", ylabel="relative MSE, blind", title=title)
     ax.legend()
