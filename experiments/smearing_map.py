@@ -2,13 +2,14 @@
 
     python experiments/smearing_map.py                    # 320 restorations: an hour and a half of one core
     python experiments/smearing_map.py --draws 2          # fewer of each
-    python experiments/smearing_map.py --pupil full --photons 1e5 1e6 1e7 1e8 --draws 2    # the full pupil
+    python experiments/smearing_map.py --pupil full --exposures 0 1 2 4 8 --photons 1e5 1e6 1e7 1e8 \\
+        --draws 3                                         # the full pupil
     python experiments/smearing_map.py --smoke            # everything, tiny, in seconds
 
-Each draw is another mask, scene, turbulence and noise, and is restored from instants in narrow light, from ever longer
-exposures and from ever wider bands, with the same photons in each frame. The library's defaults are told the read-out
-noise and the band, not how long a frame lasts. What is predicted is `TurbulentMSE` for instants in narrow
-light and known PSFs, times what `success_map` says that unknown ones cost: measure that map first.
+Each draw is another mask (but for the full pupil), scene, turbulence and noise, and is restored from instants in
+narrow light, from ever longer exposures and from ever wider bands, with the same photons in each frame. The library's
+defaults are told the read-out noise and the band, not how long a frame lasts. What is predicted is `TurbulentMSE` for
+instants in narrow light and known PSFs, times what `success_map` says that unknown ones cost: measure that map first.
 
 The table, the figure and the numbers go to a new folder, and with them smearing_mask.json or smearing_full.json, which
 `torchmask plan` interpolates (in torchmask/planning). Every restoration is kept in --sweep, from which a run that was

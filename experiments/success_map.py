@@ -6,15 +6,15 @@
         --frames 5 10 1 --draws 3 3 2                    # 128 restorations through the full pupil
     python experiments/success_map.py --smoke            # everything, tiny, in seconds
 
-Each draw is another mask, scene, turbulence and noise, and goes through every combination of d/r0, photons and frames.
-The frames are made end to end with the full von Karman phase. They are restored by the library's defaults, told
-the read-out noise alone. The reference is the better of two that know more: the positive object of least
-total variation for the true PSFs, and, for bright frames, the library's for the true aberrations. A restoration
-succeeds where its score is within 1.3 of that. The Cramer-Rao bound of the first draw stands beside.
+Each draw is another mask (but for the full pupil), scene, turbulence and noise, and goes through every combination of
+d/r0, photons and frames. The frames are made end to end with the full von Karman phase. They are restored by the
+library's defaults, told the read-out noise alone. The reference is the better of two that know more: the positive
+object of least total variation for the true PSFs, and, for bright frames, the library's for the true aberrations. A
+restoration succeeds where its score is within 1.3 of that. The Cramer-Rao bound of a mask's first draw stands beside.
 
 The figure, the table and the numbers go to a new folder, and with them success_mask.json or success_full.json, the
-counts that `torchmask plan` interpolates (in torchmask/planning). Every restoration is kept in --sweep, from which a
-run that was stopped goes on.
+counts that `torchmask plan` interpolates (in torchmask/planning). Make smearing_map anew after it, which counts on
+its `level`. Every restoration is kept in --sweep, from which a run that was stopped goes on.
 """
 
 from __future__ import annotations

@@ -78,7 +78,14 @@ def test_the_wheel_holds_the_package_and_nothing_else(wheel):
     source = ROOT / "torchmask"
     wanted = {f"torchmask/{path.relative_to(source).as_posix()}" for path in source.rglob("*.py")}
     assert information == f"torchmask-{torchmask.__version__}.dist-info/"
-    data = ("py.typed", "optics/masks.json", "planning/smearing.json", "planning/success.json")
+    data = (
+        "py.typed",
+        "optics/masks.json",
+        "planning/smearing_full.json",
+        "planning/smearing_mask.json",
+        "planning/success_full.json",
+        "planning/success_mask.json",
+    )
     assert inside == wanted | {f"torchmask/{name}" for name in data}
     assert information + "licenses/LICENSE" in names
     assert entries.split() == ["[console_scripts]", "torchmask", "=", PROJECT["scripts"]["torchmask"]]

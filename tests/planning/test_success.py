@@ -7,6 +7,7 @@ import warnings
 import numpy as np
 import pytest
 
+from torchmask.planning.smearing import smearing_map
 from torchmask.planning.success import BlindOutlook, SuccessMap, success_map
 
 FRAMES, PHOTONS, SIZES = (1, 4), (1e5, 1e6, 1e8), (0.5, 1.5)
@@ -117,6 +118,12 @@ def test_a_map_that_cannot_be_is_refused(changes, said):
     known = {"n_frames": FRAMES, "n_photons": PHOTONS, "d_over_r0": SIZES}
     with pytest.raises(ValueError, match=said):
         SuccessMap(**(known | {"tried": TRIED, "succeeded": SUCCEEDED, "cost": COST} | changes))
+
+
+@pytest.mark.parametrize("known", [success_map, smearing_map])
+def test_a_pupil_of_which_no_map_is_known_is_refused(known):
+    with pytest.raises(ValueError, match="pupil is 'ful': maps are known of mask and full"):
+        known("ful")
 
 
 @pytest.mark.parametrize("value", [0.0, math.nan, -1.0])

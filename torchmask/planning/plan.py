@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 from torchmask.design.constraint_base import Constraint, Infeasible
 from torchmask.design.observed import change_light, instant_criterion, instrument_criterion
@@ -18,7 +18,7 @@ from torchmask.optics.pupil import Aperture
 from torchmask.planning.axes import at_exposures, bands_of, or_default, positive, sampled, whole
 from torchmask.planning.result import AXES, Choice, ObservationPlan
 from torchmask.planning.smearing import phase_spread, smearing_map
-from torchmask.planning.success import BlindOutlook, success_map
+from torchmask.planning.success import BlindOutlook, Pupil, success_map
 from torchmask.record import Callback, Record
 
 _HOLES = (0.5, 0.8, 1.2)  # in r0: wider holes hold aberrations that a blind restoration has to find
@@ -121,7 +121,7 @@ def plan_observation(
             reason, *others = left_out[n_known:]
             more = f"; nor can the other {len(others)}, of more or wider holes" if others else ""
             raise ValueError(f"no point of the map can be built: {reason}{more}")
-        full = _predict(instrument, exposed, _alone(instrument.telescope.pupil()), n_frequencies, callback)
+        full = _predict(instrument, exposed, _alone(instrument.telescope.pupil()), n_frequencies, callback, beside=True)
     else:
         masks, full = _alone(aperture), None
     plan = _predict(instrument, exposed, masks, n_frequencies, callback)
@@ -138,9 +138,16 @@ def _predict(
     masks: dict[tuple[int, float], Aperture],
     n_frequencies: int,
     callback: Callback | None,
+    *,
+    beside: bool = False,
 ) -> ObservationPlan:
-    """Return the plan of given masks, all of one kind of pupil."""
-    choices, kind = tuple(_measure(exposed, masks, n_frequencies, callback)), _kind(next(iter(masks.values())))
+    """Return the plan of given masks, all of one kind of pupil, or of the full pupil `beside` masks.
+
+    For the latter the prediction is that of instants in narrow light alone, on which what is expected rests: long
+    exposures and bands of a full pupil take minutes each.
+    """
+    choices = tuple(_measure(exposed, masks, n_frequencies, callback, beside))
+    kind = _kind(next(iter(masks.values())))
     return ObservationPlan(instrument, choices, masks, tried_up_to=_tried_up_to(instrument, kind))
 
 
@@ -184,6 +191,7 @@ def _measure(
     masks: dict[tuple[int, float], Aperture],
     n_frequencies: int,
     callback: Callback | None,
+    beside: bool,
 ) -> list[Choice]:
     """Return the predicted error at every point; masks with holes of one size share what is known of the turbulence."""
     choices, n_steps = [], len(exposed) * len(masks)
@@ -192,7 +200,8 @@ def _measure(
         criterion = None
         for (n, hole), mask in sorted(masks.items(), key=lambda item: item[0][1]):
             area = float(mask.area)
-            criterion = criterion or instrument_criterion(instrument, area, n_frequencies)
+            build = instant_criterion if beside else instrument_criterion
+            criterion = criterion or build(instrument, area, n_frequencies)
             change_light(criterion, instrument, area)
             error = float(criterion.relative(mask))
             above = error - criterion.relative_floor(instrument.telescope.diameter)
@@ -201,7 +210,7 @@ def _measure(
             blind = _blind_outlook(instrument, mask)
             expected = _expected_error(blind, *instants[n, hole, place])
             choices.append(Choice(n, hole, *light, error, above, expected, blind))
-            _tell(callback, "plan/map", len(choices), n_steps, error)
+            _tell(callback, "plan/full" if beside else "plan/map", len(choices), n_steps, error)
     return sorted(choices, key=lambda choice: tuple(getattr(choice, name) for name in AXES))
 
 
@@ -237,7 +246,7 @@ def _expected_error(blind: BlindOutlook, error: float, tried: float, floor: floa
     return 1 - (1 - blind.mse(tried, tried - floor)) * (1 - error) / (1 - tried)
 
 
-def _kind(aperture: Aperture) -> Literal["mask", "full"]:
+def _kind(aperture: Aperture) -> Pupil:
     """Return of which kind of pupil the restorations were that tell about an aperture."""
     return "full" if aperture.is_full else "mask"
 
@@ -252,7 +261,7 @@ def _blind_outlook(instrument: Instrument, aperture: Aperture) -> BlindOutlook:
     return smearing_map(kind).outlook(instants, n_photons=photons, exposure=exposure, spread=spread)
 
 
-def _tried_up_to(instrument: Instrument, kind: Literal["mask", "full"]) -> dict[str, float]:
+def _tried_up_to(instrument: Instrument, kind: Pupil) -> dict[str, float]:
     """Return the largest hole diameter [m], exposure [s] and band [m] at which blind restorations were tried."""
     site, smearing = instrument.site, smearing_map(kind)
     most = {

@@ -55,7 +55,8 @@ class ObservationPlan:
     masks : by number of holes and hole diameter [m]
     left_out : why points of the axes are missing
     tried_up_to : the largest value of an axis at which blind restorations were tried
-    full_pupil : the plan of the same telescope without a mask, beside searched masks
+    full_pupil : the plan of the same telescope without a mask, beside searched masks; its `relative_mse` is that of
+        instants in narrow light
 
     Examples
     --------
@@ -207,9 +208,9 @@ class ObservationPlan:
         full = self.full_pupil.best
         least, why = f"{full.blind_mse:.4g}", ""
         if full.is_limit:
-            most = self.full_pupil.tried_up_to["hole_diameter"] / self.instrument.site.r0
-            least = f"at least {least}"
-            why = f"; such restorations were tried under easier conditions only, up to D/r0 = {most:.3g}"
+            least, why = f"at least {least}", "; such restorations were tried under easier conditions only"
+            if "d_over_r0" in full.blind.harder:
+                why += f", up to D/r0 = {self.full_pupil.tried_up_to['hole_diameter'] / self.instrument.site.r0:.3g}"
         return [f"Without a mask the least is {least}, with {self.full_pupil._point(full)}{why}."]
 
 

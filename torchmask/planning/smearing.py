@@ -13,12 +13,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
-from typing import Literal
+from typing import get_args
 
 import numpy as np
 
 from torchmask.planning.lattice import Axis, interpolate, locate
-from torchmask.planning.success import BlindOutlook
+from torchmask.planning.success import BlindOutlook, Pupil
 
 
 def phase_spread(width: float, d_over_r0: float) -> float:
@@ -118,11 +118,15 @@ class SmearingMap:
 
 
 @functools.cache
-def smearing_map(pupil: Literal["mask", "full"] = "mask") -> SmearingMap:
+def smearing_map(pupil: Pupil = "mask") -> SmearingMap:
     """Return the tables that come with the library, of masks or of the full pupil.
+
+    Raises ValueError for any other kind of pupil.
 
     >>> smearing_map() is smearing_map()  # they are read once
     True
     """
+    if pupil not in get_args(Pupil):
+        raise ValueError(f"pupil is {pupil!r}: maps are known of {' and '.join(get_args(Pupil))}")
     table = files("torchmask.planning").joinpath(f"smearing_{pupil}.json")
     return SmearingMap(**json.loads(table.read_text(encoding="utf-8")))

@@ -12,12 +12,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
 from torchmask.planning.lattice import Axis, interpolate, locate
 
+Pupil = Literal["mask", "full"]
 SUCCESS = 1.3  # a restoration succeeds if its score is within this factor of that for known PSFs
 
 
@@ -148,11 +149,15 @@ class SuccessMap:
 
 
 @functools.cache
-def success_map(pupil: Literal["mask", "full"] = "mask") -> SuccessMap:
+def success_map(pupil: Pupil = "mask") -> SuccessMap:
     """Return the map that comes with the library, of masks or of the full pupil.
+
+    Raises ValueError for any other kind of pupil.
 
     >>> success_map() is success_map()  # it is read once
     True
     """
+    if pupil not in get_args(Pupil):
+        raise ValueError(f"pupil is {pupil!r}: maps are known of {' and '.join(get_args(Pupil))}")
     table = files("torchmask.planning").joinpath(f"success_{pupil}.json")
     return SuccessMap(**json.loads(table.read_text(encoding="utf-8")))

@@ -32,19 +32,19 @@ def change_fringes(objective: MyopicObjective, state: State) -> tuple[State, int
         return state, 0
     wave = 2 * math.pi * model.band.mean / model.window.grid.wavelength  # [rad] at the wavelength of the grid
     changes = basis.parameters_of_pistons(wave * sides_of_lines(model.pupil.aperture.centers).double()).to(state.z)
-    z, costs = state.z.clone(), objective.frame_costs(state.image, state.z, state.calibration)
-    moving, tried = torch.arange(len(z), device=z.device), 0
+    z, tried = state.z.clone(), 0
+    moving = torch.arange(len(z), device=z.device)
     while len(moving):
         part, calibration = objective.of_frames(moving), state.calibration.of_frames(moving)
-        best, least = z[moving], costs[moving]
+        best = now = z[moving]
+        least = first = part.frame_costs(state.image, now, calibration)
         for change in torch.cat([changes, -changes]):
-            trial = z[moving] + change
+            trial = now + change
             cost = part.frame_costs(state.image, trial, calibration)
             best, least = torch.where((cost < least)[:, None], trial, best), torch.minimum(cost, least)
-        tried += 2 * len(changes) * len(moving)
-        moved = least < costs[moving]
-        z[moving], costs[moving] = best, least
-        moving = moving[moved]
+        tried += (2 * len(changes) + 1) * len(moving)
+        z[moving] = best
+        moving = moving[least < first]
     return (state if torch.equal(z, state.z) else replace(state, z=z)), tried // len(z)
 
 

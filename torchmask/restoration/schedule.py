@@ -43,7 +43,8 @@ class Schedule:
     nearly_at_rest : a start of a mask that explains the frames, unless they are faint, ends as soon as a segment lowers
         the cost by less than this fraction, as the last descent goes on from there
     sharp_after : number of iterations after which the object is sharp enough to escape from local minima
-    escapes : maximum number of escapes in one start, each of which restarts outlying frames and shifts the object
+    escapes : maximum number of escapes in one start, each of which restarts outlying frames, changes their
+        fringes in a band and shifts the object
     first_inflation : the initial noise variance is the residual variance of the mean frame divided by this
     start_rms : rms of random initial whitened aberrations
     start_rms_unwhitened : the same in rad, for aberrations without a prior

@@ -86,7 +86,8 @@ def _draw_exposures(ax: Axes, plan: ObservationPlan) -> None:
         ]
         line.sort(key=lambda choice: choice.exposure)
         _draw_line(ax, line, "exposure", 1e3, color, "full pupil" if is_full else f"{n} holes")
-    if any(choice.is_limit for choice in plan.choices):
+    beside = () if plan.full_pupil is None else plan.full_pupil.choices
+    if any(choice.is_limit for choice in (*plan.choices, *beside)):
         ax.plot([], [], "^", color=drawing.FAINT, label="lower limit: not tried")
     ax.plot(1e3 * best.exposure, best.blind_mse, "o", **_RING)
     tau0 = plan.instrument.with_exposure(best.exposure).seeing.tau0
