@@ -21,7 +21,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
-from map_draws import DIAMETER, FILL_FACTOR, OUTER_SCALE, READOUT_NOISE, WAVELENGTH, of_pupil
+from map_draws import FILL_FACTOR, OUTER_SCALE, READOUT_NOISE, of_pupil
+from mask_vs_full_options import DIAMETER, WAVELENGTH
 from searched_masks import search_masks
 
 from torchmask.cli.options import SweepOptions

@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import torch
+from mask_vs_full_options import DIAMETER
+from observing import SIZE
 from searched_masks import search_masks
 from torch import Tensor
 from trade import criterion_of
@@ -19,9 +21,7 @@ from torchmask.optics.pupil import Aperture
 from torchmask.record import Callback
 from torchmask.simulation.scene import SceneOptions, make_scene
 
-DIAMETER, WAVELENGTH = 1.0, 550e-9  # [m]; only ratios to them matter
 FILL_FACTOR, OUTER_SCALE, READOUT_NOISE = 0.15, 20.0, 1.5  # the second in m, the third in electrons per pixel
-SIZE = 0.5  # of the scene over the field
 HOLES = (10, 6, 14, 8, 12)  # of the masks, draw by draw
 
 

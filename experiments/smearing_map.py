@@ -28,12 +28,10 @@ from typing import Any, Literal
 
 import torch
 from map_draws import (
-    DIAMETER,
     FILL_FACTOR,
     HOLES,
     OUTER_SCALE,
     READOUT_NOISE,
-    WAVELENGTH,
     aperture_of,
     choose_pupils,
     of_pupil,
@@ -41,6 +39,7 @@ from map_draws import (
     scene_of,
     score,
 )
+from mask_vs_full_options import DIAMETER, WAVELENGTH
 from smearing_map_report import figure, markdown, summarise, table_of
 
 import torchmask

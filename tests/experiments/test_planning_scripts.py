@@ -45,7 +45,7 @@ def test_a_full_pupil_is_observed_without_a_search_and_without_a_bound():
     task = map_draws.of_pupil(pupil) | {"draw": 1, "n_photons": 1e6, "d_over_r0": 2.0, "n_frames": 2, "n_pixels": 32}
     observation = success_map.observe(task)
     assert observation.aperture.is_full
-    assert float(observation.aperture.subaperture_diameter) == map_draws.DIAMETER
+    assert float(observation.aperture.subaperture_diameter) == 1.0
     # D/r0 = 2: the phase is that of r0 = D / 2 (1.03 (D/r0)^(5/3) rad^2 without piston, for an endless outer scale)
     variance = float(success_map.fit_modes(observation, 10)[..., 1:].square().sum(-1).mean())
     assert 0.2 < variance / (1.03 * 2 ** (5 / 3)) < 3

@@ -215,7 +215,9 @@ def test_the_full_pupil_stands_beside_the_masks(plan):
         assert choice.photons == pytest.approx(3e8 * 0.5 * np.pi / 4 * choice.exposure, rel=1e-9)
         assert choice.blind_mse == pytest.approx(FULL, rel=1e-9)  # what restorations lose is taken away
     assert not any(mask.is_full for mask in plan.masks.values())
-    assert "Without a mask the least is 0.6, with the full pupil of 1 m, 166 frames of 2 ms." in str(plan)
+    assert "Without a mask the least is 0.6, with the full pupil of 1 m, 166 frames of 2 ms, a band of 20 nm." in str(
+        plan
+    )
     assert "full pupil" not in str(dataclasses.replace(plan, full_pupil=None))
 
 
@@ -254,7 +256,7 @@ def test_no_point_beyond_what_was_tried_is_the_best(monkeypatch, quick):
     instrument, holes = make(), (0.09, 0.15, 0.35)
     tau0 = instrument.seeing.tau0
     exposures = (tau0, 2 * tau0, 9 * tau0)
-    with pytest.warns(UserWarning, match="no plan chooses such a point"):
+    with pytest.warns(UserWarning, match="a plan chooses such a point only if there is no other"):
         found = plan_observation(instrument, n_subapertures=(3,), hole_diameters=holes, exposures=exposures, **TINY)
     assert (found.best.hole_diameter, found.best.exposure) == (0.15, pytest.approx(2 * tau0))  # r0 is 0.15 m
     spread = phase_spread(instrument.band.relative_width, 1.0 / 0.15)  # 100 rad were tried

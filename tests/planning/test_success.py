@@ -98,6 +98,13 @@ def test_the_part_of_an_error_that_can_be_avoided_grows_by_the_square():
 def test_the_maps_of_the_library_are_as_large_as_they_say(pupil):
     measured = success_map(pupil)
     assert ("a full pupil, " in measured.conditions) == (pupil == "full")
+    assert measured.pupil == pupil
+    through = {"mask": "masks", "full": "a full pupil"}[pupil]
+    with pytest.warns(UserWarning, match=f"restorations through {through} were tried for photons per frame from"):
+        measured.outlook(measured.d_over_r0[0], 1.0, measured.n_frames[-1])
+    told = smearing_map(pupil)
+    with pytest.warns(UserWarning, match=f"restorations through {through} were tried for exposures"):
+        told.outlook(BlindOutlook(1.0, 1.0, 1.0, 1.0), n_photons=1e6, exposure=1e3, spread=0.5)
     assert measured.conditions.startswith(f"{int(measured.tried.sum())} restorations of 64 x 64 pixels")
     with warnings.catch_warnings():
         warnings.simplefilter("error")

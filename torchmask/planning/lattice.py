@@ -80,8 +80,10 @@ class Located(NamedTuple):
     harder: tuple[str, ...]
 
 
-def locate(axes: Sequence[Axis], point: Sequence[float], told: Collection[str] = ()) -> Located:
-    """Find a point on a lattice; `told` names the axes of which a warning said before that they do not hold it.
+def locate(axes: Sequence[Axis], point: Sequence[float], through: str, told: Collection[str] = ()) -> Located:
+    """Find a point on the lattice of restorations `through` a mask or a full pupil, in words for warnings.
+
+    `told` names the axes of which a warning said before that they do not hold the point.
 
     Raises ValueError for a value that cannot be.
 
@@ -97,10 +99,14 @@ def locate(axes: Sequence[Axis], point: Sequence[float], told: Collection[str] =
     for axis in (axis for axis in outside if axis.name not in told):
         then = "beyond, what they lose is taken to be that of the nearest tried"
         if axis.name in harder:
-            then = "they lose more beyond the last, by how much is not known, so that no plan chooses such a point"
+            then = (
+                "they lose more beyond the last, by how much is not known, so that a plan chooses such a point only if "
+                "there is no other"
+            )
         first, last = axis.values[0], axis.values[-1]
         warnings.warn(
-            f"blind restorations were tried for {axis.words} from {first:g} to {last:g}: {then}", stacklevel=3
+            f"blind restorations through {through} were tried for {axis.words} from {first:g} to {last:g}: {then}",
+            stacklevel=3,
         )
     return Located(places, tuple(axis.name for axis in outside), harder)
 

@@ -200,16 +200,17 @@ def _measure(
         criterion = None
         for (n, hole), mask in sorted(masks.items(), key=lambda item: item[0][1]):
             area = float(mask.area)
-            build = instant_criterion if beside else instrument_criterion
-            criterion = criterion or build(instrument, area, n_frequencies)
-            change_light(criterion, instrument, area)
-            error = float(criterion.relative(mask))
-            above = error - criterion.relative_floor(instrument.telescope.diameter)
+            error, _, floor = instants[n, hole, place]
+            if not beside:
+                criterion = criterion or instrument_criterion(instrument, area, n_frequencies)
+                change_light(criterion, instrument, area)
+                error = float(criterion.relative(mask))
+                floor = criterion.relative_floor(instrument.telescope.diameter)
             photons, sky = instrument.photons(area), instrument.sky(area)
             light = instrument.exposure, instrument.width, instrument.frames, photons, sky
             blind = _blind_outlook(instrument, mask)
             expected = _expected_error(blind, *instants[n, hole, place])
-            choices.append(Choice(n, hole, *light, error, above, expected, blind))
+            choices.append(Choice(n, hole, *light, error, error - floor, expected, blind))
             _tell(callback, "plan/full" if beside else "plan/map", len(choices), n_steps, error)
     return sorted(choices, key=lambda choice: tuple(getattr(choice, name) for name in AXES))
 

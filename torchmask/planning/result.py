@@ -211,7 +211,8 @@ class ObservationPlan:
             least, why = f"at least {least}", "; such restorations were tried under easier conditions only"
             if "d_over_r0" in full.blind.harder:
                 why += f", up to D/r0 = {self.full_pupil.tried_up_to['hole_diameter'] / self.instrument.site.r0:.3g}"
-        return [f"Without a mask the least is {least}, with {self.full_pupil._point(full)}{why}."]
+        band = "" if full.width is None else f", a band of {1e9 * full.width:.4g} nm"
+        return [f"Without a mask the least is {least}, with {self.full_pupil._point(full)}{band}{why}."]
 
 
 def _limit_line(best: Choice) -> list[str]:

@@ -18,7 +18,7 @@ from typing import get_args
 import numpy as np
 
 from torchmask.planning.lattice import Axis, interpolate, locate
-from torchmask.planning.success import BlindOutlook, Pupil
+from torchmask.planning.success import THROUGH, BlindOutlook, Pupil
 
 
 def phase_spread(width: float, d_over_r0: float) -> float:
@@ -42,6 +42,7 @@ class SmearingMap:
         times `BlindOutlook.cost` and `SuccessMap.level`, indexed [photons, exposures] and [photons, spreads]; the
         exposures were in narrow light, the bands those of instants
     conditions : what all restorations share, in a sentence
+    pupil : what they were through
 
     Raises ValueError if a shape or an order is wrong, or a ratio is not finite and positive.
 
@@ -59,6 +60,7 @@ class SmearingMap:
     exposure_ratio: np.ndarray
     band_ratio: np.ndarray
     conditions: str = ""
+    pupil: Pupil = "mask"
 
     def __post_init__(self) -> None:
         photons, exposures, spreads = self._axes
@@ -108,7 +110,9 @@ class SmearingMap:
             exposure = max(exposure, self.exposures[0])
         if spread >= 0:
             spread = max(spread, self.spreads[0])
-        (light, long, wide), outside, harder = locate(self._axes, (n_photons, exposure, spread), instants.outside)
+        (light, long, wide), outside, harder = locate(
+            self._axes, (n_photons, exposure, spread), THROUGH[self.pupil], instants.outside
+        )
         logarithm = 0.0
         for ratio, place in ((self.exposure_ratio, long), (self.band_ratio, wide)):
             logarithm += interpolate(np.log(ratio), (light, place)) - interpolate(np.log(ratio), (light, 0)) / 2
@@ -129,4 +133,4 @@ def smearing_map(pupil: Pupil = "mask") -> SmearingMap:
     if pupil not in get_args(Pupil):
         raise ValueError(f"pupil is {pupil!r}: maps are known of {' and '.join(get_args(Pupil))}")
     table = files("torchmask.planning").joinpath(f"smearing_{pupil}.json")
-    return SmearingMap(**json.loads(table.read_text(encoding="utf-8")))
+    return SmearingMap(**json.loads(table.read_text(encoding="utf-8")), pupil=pupil)

@@ -19,6 +19,7 @@ import numpy as np
 from torchmask.planning.lattice import Axis, interpolate, locate
 
 Pupil = Literal["mask", "full"]
+THROUGH: dict[Pupil, str] = {"mask": "masks", "full": "a full pupil"}
 SUCCESS = 1.3  # a restoration succeeds if its score is within this factor of that for known PSFs
 
 
@@ -65,6 +66,7 @@ class SuccessMap:
     tried, succeeded : numbers of restorations, indexed [frames, photons, d_over_r0]
     cost : median over them of the score over that for known PSFs
     conditions : what all of them share, in a sentence
+    pupil : what the restorations were through
     level : geometric mean over them of the score for known PSFs over the one that `TurbulentMSE` predicts; a single
         number where it was not measured, and is taken to be the same at all points
 
@@ -84,6 +86,7 @@ class SuccessMap:
     succeeded: np.ndarray
     cost: np.ndarray
     conditions: str = ""
+    pupil: Pupil = "mask"
     level: np.ndarray = field(default_factory=lambda: np.array(1.0))
 
     def __post_init__(self) -> None:
@@ -133,7 +136,7 @@ class SuccessMap:
         UserWarning
             If the point lies outside the map, whose nearest edge is taken.
         """
-        places, outside, harder = locate(self._axes, (n_frames, n_photons, d_over_r0))
+        places, outside, harder = locate(self._axes, (n_frames, n_photons, d_over_r0), THROUGH[self.pupil])
         chance = self.succeeded / self.tried
         middle, half = chance + 0.5 / self.tried, np.sqrt(chance * (1 - chance) / self.tried + 0.25 / self.tried**2)
         low, high = ((middle + side * half) / (1 + 1 / self.tried) for side in (-1, 1))
@@ -160,4 +163,4 @@ def success_map(pupil: Pupil = "mask") -> SuccessMap:
     if pupil not in get_args(Pupil):
         raise ValueError(f"pupil is {pupil!r}: maps are known of {' and '.join(get_args(Pupil))}")
     table = files("torchmask.planning").joinpath(f"success_{pupil}.json")
-    return SuccessMap(**json.loads(table.read_text(encoding="utf-8")))
+    return SuccessMap(**json.loads(table.read_text(encoding="utf-8")), pupil=pupil)
