@@ -95,15 +95,19 @@ def plan():
         return plan_observation(make(), **AXES, **TINY)
 
 
+def floor_of(choice):
+    """What no mask of the telescope's diameter can avoid."""
+    psds = PowerLawPSD(1.5, choice.photons), NoisePSD(choice.photons)
+    return AsymptoticMSE(make().grid(32), *psds, choice.frames).relative_floor(1.0)
+
+
 def test_points_have_the_light_of_their_area(plan):
     for choice in plan.choices:
         mask = plan.masks[choice.n_subapertures, choice.hole_diameter]
         photons = 3e8 * 0.5 * float(mask.area) * choice.exposure
         assert choice.photons == pytest.approx(photons, rel=1e-12)
         assert choice.frames == int(0.5 / (choice.exposure + 1e-3) + 1e-9)
-        criterion = AsymptoticMSE(make().grid(32), PowerLawPSD(1.5, photons), NoisePSD(photons), choice.frames)
-        floor = criterion.relative_floor(1.0)
-        assert choice.relative_mse - choice.above_floor == pytest.approx(floor, rel=1e-10)
+        assert choice.relative_mse - choice.above_floor == pytest.approx(floor_of(choice), rel=1e-10)
 
 
 BRIGHT = {"source": Source(photon_rate=3e10), "n_wavelengths": 1}
@@ -214,6 +218,8 @@ def test_the_full_pupil_stands_beside_the_masks(plan):
     for choice in full.choices:
         assert choice.photons == pytest.approx(3e8 * 0.5 * np.pi / 4 * choice.exposure, rel=1e-9)
         assert choice.blind_mse == pytest.approx(FULL, rel=1e-9)  # what restorations lose is taken away
+        assert choice.relative_mse == pytest.approx(FULL, rel=1e-9)
+        assert choice.relative_mse - choice.above_floor == pytest.approx(floor_of(choice), rel=1e-10)
     assert not any(mask.is_full for mask in plan.masks.values())
     assert "Without a mask the least is 0.6, with the full pupil of 1 m, 166 frames of 2 ms, a band of 20 nm." in str(
         plan
