@@ -234,6 +234,53 @@ def test_an_interrupted_last_descent_goes_on(observe, five_holes, tmp_path):
         records.clear()
 
 
+@pytest.mark.parametrize(
+    ("change", "calls"),
+    [
+        ({}, [4, 8, 12]),  # after each segment until none are found
+        ({"found": 0}, [4]),
+        ({"aperture": FullAperture(1.0)}, []),  # which has rounds of its own
+        ({"wavelengths": (550e-9, 600e-9)}, []),  # a field of one wavelength is no start for two
+        ({"n_frames": 1}, []),  # the object of one frame is no help for its phases
+    ],
+)
+def test_lost_frames_are_looked_for_between_segments(change, calls, observe, five_holes, tmp_path, monkeypatch):
+    """What is found is worth another segment, the object is moved and settled for it, and the message says so.
+
+    An interrupted restoration goes on as if it had not been interrupted.
+    """
+    seen = observe(change.get("aperture", five_holes), n_frames=change.get("n_frames", 2), shape=(32, 32))
+    records, tried, moved, n_found = [], [], [], change.get("found", 2)
+
+    def stand_in(objective, state, seed, schedule, minimizer):
+        tried.append(sum(record.stage == "last descent" for record in records))
+        return (replace(state, z=1.01 * state.z) if seed < n_found else state), 7  # seeds count up from 0
+
+    def move(objective, state, schedule):
+        moved.append(state)
+        return finish_centre(objective, state, schedule)
+
+    finish_centre = finish.centre_on_pixels
+    monkeypatch.setattr(finish, "retrieve_lost_frames", stand_in)
+    monkeypatch.setattr(finish, "centre_on_pixels", move)
+    monkeypatch.setattr(myopic, "FULL_MODES", 10)
+    options = {"start_iterations": 8, "segment": 4, "last_modes": 8, "chance": math.inf, "faint": 0.0, "retrievals": 0}
+    options |= {"last_segments": 9, "last_gain": 1.0, "last_modes_full": 15, "averaged": 1, "candidates": ()}
+    given = {"wavelengths": change["wavelengths"]} if "wavelengths" in change else {}
+    method = MyopicDeconvolution(
+        seen.aperture, seen.grid, readout_noise=1.5, schedule=Schedule(**options), tolerance=0.0, **given
+    )
+    whole = method.restore(seen.frames, callback=records.append)
+    assert tried == calls
+    assert len(moved) == max(0, len(calls) - 1)
+    assert ("phases were retrieved" in whole.message) is (len(calls) > 1)
+    if len(calls) > 1:
+        interrupt_last_descent(method, seen.frames, path := tmp_path / "state.npz", 6)
+        resumed = method.restore(seen.frames, checkpoint=path)
+        assert torch.equal(resumed.object, whole.object)
+        assert (resumed.n_evaluations, resumed.message) == (whole.n_evaluations, whole.message)
+
+
 def test_a_search_that_is_cut_short_has_an_end_once_a_start_was_whole(observe, five_holes, tmp_path):
     """And leaves a file from which the search goes on if it may have more iterations."""
     seen = observe(n_frames=2, shape=(32, 32))
@@ -372,7 +419,7 @@ def test_an_interrupted_last_descent_of_a_full_pupil_goes_on(retrievals, said, o
     seen = observe(FullAperture(1.0), n_frames=3, r0=0.5)
     monkeypatch.setattr(myopic, "FULL_MODES", 10)
     options = {"candidates": ((2, 4),), "segment": 4, "sharp_after": 4, "escapes": 0, "start_iterations": 8}
-    options |= {"chance": 1e9, "last_segments": 3, "last_gain": 0.0, "reflections": 2, "retrieved_from": 0.0}
+    options |= {"chance": 1e9, "last_segments": 3, "last_gain": 0.0, "reflections_full": 2, "retrieved_from": 0.0}
     options |= {"retrievals": retrievals, "retrieved_gain": math.inf, "retrieved_iterations": 4}
     schedule = Schedule(**options, last_modes_full=15)
     method = MyopicDeconvolution(FullAperture(1.0), seen.grid, readout_noise=1.5, tolerance=0, schedule=schedule)

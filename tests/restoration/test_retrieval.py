@@ -1,5 +1,6 @@
-"""Phases of a full pupil's frames, retrieved for a sharp object where descents end in poor minima."""
+"""Phases of frames, retrieved for a sharp object where descents end in poor minima."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -7,20 +8,21 @@ import torch
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture, SparseAperture
-from torchmask.restoration import reflections, retrieval, solver
-from torchmask.restoration.aberrations import AberrationBasis
+from torchmask.restoration import frame_retrieval, reflections, retrieval, solver
+from torchmask.restoration.aberrations import AberrationBasis, turbulent_basis
 from torchmask.restoration.background import Background
 from torchmask.restoration.calibration import calibrate
 from torchmask.restoration.candidates import Candidates
 from torchmask.restoration.checkpoint import Progress
 from torchmask.restoration.descent import descend
 from torchmask.restoration.forward import ExposureModel
+from torchmask.restoration.frame_retrieval import Trial, parameters_of_fields, retrieve_frames
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.priors import TotalVariation
 from torchmask.restoration.projected_lbfgs import ProjectedLBFGS
 from torchmask.restoration.reflections import STEPS, retrieve_fields
-from torchmask.restoration.retrieval import parameters_of_fields, retrieve_phases
+from torchmask.restoration.retrieval import retrieve_lost_frames, retrieve_phases
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.state import Calibration, State
 from torchmask.restoration.traits import Refinement, Traits
@@ -52,6 +54,42 @@ def fit_modes(objective, state, n_iterations):
 
 def chi_squares(objective, state):
     return 2 * objective.frame_costs(state.image, state.z, state.calibration) / objective.frames[0].numel()
+
+
+def lost(truth):
+    """The state with two frames whose aberrations are those of others."""
+    z = truth.z.clone()
+    z[[0, 1]] = z[[1, 0]]
+    return replace(truth, z=z)
+
+
+class Script:
+    """Stands in for the trials of frames: says what is found in each round, and keeps who was tried.
+
+    `results` has for each round what becomes of all frames, of which only those that are tried count.
+    """
+
+    def __init__(self, monkeypatch, results):
+        self.results, self.tried, self.seeds = results, [], []
+        monkeypatch.setattr(retrieval, "retrieve_frames", self.try_frames)
+        monkeypatch.setattr(retrieval, "_descend_together", lambda objective, state, *given, **more: state)
+
+    def try_frames(self, objective, state, tried, n_reflections, seed, *given):
+        self.seeds.append(seed)
+        found = self.results[len(self.tried)]
+        self.tried.append(tried.tolist())
+        said = [found[number] for number in self.tried[-1]]
+        spent = round(n_reflections * (STEPS + 2) / 2 * len(said) / len(state.z))
+        state = replace(state) if YES in said else state
+        return Trial(state, said.count(YES), torch.tensor([word == NO for word in said]), spent)
+
+
+def left(truth, *excess):
+    """The state whose frames leave this excess chi-square, whatever their aberrations."""
+    return truth.calibrated(noise_inflation=1 + torch.tensor(excess, dtype=torch.float64))
+
+
+NO, YES, AGAIN = "", "found", "again"
 
 
 def test_reflections_find_most_frames_where_descents_stop():
@@ -89,6 +127,28 @@ def test_phases_of_several_waves_are_unwrapped_exactly():
     assert float(phase.abs().max()) > 3.5  # wrapped: beyond pi
     found = parameters_of_fields(objective, samples.field(phase), torch.zeros_like(state.z))
     torch.testing.assert_close(found[:, 1:], state.z[:, 1:], rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_pistons_of_holes_are_found_but_for_whole_waves(dtype, five_holes):
+    """Differences of the phase do not show them. Under a prior that makes them large, rounding must not either.
+
+    What is below 1e-5 of the largest singular value may be left, so the phase is known to that part of the largest.
+    """
+    basis = turbulent_basis(five_holes, 6, 0, 0.05, 20.0)
+    samples = (model := ExposureModel(five_holes, Grid.nyquist(1.0, 550e-9, 48), basis, dtype=dtype)).pupil.samples()
+    z = torch.randn(4, basis.n_parameters, dtype=torch.float64, generator=torch.Generator().manual_seed(5)).to(dtype)
+    coefficients = basis.coefficients(z)
+    largest = float(coefficients.abs().max())
+    assert float(coefficients[..., 0].abs().max()) > 2 * 2 * math.pi  # whole waves
+    frames, precision = torch.zeros(4, 48, 48, dtype=dtype), torch.ones(1, 1, 1, dtype=dtype)
+    objective = MyopicObjective(model, frames, precision, TotalVariation())
+    found = parameters_of_fields(objective, samples.field(samples.phase(z)), torch.zeros_like(z))
+    off = basis.coefficients(found) - coefficients
+    torch.testing.assert_close(off[..., 1:], torch.zeros_like(off[..., 1:]), rtol=0, atol=1e-5 * largest)
+    field = torch.exp(1j * (off[..., 0] - off[..., :1, 0]))
+    torch.testing.assert_close(field, torch.ones_like(field), rtol=0, atol=1e-5 * largest)
+    assert float(found.abs().max()) < 10 * float(z.abs().max())
 
 
 def test_common_aberrations_stay_and_are_taken_off():
@@ -152,9 +212,62 @@ def test_the_intensity_fits_the_frame_and_stays_where_the_object_hides_it(monkey
     torch.testing.assert_close(angle[bright].imag, torch.zeros_like(angle[bright].imag), rtol=0, atol=1e-9)
 
 
+# --- frames that a descent through a mask has lost
+
+
+def test_lost_frames_of_a_mask_are_found_at_once(explain):
+    """All of them, by a hundred reflections; frames at the noise are not touched.
+
+    The noise was taken to be as large in all frames, so a descent at the true one follows.
+    """
+    objective, truth = explain(n_frames=6, noise=0.1)
+    begun = lost(truth)
+    before = chi_squares(objective, begun)
+    assert float(before[:2].min()) > 2
+    state, n_evaluations = retrieve_lost_frames(objective, begun, 0, Schedule(), ProjectedLBFGS())
+    after = calibrate(objective, fit_modes(objective, replace(state, calibration=truth.calibration), 60))
+    assert float(after.calibration.noise_inflation.max()) < 1 + 4 * math.sqrt(2 / objective.frames[0].numel())
+    assert torch.equal(state.z[2:], begun.z[2:])
+    assert n_evaluations >= 2 / 6 * 100 * (STEPS + 2) / 2 - 1
+
+
+@pytest.mark.parametrize(
+    ("results", "tried", "found"),
+    [
+        # the worst quarter first, and then the rest of those that leave more than noise
+        ([(YES, YES, YES, YES, YES), (YES, YES, YES, NO, YES)], [[4, 1], [2, 5, 0]], True),
+        ([(NO, NO, NO, NO, NO, YES), (YES,) * 6], [[4, 1]], False),
+        ([(NO, YES, NO, NO, NO, NO), (NO,) * 6], [[4, 1], [2, 5, 0]], True),
+        ([(AGAIN,) * 6], [[4, 1]], False),
+    ],
+)
+def test_the_worst_frames_are_tried_first(results, tried, found, monkeypatch, explain):
+    """Where none of them is found the model lacks what the frames hold, so the others are spared."""
+    objective, truth = explain(n_frames=6)
+    monkeypatch.setattr(retrieval, "calibrate", lambda objective, state: state)
+    script = Script(monkeypatch, [[*one, NO][:6] for one in results])
+    begun = left(truth, 0.5, 3.0, 1.0, 0.0, 4.0, 0.9)
+    state, n_evaluations = retrieve_lost_frames(objective, begun, 3, Schedule(reflections=60), ProjectedLBFGS())
+    assert script.tried == tried
+    assert script.seeds == [3] * len(tried)
+    assert (state is begun) is not found
+    assert n_evaluations == sum(map(len, tried)) / 6 * 60 * (STEPS + 2) / 2
+
+
+@pytest.mark.parametrize(("limit", "tried"), [(0.05, [[1]]), (0.5, [])])
+def test_frames_at_the_noise_are_not_lost(limit, tried, monkeypatch, explain):
+    """Of 32 x 32 pixels three standard deviations are 0.13."""
+    objective, truth = explain(n_frames=3)
+    monkeypatch.setattr(retrieval, "calibrate", lambda objective, state: state)
+    script = Script(monkeypatch, [(NO, NO, NO)])
+    begun = left(truth, 0.12, 0.14, 0.0)
+    retrieve_lost_frames(objective, begun, 0, Schedule(lost=limit), ProjectedLBFGS())
+    assert script.tried == tried
+
+
 # --- rounds
 
-BRISK = {"reflections": 60, "retrieved_segments": 1, "segment": 40}
+BRISK = {"reflections_full": 60, "retrieved_segments": 1, "segment": 40}
 TRAITS = Traits(True, False, True, False, 0.2, 20.0, 1000, 0.0, 0, Refinement.OFF)
 
 
@@ -164,17 +277,10 @@ def retrieve(objective, state, **numbers):
     return ended
 
 
-def lost(truth):
-    """The state with two frames whose aberrations are those of others."""
-    z = truth.z.clone()
-    z[[0, 1]] = z[[1, 0]]
-    return replace(truth, z=z)
-
-
 def test_lost_frames_are_found_and_the_others_stay():
     objective, truth = problem(5, rms=0.2, noise=0.1)
     before = chi_squares(objective, lost(truth)) - 1
-    ended = retrieve(objective, lost(truth), reflections=200)
+    ended = retrieve(objective, lost(truth), reflections_full=200)
     after = chi_squares(objective, replace(ended.state, calibration=truth.calibration)) - 1
     assert ended.retrieved
     assert bool((after[:2] < 0.25 * before[:2]).all())
@@ -193,37 +299,10 @@ def test_what_does_not_gain_enough_is_not_kept():
 
 def test_frames_that_are_explained_are_left_alone(monkeypatch):
     objective, truth = problem(5, rms=0.2)
-    monkeypatch.setattr(retrieval, "retrieve_fields", lambda *given: pytest.fail("it was called"))
+    monkeypatch.setattr(frame_retrieval, "retrieve_fields", lambda *given: pytest.fail("it was called"))
     ended = retrieve(objective, truth)
     assert not ended.retrieved
     assert ended.n_evaluations == 0
-
-
-class Script:
-    """Stands in for the trials of frames: says what is found in each round, and keeps who was tried.
-
-    `results` has for each round what becomes of all frames, of which only those that are tried count.
-    """
-
-    def __init__(self, monkeypatch, results):
-        self.results, self.tried, self.seeds = results, [], []
-        monkeypatch.setattr(retrieval, "_try_frames", self.try_frames)
-        monkeypatch.setattr(retrieval, "_descend_together", lambda objective, state, *given, **more: state)
-
-    def try_frames(self, objective, state, tried, seed, *given):
-        self.seeds.append(seed)
-        found = self.results[len(self.tried)]
-        self.tried.append(tried.tolist())
-        said = [found[number] for number in self.tried[-1]]
-        return retrieval._Trial(state, said.count(YES), torch.tensor([word == NO for word in said]), 0)
-
-
-def left(truth, *excess):
-    """The state whose frames leave this excess chi-square, whatever their aberrations."""
-    return truth.calibrated(noise_inflation=1 + torch.tensor(excess, dtype=torch.float64))
-
-
-NO, YES, AGAIN = "", "found", "again"
 
 
 @pytest.mark.parametrize(
@@ -262,11 +341,9 @@ def test_a_frame_is_found_where_clearly_less_is_left_and_again_where_as_much_is(
     start = calibrate(objective, lost(truth))
     z = truth.z.clone()
     z[3] = 3 * z[0]
-    monkeypatch.setattr(retrieval, "parameters_of_fields", lambda part, fields, now: z)
+    monkeypatch.setattr(frame_retrieval, "parameters_of_fields", lambda part, fields, now: z)
     every = torch.arange(4)
-    trial = retrieval._try_frames(
-        objective, start, every, 0, Schedule(retrieved_iterations=0, reflections=1), ProjectedLBFGS()
-    )
+    trial = retrieve_frames(objective, start, every, 1, 0, Schedule(retrieved_iterations=0), ProjectedLBFGS())
     assert trial.n_found == 2
     assert trial.missing.tolist() == [False, False, False, True]
     torch.testing.assert_close(trial.state.z, truth.z, rtol=1e-12, atol=1e-12)
@@ -277,9 +354,9 @@ def test_a_frame_that_is_hardly_better_has_not_been_found(monkeypatch):
     objective, truth = problem(4, rms=0.1, noise=0.1)
     start = calibrate(objective, lost(truth))
     z = start.z + 0.05 * (truth.z - start.z)
-    monkeypatch.setattr(retrieval, "parameters_of_fields", lambda part, fields, now: z)
-    schedule = Schedule(retrieved_iterations=0, reflections=1)
-    trial = retrieval._try_frames(objective, start, torch.arange(4), 0, schedule, ProjectedLBFGS())
+    monkeypatch.setattr(frame_retrieval, "parameters_of_fields", lambda part, fields, now: z)
+    schedule = Schedule(retrieved_iterations=0)
+    trial = retrieve_frames(objective, start, torch.arange(4), 1, 0, schedule, ProjectedLBFGS())
     assert trial.n_found == 0
     torch.testing.assert_close(trial.state.z, z, rtol=1e-12, atol=1e-12)
 
@@ -290,20 +367,22 @@ def test_a_frame_that_fits_as_badly_with_other_phases_is_missing_still(monkeypat
     start = calibrate(objective, truth)
     turned = torch.tensor([0.0, 0.1, 3.0], dtype=torch.float64)[:, None]  # a constant phase shows in no field
     other = truth.z + turned * torch.eye(MODES, dtype=torch.float64)[3]
-    monkeypatch.setattr(retrieval, "parameters_of_fields", lambda part, fields, now: other)
-    monkeypatch.setattr(retrieval, "calibrate", lambda objective, state: start)  # which leaves as much of all frames
-    schedule = Schedule(retrieved_iterations=0, reflections=1)
-    trial = retrieval._try_frames(objective, start, torch.arange(3), 0, schedule, ProjectedLBFGS())
+    monkeypatch.setattr(frame_retrieval, "parameters_of_fields", lambda part, fields, now: other)
+    monkeypatch.setattr(
+        frame_retrieval, "calibrate", lambda objective, state: start
+    )  # which leaves as much of all frames
+    schedule = Schedule(retrieved_iterations=0)
+    trial = retrieve_frames(objective, start, torch.arange(3), 1, 0, schedule, ProjectedLBFGS())
     assert trial.missing.tolist() == [False, False, True]
     piston = torch.eye(MODES, dtype=torch.float64)[:1]
-    torch.testing.assert_close(retrieval._agreement(objective, 2.0 * piston), torch.ones(1).double())
+    torch.testing.assert_close(frame_retrieval._agreement(objective, 2.0 * piston), torch.ones(1).double())
 
 
 def test_frames_at_the_noise_are_not_tried(monkeypatch):
     objective, truth = problem(4, rms=0.2)
     monkeypatch.setattr(retrieval, "calibrate", lambda objective, state: state)
     script = Script(monkeypatch, [(NO, NO, NO, NO)] * 9)
-    ended = retrieve(objective, left(truth, 0.4, 3.0, 0.1, 0.45), retrievals=9, reflections=60)
+    ended = retrieve(objective, left(truth, 0.4, 3.0, 0.1, 0.45), retrievals=9, reflections_full=60)
     assert script.tried == [[1]] * 4
     assert script.seeds == [0, 1, 2, 3]  # other phases each time
     assert ended.n_evaluations == 4 * 60 * (STEPS + 2) / 2 / 4  # of one frame of four
@@ -327,10 +406,10 @@ def test_trials_begin_at_random_phases_that_the_seed_gives(monkeypatch):
         given.append(state.z)
         return retrieve_fields(part, state, n_reflections)
 
-    monkeypatch.setattr(retrieval, "retrieve_fields", watch)
-    schedule = Schedule(retrieved_iterations=1, reflections=1)
+    monkeypatch.setattr(frame_retrieval, "retrieve_fields", watch)
+    schedule = Schedule(retrieved_iterations=1)
     for seed in (0, 0, 1):
-        retrieval._try_frames(objective, start, torch.tensor([0, 2]), seed, schedule, ProjectedLBFGS())
+        retrieve_frames(objective, start, torch.tensor([0, 2]), 1, seed, schedule, ProjectedLBFGS())
     assert torch.equal(given[0], given[1])
     assert not bool((given[0] == given[2]).any())
     assert float((given[0] - start.z[[0, 2]]).abs().min()) > 0

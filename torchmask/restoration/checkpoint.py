@@ -69,7 +69,8 @@ class Progress:
     last_segments : number of segments of the last descent that are done; all there may be, once it gains no more
     integrated : whether the aberrations have been integrated out, which is done at the end and not stored
     averaged : number of starts whose objects have been averaged, before the last descent
-    retrieved : whether phases have been retrieved, after the present start
+    retrieved : whether phases have been retrieved, after the present start or in the last descent
+    all_found : whether that descent has lost no more frames, or none of those could be found
     """
 
     candidates: Candidates
@@ -89,6 +90,7 @@ class Progress:
     integrated: bool = False
     averaged: int = 1
     retrieved: bool = False
+    all_found: bool = False
 
     @property
     def state(self) -> State:
@@ -130,7 +132,17 @@ class Progress:
         self.status, self.decrease = Status.RUNNING, None
 
 
-_NUMBERS = ("n_evaluations", "escapes", "starts", "began", "alike", "last_segments", "averaged", "retrieved")
+_NUMBERS = (
+    "n_evaluations",
+    "escapes",
+    "starts",
+    "began",
+    "alike",
+    "last_segments",
+    "averaged",
+    "retrieved",
+    "all_found",
+)
 # arrays of an ending
 _NEEDED = ("image", "z", "geometry", "modes", "status", *(item.name for item in fields(Calibration)))
 

@@ -3,7 +3,8 @@
 A descent from far away takes few modes per sub-aperture. Close to the solution, more of them take away much of what the
 model leaves unexplained. So once the search has ended, the aberrations gain modes, and the object a smoother prior
 (`ObjectPrior.smoother`), and that descent goes on while it gains. Where noise leaves the aberrations of a mask
-uncertain, they are integrated out after it, or in its place if frames are faint. For a full pupil its segments begin
+uncertain, they are integrated out after it, or in its place if frames are faint. Between its segments the phases of
+frames are retrieved that a mask's search has left in poor minima (`retrieval`). For a full pupil its segments begin
 with the object settled for the aberrations at hand: a joint descent is too slow at the frequencies that a full pupil
 hardly passes, in which most of the error in bright light would lie.
 """
@@ -17,11 +18,12 @@ from torchmask.record import Callback
 from torchmask.restoration.calibration import calibrate, recalibrate
 from torchmask.restoration.checkpoint import Progress
 from torchmask.restoration.descent import Variables, descend
-from torchmask.restoration.escapes import settle
+from torchmask.restoration.escapes import centre_on_pixels, settle
 from torchmask.restoration.marginal import integrate_aberrations
 from torchmask.restoration.motion import Setting
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.projected_lbfgs import Minimizer
+from torchmask.restoration.retrieval import retrieve_lost_frames
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.state import State
 from torchmask.restoration.traits import End, Traits
@@ -65,6 +67,7 @@ class Finisher:
         objective = self.setting.objective_at(objective, state).with_changes(prior=objective.prior.smoother())
         most, done = (number * schedule.segment for number in (schedule.last_segments, ended.last_segments))
         report, costs = ended.reporter("last descent", most, self.callback, done), []
+        may_find = not self.traits.many_minima and objective.model.pupil.n_rasters == 1 and len(state.z) > 1
 
         def listen(cost: float, evaluations: int, variables: Variables) -> None:
             costs.append(cost)
@@ -72,12 +75,15 @@ class Finisher:
 
         while ended.last_segments < schedule.last_segments:
             costs.clear()
-            if schedule.recalibrates:
-                state = recalibrate(objective, state, self.traits.fit_power, follow_r0=self.traits.r0_is_open)
+            state = self._recalibrate(objective, state)
             if self.traits.many_minima:
                 state = settle(objective, state, schedule.last_settling)
             state = descend(objective, state, schedule.segment, self.minimizer, listen)
             gains = bool(costs) and costs[len(costs) // 2] - costs[-1] > schedule.last_gain * abs(costs[-1])
+            if may_find and not ended.all_found:
+                descended, state = state, self._find_lost_frames(objective, state, ended)
+                ended.all_found = state is descended
+                gains = gains or not ended.all_found
             ended.finer, ended.last_segments = state, ended.last_segments + 1 if gains else schedule.last_segments
             self.save(ended)
         # a descent moves flat parts of the object slowly
@@ -86,6 +92,24 @@ class Finisher:
             return first
         ended.state = state
         return objective
+
+    def _recalibrate(self, objective: MyopicObjective, state: State) -> State:
+        if not self.schedule.recalibrates:
+            return state
+        return recalibrate(objective, state, self.traits.fit_power, follow_r0=self.traits.r0_is_open)
+
+    def _find_lost_frames(self, objective: MyopicObjective, state: State, ended: Progress) -> State:
+        """Return the state with the phases of frames that a descent has lost, and an object that suits them; the state
+        itself if none are found."""
+        seed = self.traits.seed + ended.last_segments
+        found, spent = retrieve_lost_frames(objective, state, seed, self.schedule, self.minimizer)
+        ended.n_evaluations += spent
+        if found is state:
+            return state
+        ended.retrieved = True
+        # the sharper the object, the more it matters where it lies on the pixels
+        found = centre_on_pixels(objective, self._recalibrate(objective, found), self.schedule)
+        return settle(objective, found, self.schedule.last_settling)
 
 
 def _chi_square(objective: MyopicObjective, state: State) -> float:

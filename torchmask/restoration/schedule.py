@@ -92,10 +92,13 @@ class Schedule:
     last_modes_full : the same of a full pupil, however faint
     last_segments : maximum number of segments of that descent; 0: there is none
     last_gain : it ends when the second half of a segment lowers the cost by less than this fraction
+    lost : after each segment phases are retrieved of a mask's frames whose chi-square is above that of noise by more
+        than this
+    reflections : number of reflections by which they are
     retrievals : for a full pupil, maximum number of rounds of phase retrieval after a start; 0: there is none
     retrieved_starts : number of starts after which phases are retrieved, until they are found
     retrieved_from : a round is made while the mean chi-square is above that of noise by more than this
-    reflections : number of reflections of a round
+    reflections_full : number of reflections of a round
     retrieved_iterations : maximum number of iterations that fit the modes of the phases retrieved
     retrieved_segments : number of segments in which object and aberrations then descend
     retrieved_gain : what the rounds have found is kept if the excess chi-square falls below this fraction
@@ -148,10 +151,12 @@ class Schedule:
     last_modes_full: int = 351
     last_segments: int = 20
     last_gain: float = 0.003
+    lost: float = 0.05
+    reflections: int = 100
     retrievals: int = 8
     retrieved_starts: int = 2
     retrieved_from: float = 0.5
-    reflections: int = 600
+    reflections_full: int = 600
     retrieved_iterations: int = 60
     retrieved_segments: int = 2
     retrieved_gain: float = 0.7
