@@ -239,6 +239,7 @@ def test_an_interrupted_last_descent_goes_on(observe, five_holes, tmp_path):
     [
         ({}, [4, 8, 12]),  # after each segment until none are found
         ({"found": 0}, [4]),
+        ({"found": 0, "last_gain": 0.0}, [4]),  # not again either
         ({"aperture": FullAperture(1.0)}, []),  # which has rounds of its own
         ({"wavelengths": (550e-9, 600e-9)}, []),  # a field of one wavelength is no start for two
         ({"n_frames": 1}, []),  # the object of one frame is no help for its phases
@@ -250,31 +251,31 @@ def test_lost_frames_are_looked_for_between_segments(change, calls, observe, fiv
     An interrupted restoration goes on as if it had not been interrupted.
     """
     seen = observe(change.get("aperture", five_holes), n_frames=change.get("n_frames", 2), shape=(32, 32))
-    records, tried, moved, n_found = [], [], [], change.get("found", 2)
+    records, tried, calls_of, n_found = [], [], [], change.get("found", 2)
 
     def stand_in(objective, state, seed, schedule, minimizer):
         tried.append(sum(record.stage == "last descent" for record in records))
-        return (replace(state, z=1.01 * state.z) if seed < n_found else state), 7  # seeds count up from 0
+        return (replace(state, z=1.01 * state.z) if seed < n_found else state), 1000  # seeds count up from 0
 
-    def move(objective, state, schedule):
-        moved.append(state)
-        return finish_centre(objective, state, schedule)
-
-    finish_centre = finish.centre_on_pixels
+    for name in ("centre_on_pixels", "settle"):
+        made = getattr(finish, name)
+        monkeypatch.setattr(finish, name, lambda *given, name=name, made=made: calls_of.append(name) or made(*given))
     monkeypatch.setattr(finish, "retrieve_lost_frames", stand_in)
-    monkeypatch.setattr(finish, "centre_on_pixels", move)
     monkeypatch.setattr(myopic, "FULL_MODES", 10)
     options = {"start_iterations": 8, "segment": 4, "last_modes": 8, "chance": math.inf, "faint": 0.0, "retrievals": 0}
-    options |= {"last_segments": 9, "last_gain": 1.0, "last_modes_full": 15, "averaged": 1, "candidates": ()}
+    options |= {"last_segments": 3, "last_gain": change.get("last_gain", 1.0), "last_modes_full": 15}
+    options |= {"averaged": 1, "candidates": ()}
     given = {"wavelengths": change["wavelengths"]} if "wavelengths" in change else {}
     method = MyopicDeconvolution(
         seen.aperture, seen.grid, readout_noise=1.5, schedule=Schedule(**options), tolerance=0.0, **given
     )
     whole = method.restore(seen.frames, callback=records.append)
     assert tried == calls
-    assert len(moved) == max(0, len(calls) - 1)
+    assert 1000 * len(calls) < whole.n_evaluations < 1000 * len(calls) + 1000
+    if not seen.aperture.is_full:
+        assert calls_of == n_found * bool(calls) * ["centre_on_pixels", "settle"] + ["settle"]  # at the end
     assert ("phases were retrieved" in whole.message) is (len(calls) > 1)
-    if len(calls) > 1:
+    if sum(record.stage == "last descent" for record in records) > 6:
         interrupt_last_descent(method, seen.frames, path := tmp_path / "state.npz", 6)
         resumed = method.restore(seen.frames, checkpoint=path)
         assert torch.equal(resumed.object, whole.object)

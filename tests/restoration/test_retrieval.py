@@ -130,25 +130,32 @@ def test_phases_of_several_waves_are_unwrapped_exactly():
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_pistons_of_holes_are_found_but_for_whole_waves(dtype, five_holes):
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_pistons_of_holes_are_found_but_for_whole_waves(dtype, noise, five_holes):
     """Differences of the phase do not show them. Under a prior that makes them large, rounding must not either.
 
     What is below 1e-5 of the largest singular value may be left, so the phase is known to that part of the largest.
+    Noise of 0.3 rad on 20 or more samples of a hole moves six modes by 0.16 rad rms, so that fields agree to 0.01.
     """
-    basis = turbulent_basis(five_holes, 6, 0, 0.05, 20.0)
+    basis = turbulent_basis(five_holes, 6, 0, 0.15, 20.0)
     samples = (model := ExposureModel(five_holes, Grid.nyquist(1.0, 550e-9, 48), basis, dtype=dtype)).pupil.samples()
-    z = torch.randn(4, basis.n_parameters, dtype=torch.float64, generator=torch.Generator().manual_seed(5)).to(dtype)
+    generator = torch.Generator().manual_seed(5)
+    z = torch.randn(40, basis.n_parameters, dtype=torch.float64, generator=generator)
     coefficients = basis.coefficients(z)
     largest = float(coefficients.abs().max())
-    assert float(coefficients[..., 0].abs().max()) > 2 * 2 * math.pi  # whole waves
-    frames, precision = torch.zeros(4, 48, 48, dtype=dtype), torch.ones(1, 1, 1, dtype=dtype)
+    assert float(coefficients[..., 0].abs().max()) > 2 * math.pi  # whole waves
+    frames, precision = torch.zeros(40, 48, 48, dtype=dtype), torch.ones(1, 1, 1, dtype=dtype)
     objective = MyopicObjective(model, frames, precision, TotalVariation())
-    found = parameters_of_fields(objective, samples.field(samples.phase(z)), torch.zeros_like(z))
-    off = basis.coefficients(found) - coefficients
-    torch.testing.assert_close(off[..., 1:], torch.zeros_like(off[..., 1:]), rtol=0, atol=1e-5 * largest)
-    field = torch.exp(1j * (off[..., 0] - off[..., :1, 0]))
-    torch.testing.assert_close(field, torch.ones_like(field), rtol=0, atol=1e-5 * largest)
-    assert float(found.abs().max()) < 10 * float(z.abs().max())
+    phase = samples.phase(z)
+    rough = phase + noise * torch.randn(phase.shape, dtype=torch.float64, generator=generator).to(phase)
+    found = parameters_of_fields(objective, samples.field(rough), torch.zeros_like(z))
+    agreement = (samples.field(samples.phase(found)) * samples.field(phase).conj()).sum(1).abs()
+    agreement = agreement / samples.weights.square().sum()
+    assert float(agreement.min()) > 1 - 2e-5 * largest - noise**2 / 3
+    if not noise:
+        off = basis.coefficients(found) - coefficients
+        torch.testing.assert_close(off[..., 1:], torch.zeros_like(off[..., 1:]), rtol=0, atol=1e-5 * largest)
+        assert float(found.abs().max()) < 10 * float(z.abs().max())
 
 
 def test_common_aberrations_stay_and_are_taken_off():
@@ -228,7 +235,9 @@ def test_lost_frames_of_a_mask_are_found_at_once(explain):
     after = calibrate(objective, fit_modes(objective, replace(state, calibration=truth.calibration), 60))
     assert float(after.calibration.noise_inflation.max()) < 1 + 4 * math.sqrt(2 / objective.frames[0].numel())
     assert torch.equal(state.z[2:], begun.z[2:])
-    assert n_evaluations >= 2 / 6 * 100 * (STEPS + 2) / 2 - 1
+    assert not bool((state.z[:2] == begun.z[:2]).any())
+    reflections, descents = 2 / 6 * 100 * (STEPS + 2) / 2, 2 / 6 * 60
+    assert reflections + 2 / 6 <= n_evaluations <= reflections + 2 * descents
 
 
 @pytest.mark.parametrize(
@@ -259,7 +268,7 @@ def test_frames_at_the_noise_are_not_lost(limit, tried, monkeypatch, explain):
     """Of 32 x 32 pixels three standard deviations are 0.13."""
     objective, truth = explain(n_frames=3)
     monkeypatch.setattr(retrieval, "calibrate", lambda objective, state: state)
-    script = Script(monkeypatch, [(NO, NO, NO)])
+    script = Script(monkeypatch, [(YES, YES, YES)] * 2)
     begun = left(truth, 0.12, 0.14, 0.0)
     retrieve_lost_frames(objective, begun, 0, Schedule(lost=limit), ProjectedLBFGS())
     assert script.tried == tried
