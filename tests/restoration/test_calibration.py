@@ -185,6 +185,15 @@ def test_full_waves_are_taken_off_the_pistons(problem):
     torch.testing.assert_close(near.z, state.z, rtol=0, atol=1e-9)
 
 
+def test_what_comes_off_is_a_wave_of_the_light(problem):
+    """Not of the wavelength of the grid: frames stay what they are, and pistons come as near as they can."""
+    objective, state = problem(band=Band.of((620e-9,)))
+    far = with_waves(objective, with_waves(objective, state))
+    near = unwrap_pistons(objective, far)
+    assert float(near.z.square().sum()) < float(far.z.square().sum())
+    torch.testing.assert_close(objective.model(far.image, near.z), objective.model(far.image, far.z))
+
+
 def test_waves_stay_where_they_are_known_unheld_or_seen(problem):
     """Of known aberrations, of those without a prior, and in a band, whose wavelengths tell them."""
     for options, weight in (

@@ -238,6 +238,7 @@ def test_an_interrupted_last_descent_goes_on(observe, five_holes, tmp_path):
     ("change", "calls"),
     [
         ({}, [4, 8, 12]),  # after each segment until none are found
+        ({"last_segments": 3}, [4, 8]),  # or none follows
         ({"found": 0}, [4]),
         ({"found": 0, "last_gain": 0.0}, [4]),  # not again either
         ({"aperture": FullAperture(1.0)}, []),  # which has rounds of its own
@@ -263,7 +264,11 @@ def test_lost_frames_are_looked_for_between_segments(change, calls, observe, fiv
     monkeypatch.setattr(finish, "retrieve_lost_frames", stand_in)
     monkeypatch.setattr(myopic, "FULL_MODES", 10)
     options = {"start_iterations": 8, "segment": 4, "last_modes": 8, "chance": math.inf, "faint": 0.0, "retrievals": 0}
-    options |= {"last_segments": 3, "last_gain": change.get("last_gain", 1.0), "last_modes_full": 15}
+    options |= {
+        "last_segments": change.get("last_segments", 4),
+        "last_gain": change.get("last_gain", 1.0),
+        "last_modes_full": 15,
+    }
     options |= {"averaged": 1, "candidates": ()}
     given = {"wavelengths": change["wavelengths"]} if "wavelengths" in change else {}
     method = MyopicDeconvolution(
@@ -273,13 +278,25 @@ def test_lost_frames_are_looked_for_between_segments(change, calls, observe, fiv
     assert tried == calls
     assert 1000 * len(calls) < whole.n_evaluations < 1000 * len(calls) + 1000
     if not seen.aperture.is_full:
-        assert calls_of == n_found * bool(calls) * ["centre_on_pixels", "settle"] + ["settle"]  # at the end
+        assert calls_of == n_found * bool(calls) * ["centre_on_pixels", "settle"] + ["settle"]  # this at the end
     assert ("phases were retrieved" in whole.message) is (len(calls) > 1)
     if sum(record.stage == "last descent" for record in records) > 6:
         interrupt_last_descent(method, seen.frames, path := tmp_path / "state.npz", 6)
         resumed = method.restore(seen.frames, checkpoint=path)
         assert torch.equal(resumed.object, whole.object)
         assert (resumed.n_evaluations, resumed.message) == (whole.n_evaluations, whole.message)
+
+
+@pytest.mark.parametrize(("traits", "calls"), [(TRAITS, 1), (replace(TRAITS, estimated=True), 0)])
+def test_what_a_sensor_has_measured_is_not_retrieved(traits, calls, explained, monkeypatch):
+    """Random phases would be drawn around zero."""
+    seen = []
+    monkeypatch.setattr(
+        finish, "retrieve_lost_frames", lambda objective, state, *given: seen.append(state) or (state, 0)
+    )
+    objective, state = explained
+    ended(objective, state, Setting.of(objective), Schedule(segment=2, last_segments=2, last_gain=0.0), traits=traits)
+    assert len(seen) == calls
 
 
 def test_a_search_that_is_cut_short_has_an_end_once_a_start_was_whole(observe, five_holes, tmp_path):

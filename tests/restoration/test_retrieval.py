@@ -8,10 +8,11 @@ import torch
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture, SparseAperture
+from torchmask.optics.band import Band
 from torchmask.restoration import frame_retrieval, reflections, retrieval, solver
 from torchmask.restoration.aberrations import AberrationBasis, turbulent_basis
 from torchmask.restoration.background import Background
-from torchmask.restoration.calibration import calibrate
+from torchmask.restoration.calibration import calibrate, unwrap_pistons
 from torchmask.restoration.candidates import Candidates
 from torchmask.restoration.checkpoint import Progress
 from torchmask.restoration.descent import descend
@@ -21,7 +22,7 @@ from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.priors import TotalVariation
 from torchmask.restoration.projected_lbfgs import ProjectedLBFGS
-from torchmask.restoration.reflections import STEPS, retrieve_fields
+from torchmask.restoration.reflections import LAST, STEPS, retrieve_fields
 from torchmask.restoration.retrieval import retrieve_lost_frames, retrieve_phases
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.state import Calibration, State
@@ -219,6 +220,33 @@ def test_the_intensity_fits_the_frame_and_stays_where_the_object_hides_it(monkey
     torch.testing.assert_close(angle[bright].imag, torch.zeros_like(angle[bright].imag), rtol=0, atol=1e-9)
 
 
+def test_a_field_is_that_at_the_wavelength_of_the_light(five_holes):
+    """Aberrations are in rad at the wavelength of the grid."""
+    basis = turbulent_basis(five_holes, 6, 0, 0.2, 20.0)
+    model = ExposureModel(five_holes, Grid.nyquist(1.0, 550e-9, 48), basis, Band.of((620e-9,)))
+    z = 0.5 * torch.randn(10, 29, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
+    samples = model.pupil.samples()
+    objective = MyopicObjective(model, torch.zeros(10, 48, 48).double(), torch.ones(1, 1, 1), TotalVariation())
+    found = parameters_of_fields(objective, samples.field(samples.phase(z)), torch.zeros_like(z))
+    agreement = (samples.field(samples.phase(found)) * samples.field(samples.phase(z)).conj()).sum(1).abs()
+    torch.testing.assert_close(agreement / samples.weights.square().sum(), torch.ones(10).double(), rtol=0, atol=1e-6)
+
+
+def test_pistons_come_near_to_their_prior_before_frames_are_compared(monkeypatch, explain):
+    """A wave that no frame shows costs nothing, though the prior would count it, and no descent takes it off."""
+    objective, truth = explain(n_frames=4, noise=0.1)
+    begun, basis = calibrate(objective, lost(truth)), objective.model.aberrations
+    waves = 2 * math.pi * torch.tensor([3.0, -3.0, 3.0, -3.0, 0.0], dtype=torch.float64)
+    far = truth.z + basis.parameters_of_pistons(waves)
+    monkeypatch.setattr(frame_retrieval, "parameters_of_fields", lambda part, fields, now: far)
+    schedule = Schedule(retrieved_iterations=0)
+    trial = retrieve_frames(objective, begun, torch.arange(4), 1, 0, schedule, ProjectedLBFGS())
+    near = unwrap_pistons(objective, replace(truth, z=far)).z
+    assert float(near.norm()) < 0.5 * float(far.norm())
+    torch.testing.assert_close(trial.state.z[:2], near[:2], rtol=0, atol=1e-9)
+    assert trial.n_found == 2
+
+
 # --- frames that a descent through a mask has lost
 
 
@@ -236,31 +264,40 @@ def test_lost_frames_of_a_mask_are_found_at_once(explain):
     assert float(after.calibration.noise_inflation.max()) < 1 + 4 * math.sqrt(2 / objective.frames[0].numel())
     assert torch.equal(state.z[2:], begun.z[2:])
     assert not bool((state.z[:2] == begun.z[:2]).any())
-    reflections, descents = 2 / 6 * 100 * (STEPS + 2) / 2, 2 / 6 * 60
+    assert state.calibration is begun.calibration  # which is nobody else's business
+    reflections, descents = 2 / 6 * (100 + LAST) * (STEPS + 2) / 2, 2 / 6 * 60
     assert reflections + 2 / 6 <= n_evaluations <= reflections + 2 * descents
 
 
 @pytest.mark.parametrize(
     ("results", "tried", "found"),
     [
-        # the worst quarter first, and then the rest of those that leave more than noise
-        ([(YES, YES, YES, YES, YES), (YES, YES, YES, NO, YES)], [[4, 1], [2, 5, 0]], True),
-        ([(NO, NO, NO, NO, NO, YES), (YES,) * 6], [[4, 1]], False),
-        ([(NO, YES, NO, NO, NO, NO), (NO,) * 6], [[4, 1], [2, 5, 0]], True),
-        ([(AGAIN,) * 6], [[4, 1]], False),
+        # the worst three first, and then the rest of those that leave more than noise
+        ([(YES,) * 6, (YES,) * 6], [[4, 1, 2], [5, 0]], True),
+        ([(NO, NO, NO, NO, NO, YES), (YES,) * 6], [[4, 1, 2]], False),
+        ([(NO, YES, NO, NO, NO, NO), (NO,) * 6], [[4, 1, 2], [5, 0]], True),  # one may hold what no phases explain
+        ([(AGAIN,) * 6], [[4, 1, 2]], False),
     ],
 )
 def test_the_worst_frames_are_tried_first(results, tried, found, monkeypatch, explain):
     """Where none of them is found the model lacks what the frames hold, so the others are spared."""
     objective, truth = explain(n_frames=6)
     monkeypatch.setattr(retrieval, "calibrate", lambda objective, state: state)
-    script = Script(monkeypatch, [[*one, NO][:6] for one in results])
+    script = Script(monkeypatch, results)
     begun = left(truth, 0.5, 3.0, 1.0, 0.0, 4.0, 0.9)
     state, n_evaluations = retrieve_lost_frames(objective, begun, 3, Schedule(reflections=60), ProjectedLBFGS())
     assert script.tried == tried
     assert script.seeds == [3] * len(tried)
     assert (state is begun) is not found
     assert n_evaluations == sum(map(len, tried)) / 6 * 60 * (STEPS + 2) / 2
+
+
+def test_of_many_lost_frames_a_quarter_is_tried_first(monkeypatch, explain):
+    objective, truth = explain(n_frames=16)
+    monkeypatch.setattr(retrieval, "calibrate", lambda objective, state: state)
+    script = Script(monkeypatch, [(NO,) * 16])
+    retrieve_lost_frames(objective, left(truth, *range(1, 17)), 0, Schedule(), ProjectedLBFGS())
+    assert script.tried == [[15, 14, 13, 12]]
 
 
 @pytest.mark.parametrize(("limit", "tried"), [(0.05, [[1]]), (0.5, [])])

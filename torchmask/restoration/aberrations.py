@@ -135,20 +135,21 @@ class AberrationBasis(nn.Module):
         z = rms * torch.randn(like.shape, dtype=like.dtype, device="cpu", generator=generator).to(like)
         return self.with_common_of(z, z[:1])
 
-    def unwrapped(self, z: Tensor, centre: Tensor) -> Tensor:
+    def unwrapped(self, z: Tensor, centre: Tensor, wave: float = 2 * math.pi) -> Tensor:
         """Return z (T, K) with whole waves subtracted from pistons where that brings it closer to `centre` (T, K).
 
-        This leaves monochromatic frames unchanged, but not those of several wavelengths.
+        This leaves frames of one wavelength unchanged, a `wave` of which is so many radians of the coefficients, but
+        not those of several wavelengths.
         """
         if self.n_subapertures == 1:  # its piston is the mean piston, which is not visible
             return z
         own = self.n_own
-        waves = 2 * math.pi * torch.linalg.pinv(self.mixing[:, :own].to(z))[:, :: self.n_modes]  # (own, N)
+        waves = wave * torch.linalg.pinv(self.mixing[:, :own].to(z))[:, :: self.n_modes]  # (own, N)
         z = z.clone()
         for _ in range(2):  # a wave subtracted from one hole may require one from its neighbour
-            for wave in waves.T:
+            for one in waves.T:
                 away = z[:, :own] - centre[:, :own]
-                z[:, :own] -= (away @ wave / wave.square().sum()).round()[:, None] * wave
+                z[:, :own] -= (away @ one / one.square().sum()).round()[:, None] * one
         return z
 
     def turbulence_strength(self, z: Tensor) -> float | None:

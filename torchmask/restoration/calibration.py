@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -119,6 +120,8 @@ def follow_turbulence(objective: MyopicObjective, state: State) -> State:
 def unwrap_pistons(objective: MyopicObjective, state: State) -> State:
     """Return the state without full waves of piston, which the frames of one wavelength cannot show."""
     known = Free.ABERRATIONS not in objective.free or not state.calibration.aberration_weight
-    if known or len(objective.model.band.wavelengths) > 1:
+    model = objective.model
+    if known or len(model.band.wavelengths) > 1:
         return state
-    return replace(state, z=objective.model.aberrations.unwrapped(state.z, objective.centre))
+    wave = 2 * math.pi * model.band.mean / model.window.grid.wavelength
+    return replace(state, z=model.aberrations.unwrapped(state.z, objective.centre, wave))

@@ -70,7 +70,7 @@ class Progress:
     integrated : whether the aberrations have been integrated out, which is done at the end and not stored
     averaged : number of starts whose objects have been averaged, before the last descent
     retrieved : whether phases have been retrieved, after the present start or in the last descent
-    all_found : whether that descent has lost no more frames, or none of those could be found
+    seeks_no_more : whether phases of frames that the search has lost are no longer looked for in the last descent
     """
 
     candidates: Candidates
@@ -90,7 +90,7 @@ class Progress:
     integrated: bool = False
     averaged: int = 1
     retrieved: bool = False
-    all_found: bool = False
+    seeks_no_more: bool = False
 
     @property
     def state(self) -> State:
@@ -141,7 +141,7 @@ _NUMBERS = (
     "last_segments",
     "averaged",
     "retrieved",
-    "all_found",
+    "seeks_no_more",
 )
 # arrays of an ending
 _NEEDED = ("image", "z", "geometry", "modes", "status", *(item.name for item in fields(Calibration)))

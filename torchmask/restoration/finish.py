@@ -67,7 +67,8 @@ class Finisher:
         objective = self.setting.objective_at(objective, state).with_changes(prior=objective.prior.smoother())
         most, done = (number * schedule.segment for number in (schedule.last_segments, ended.last_segments))
         report, costs = ended.reporter("last descent", most, self.callback, done), []
-        may_find = not self.traits.many_minima and objective.model.pupil.n_rasters == 1 and len(state.z) > 1
+        searched = not (self.traits.many_minima or self.traits.estimated)
+        may_find = searched and objective.model.pupil.n_rasters == 1 and len(state.z) > 1
 
         def listen(cost: float, evaluations: int, variables: Variables) -> None:
             costs.append(cost)
@@ -80,10 +81,11 @@ class Finisher:
                 state = settle(objective, state, schedule.last_settling)
             state = descend(objective, state, schedule.segment, self.minimizer, listen)
             gains = bool(costs) and costs[len(costs) // 2] - costs[-1] > schedule.last_gain * abs(costs[-1])
-            if may_find and not ended.all_found:
+            is_last = ended.last_segments + 1 == schedule.last_segments
+            if may_find and not (ended.seeks_no_more or is_last):
                 descended, state = state, self._find_lost_frames(objective, state, ended)
-                ended.all_found = state is descended
-                gains = gains or not ended.all_found
+                ended.seeks_no_more = state is descended
+                gains = gains or not ended.seeks_no_more
             ended.finer, ended.last_segments = state, ended.last_segments + 1 if gains else schedule.last_segments
             self.save(ended)
         # a descent moves flat parts of the object slowly

@@ -1,6 +1,6 @@
 """The phases of single bright frames, retrieved for the object at hand.
 
-Phase retrieval finds the field of a frame from random phases (`reflections`), through a mask nearly always. The modes
+Phase retrieval finds the field of a frame from random phases (`reflections`), nearly always through a mask. The modes
 closest to its phase are the start of a descent of the aberrations; frames that end lower there than before keep it.
 """
 
@@ -13,13 +13,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchmask.restoration.calibration import calibrate, share_noise_inflation
+from torchmask.restoration.calibration import calibrate, share_noise_inflation, unwrap_pistons
 from torchmask.restoration.descent import Variables, descend
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.pupil import OpenSamples
-from torchmask.restoration.reflections import STEPS, retrieve_fields
+from torchmask.restoration.reflections import LAST, STEPS, retrieve_fields
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.starts import random_candidates
 from torchmask.restoration.state import State
@@ -61,7 +61,7 @@ def retrieve_frames(
 
     Aberrations in common stay as they are, since only some frames may change.
     """
-    spent = n_reflections * _EVALUATIONS
+    spent = (n_reflections + LAST) * _EVALUATIONS
 
     def count(cost: float, evaluations: int, variables: Variables) -> None:
         nonlocal spent
@@ -70,7 +70,7 @@ def retrieve_frames(
     part, now = objective.of_frames(tried, free=Free.ABERRATIONS), share_noise_inflation(state).of_frames(tried)
     fresh = random_candidates(part, now, 1, schedule.start_rms, seed).state
     fields = retrieve_fields(part, fresh, n_reflections)
-    trial = replace(now, z=parameters_of_fields(part, fields, now.z))
+    trial = unwrap_pistons(part, replace(now, z=parameters_of_fields(part, fields, now.z)))
     trial = descend(part, trial, schedule.retrieved_iterations, minimizer, count)
     after, before = (part.frame_costs(now.image, z, now.calibration) for z in (trial.z, now.z))
     left, least = (s.calibration.noise_inflation for s in (calibrate(part, trial), state.of_frames(tried)))
@@ -112,7 +112,7 @@ def parameters_of_fields(objective: MyopicObjective, fields: Tensor, z: Tensor) 
     found[:, : basis.n_own] = _fit(own[second] - own[first], steps, (amplitude[first] * amplitude[second]).sqrt())
     holes = torch.zeros(len(z), basis.n_subapertures, dtype=turned.dtype, device=z.device)
     light = holes.index_add(1, _hole_of(objective.model, samples), amplitude * turned_back())
-    found += basis.parameters_of_pistons(light.angle()).to(found)
+    found += basis.parameters_of_pistons(light.angle() / samples.chromaticity[0]).to(found)
     own = torch.cat([own, torch.ones_like(own[:, :1])], dim=1)  # and a piston, which no frame shows
     for _ in range(_CORRECTIONS):
         turned = turned_back()
@@ -124,7 +124,7 @@ def parameters_of_fields(objective: MyopicObjective, fields: Tensor, z: Tensor) 
 def _hole_of(model: ExposureModel, samples: OpenSamples) -> Tensor:
     """Return the number of the hole (P,) that each sample belongs to."""
     centers = model.pupil.aperture.centers.detach().to(samples.positions) / model.window.field.period
-    return torch.cdist(samples.positions, centers).argmin(1)
+    return torch.cdist(samples.positions, samples.chromaticity[0] * centers).argmin(1)
 
 
 def _fit(columns: Tensor, values: Tensor, weights: Tensor) -> Tensor:

@@ -25,7 +25,7 @@ STEPS = 8  # conjugate-gradient steps of a projection onto the frames, from wher
 _RELAXATION = 0.9  # of the reflections; 1 has no attraction to the present field
 _STIFFNESS = 3e3  # holds focal amplitudes, of unit norm, where they are while their PSF is fitted to a frame
 _DARK = 1e-6  # intensity below which a PSF of unit sum is free to change as if it had so much
-_LAST = 10  # projections at the end, without reflections
+LAST = 10  # projections at the end, without reflections
 
 
 @torch.no_grad()
@@ -67,7 +67,7 @@ class _Frames:
             mirrored = 2 * fitted - now
             reflected = 2 * self._fit_pupil(mirrored) - mirrored
             now = _RELAXATION * (reflected + now) / 2 + (1 - _RELAXATION) * fitted
-        for _ in range(_LAST):
+        for _ in range(LAST):
             now, pull = self._fit_frames(self._fit_pupil(now), pull)
         return now.flatten(1)[:, self.samples.index]
 

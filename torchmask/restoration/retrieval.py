@@ -1,15 +1,16 @@
 """The phases of bright frames, retrieved once the object is sharp.
 
-In bright light most of a full pupil's residual comes from minima of its many modes, and in strong turbulence a search
-leaves nearly all frames in such, through a mask too. Once there is an object to hold the frames against, phase
-retrieval finds them (`frame_retrieval`). Through a mask it does so nearly at once, so it is done between the segments
-of the last descent. Through a full pupil it seldom does. But every frame that is found sharpens the object, which helps
-to find the next ones, so object and aberrations descend together after each of several rounds.
+In bright light most of a full pupil's residual comes from minima of its many modes. In strong turbulence a search
+leaves nearly all frames in such, and those of a mask as well. Once there is an object to hold the frames against, phase
+retrieval finds them (`frame_retrieval`). For a mask one try is mostly enough, so it is made between the segments of the
+last descent. Through a full pupil most tries are in vain, but every frame that is found sharpens the object, which
+helps to find the next ones, so object and aberrations descend together after each of several rounds.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 from torch import Tensor
 
@@ -26,6 +27,7 @@ from torchmask.restoration.state import State
 from torchmask.restoration.traits import Traits
 
 _POOR = 2.0  # of the median chi-square: a frame with more is tried again, whatever was found
+_FIRST = 3  # lost frames that are tried before the others, at least: one may hold what no phases explain
 _SURE = 3.0  # standard deviations of the chi-square of a frame that do not occur by chance
 
 
@@ -66,15 +68,15 @@ def retrieve_lost_frames(
 ) -> tuple[State, int]:
     """Return the state with phases retrieved of frames that leave more than noise, and the evaluations it took.
 
-    It is `state` itself if none are found. The worst quarter of the frames is tried first, and the others only if some
-    of those are found: where frames hold what the model lacks, none are.
+    It is `state` itself if none are found. The worst quarter of the frames is tried first, or the worst three, and the
+    others only if some of those are found: where frames hold what the model lacks, none are.
     """
-    now, evaluations = calibrate(objective, state), 0
+    now, found, evaluations = calibrate(objective, state), state, 0
     excess = now.calibration.noise_inflation - 1
     pixels = (objective.precision.expand_as(objective.frames) > 0).sum((1, 2))
     lost = (excess > (_SURE * (2 / pixels).sqrt()).clamp(min=schedule.lost)).nonzero().flatten()
     worst_first = lost[excess[lost].argsort(descending=True)]
-    n_first = math.ceil(len(lost) / 4)
+    n_first = max(_FIRST, math.ceil(len(lost) / 4))
     for tried in (worst_first[:n_first], worst_first[n_first:]):
         if not len(tried):
             break
@@ -82,8 +84,8 @@ def retrieve_lost_frames(
         evaluations += trial.n_evaluations
         if not trial.n_found:
             break
-        now = state = trial.state
-    return state, evaluations
+        now, found = trial.state, replace(state, z=trial.state.z)
+    return found, evaluations
 
 
 def _excess(state: State) -> float:

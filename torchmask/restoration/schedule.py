@@ -86,14 +86,15 @@ class Schedule:
     move_size : size of the first moves, in standard deviations of Laplace's approximation
     renewal : number of rounds after which that approximation is recomputed
     settling : maximum number of iterations that fit the object in a round
-    last_settling : the same after the last descent, and for a full pupil before each of its segments and of those
-        between rounds of phase retrieval
+    last_settling : the same after the last descent and after phases of a mask's lost frames have been found, and for a
+        full pupil before each of its segments and of those between rounds of phase retrieval
     last_modes : number of modes of each sub-aperture of a mask in the last descent of frames that are not faint
     last_modes_full : the same of a full pupil, however faint
     last_segments : maximum number of segments of that descent; 0: there is none
-    last_gain : it ends when the second half of a segment lowers the cost by less than this fraction
-    lost : after each segment phases are retrieved of a mask's frames whose chi-square is above that of noise by more
-        than this
+    last_gain : it ends when the second half of a segment lowers the cost by less than this fraction, unless phases of
+        lost frames have been found
+    lost : after each segment of the last descent, phases are retrieved of a mask's frames whose chi-square is above
+        that of noise by more than this and three standard deviations of noise; infinite: of none
     reflections : number of reflections by which they are
     retrievals : for a full pupil, maximum number of rounds of phase retrieval after a start; 0: there is none
     retrieved_starts : number of starts after which phases are retrieved, until they are found

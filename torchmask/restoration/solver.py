@@ -7,7 +7,7 @@ to the residual of the model, if that is larger. Once the object is sharp, frame
 when nothing changes any more, each frame is weighted by how well it fits. A start ends when a segment gains nothing, or
 little if it explains the frames, or its iterations are used up. Then phases of a full pupil's bright frames are
 retrieved. If it missed the object, or frames are faint, others start, from random aberrations or twins of the object;
-the best is kept, or the mean for a full pupil. Then aberrations of faint frames are integrated out, others gain modes.
+the best is kept, or the mean for a full pupil. What follows is told in `finish`.
 """
 
 from __future__ import annotations

@@ -99,7 +99,7 @@ class Traits:
         """Power of their residual variance by which frames are weighted once the object has been found.
 
         2 for a full pupil, where residuals come from poor minima and are more harmful than white noise of that
-        variance; 1 for a mask, where they come from modes left out.
+        variance; 1 for a mask, where most come from modes left out.
         """
         return 2 if self.many_minima else 1
 
