@@ -261,7 +261,9 @@ def test_a_prior_from_outside_is_as_good_as_one_from_here(observation, restoring
 
 def test_a_prior_of_ones_own_loses_nothing(observation, tmp_path):
     """Noise, transmissions, another start, deviations and checkpoints are as with ours."""
-    schedule = Schedule(segment=10, start_iterations=20, sharp_after=15, chance=-1e9, alike=-1.0, starts=2)
+    schedule = Schedule(
+        segment=10, start_iterations=20, sharp_after=15, chance=-1e9, alike=-1.0, starts=2, lost=math.inf
+    )
     given = {"n_modes": 3, "schedule": schedule, "tolerance": 0}
     dim = observation.frames * torch.linspace(0.8, 1.2, 8).double()[:, None, None]
     made = {}
