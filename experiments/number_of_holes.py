@@ -86,7 +86,7 @@ def measure(options: Options, callback: Callback) -> list[dict[str, Any]]:
     for (strength, n), task, result in zip(keys, tasks, results, strict=True):
         size = task["subaperture_diameter"] / DIAMETER * strength
         for photons, known, floor in zip(options.photons, result["errors"], result["floors"], strict=True):
-            # what unknown aberrations cost, over the criterion: known PSFs are better by some factor, for any N
+            # the question is what unknown aberrations add to the criterion, not how known PSFs compare with it
             blind = replace(success_map().outlook(size, photons, options.n_frames), restored=1.0)
             row = {"d_over_r0_tried": "d_over_r0" not in blind.outside, "success": blind.success, "cost": blind.cost}
             row |= {"strength": strength, "n_photons": photons, "n_subapertures": n, "d_over_r0": size, "known": known}
