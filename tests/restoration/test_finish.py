@@ -121,7 +121,8 @@ def test_more_modes_explain_what_few_leave(five_holes, explain):
     assert [record.step for record in records] == list(range(1, len(records) + 1))
 
 
-def test_the_last_descent_ends_when_half_a_segment_gains_little(explained):
+@pytest.mark.parametrize(("traits", "end"), [(TRAITS, End.LAST_DESCENT), (FULL_PUPIL, End.FULL_PUPIL)])
+def test_the_last_descent_ends_when_half_a_segment_gains_little(traits, end, explained):
     objective, state = explained
     gains = [0.5, 0.02, 0.009, 0.5]
 
@@ -132,12 +133,13 @@ def test_the_last_descent_ends_when_half_a_segment_gains_little(explained):
             callback(start, told, step)
         return Minimum(start, 1.0, 4, 4, False, "says so")
 
-    setting, schedule = Setting.of(objective), Schedule(last_gain=0.01)
-    _, progress = ended(objective, state, setting, schedule, minimizer=says)
+    own, other = ("last_gain_full", "last_gain") if traits.many_minima else ("last_gain", "last_gain_full")
+    setting, schedule = Setting.of(objective), Schedule(**{own: 0.01, other: 0.3})
+    _, progress = ended(objective, state, setting, schedule, minimizer=says, traits=traits, end=end)
     assert gains == [0.5]
     assert progress.n_evaluations == 3 * 4
     gains = [0.5] * 4
-    ended(objective, state, setting, replace(schedule, last_segments=3), minimizer=says)
+    ended(objective, state, setting, replace(schedule, last_segments=3), minimizer=says, traits=traits, end=end)
     assert len(gains) == 1
 
 
@@ -180,12 +182,58 @@ def test_nothing_follows_the_search_of_a_schedule_without_last_segments(observe,
     assert "TotalVariation" in result.prior
 
 
+def hill(height):
+    """An image whose slopes are in proportion to its height."""
+    x = torch.linspace(-1, 1, 24, dtype=torch.float64)
+    return height * torch.exp(-3 * (x**2 + x[:, None] ** 2))
+
+
 def test_the_prior_of_the_last_descent_is_smoother():
-    smooth = TotalVariation(2.0, 0.3).smoother()
+    steep, gentle = hill(1e3), hill(1.0)
+    prior = TotalVariation(2.0, 0.3)
+    smooth = prior.smoother(steep)
     assert isinstance(smooth, SmoothVariation)
     assert (smooth.weight, smooth.bending, smooth.epsilon) == (2.0, 0.1, 0.3)
-    assert smooth.smoother() is smooth
-    assert (own := EdgePreserving()).smoother() is own
+    assert smooth.smoother(gentle) is smooth
+    assert (own := EdgePreserving()).smoother(gentle) is own
+    # Where the object's own scale asks for more weight it has that, and where it asks for less it does not.
+    suited = [prior.suited_to(image).weight for image in (steep, gentle)]
+    assert suited[0] < 2.0 < suited[1]
+    heavier = prior.smoother(gentle)
+    assert isinstance(heavier, SmoothVariation)
+    assert (heavier.weight, heavier.bending, heavier.epsilon) == (suited[1], 0.25, 0.3)
+    assert prior.smoother(torch.zeros(24, 24)).weight == 2.0
+
+
+def test_each_segment_of_the_last_descent_has_the_prior_of_its_object(explained, monkeypatch):
+    """It is that of the search at the scale of the object, whatever that was before; the integration begins anew."""
+    objective, state = explained
+    weights = []
+
+    def descend(objective, state, *rest):
+        weights.append(objective.prior.weight)
+        for cost in (3.0, 2.0, 1.0):
+            rest[2](cost, 1, lambda: None)
+        return replace(state, image=state.image / 3)
+
+    def settle(objective, state, n_iterations):
+        weights.append(objective.prior.weight)
+        return state
+
+    monkeypatch.setattr(finish, "descend", descend)
+    monkeypatch.setattr(finish, "settle", settle)
+    monkeypatch.setattr(finish, "recalibrate", lambda objective, state, power, **more: state)
+    scale = TotalVariation().suited_to(state.image).weight
+    objective = objective.with_changes(prior=TotalVariation(0.5))
+    begun = replace(state, image=state.image * scale / 2)  # whose own scale is 2, and 6 and 18 later
+    schedule = Schedule(segment=1, last_segments=2, last_gain=0.0, lost=math.inf)
+    monkeypatch.setattr(
+        finish, "integrate_aberrations", lambda given, state, *rest, **more: (state, given.prior.weight)
+    )
+    found, progress = ended(objective, begun, Setting.of(objective), schedule, end=End.BOTH)
+    assert weights == pytest.approx([1.0, 3.0, 9.0], rel=1e-9)
+    assert found.prior.weight == weights[-1]
+    assert progress.n_evaluations - 6 == 0.5
 
 
 def test_a_result_holds_the_modes_of_the_search(observe, five_holes):
@@ -437,7 +485,7 @@ def test_an_interrupted_last_descent_of_a_full_pupil_goes_on(retrievals, said, o
     seen = observe(FullAperture(1.0), n_frames=3, r0=0.5)
     monkeypatch.setattr(myopic, "FULL_MODES", 10)
     options = {"candidates": ((2, 4),), "segment": 4, "sharp_after": 4, "escapes": 0, "start_iterations": 8}
-    options |= {"chance": 1e9, "last_segments": 3, "last_gain": 0.0, "reflections_full": 2, "retrieved_from": 0.0}
+    options |= {"chance": 1e9, "last_segments": 3, "last_gain_full": 0.0, "reflections_full": 2, "retrieved_from": 0.0}
     options |= {"retrievals": retrievals, "retrieved_gain": math.inf, "retrieved_iterations": 4}
     schedule = Schedule(**options, last_modes_full=15)
     method = MyopicDeconvolution(FullAperture(1.0), seen.grid, readout_noise=1.5, tolerance=0, schedule=schedule)

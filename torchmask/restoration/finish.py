@@ -45,13 +45,15 @@ class Finisher:
 
     def finish(self, objective: MyopicObjective, ended: Progress, end: End) -> MyopicObjective:
         """Update `ended`, and return the objective of its state."""
+        prior = objective.prior  # which the integration suits to the object by itself
         if end.descends:
             objective = self._descend(objective, ended)
         if end.integrates:
             rounds = self.schedule.fine_rounds if end.descends else self.schedule.rounds
             how = (self.schedule, self.minimizer, self.callback)
             known = {"seed": self.traits.seed, "follow_r0": self.traits.r0_is_open}
-            ended.state, spent = integrate_aberrations(objective, ended.state, rounds, *how, **known)
+            given = objective.with_changes(prior=prior)
+            ended.state, spent = integrate_aberrations(given, ended.state, rounds, *how, **known)
             ended.n_evaluations += spent
             ended.integrated = True
         return objective
@@ -64,9 +66,10 @@ class Finisher:
         """
         schedule, first = self.schedule, objective
         state = self.setting.in_finer_modes(ended.state) if ended.finer is None else ended.finer
-        objective = self.setting.objective_at(objective, state).with_changes(prior=objective.prior.smoother())
+        objective = self.setting.objective_at(objective, state)
         most, done = (number * schedule.segment for number in (schedule.last_segments, ended.last_segments))
         report, costs = ended.reporter("last descent", most, self.callback, done), []
+        least_gain = schedule.last_gain_full if self.traits.many_minima else schedule.last_gain
         searched = not (self.traits.many_minima or self.traits.estimated)
         may_find = searched and objective.model.pupil.n_rasters == 1 and len(state.z) > 1
 
@@ -77,10 +80,11 @@ class Finisher:
         while ended.last_segments < schedule.last_segments:
             costs.clear()
             state = self._recalibrate(objective, state)
+            objective = objective.with_changes(prior=first.prior.smoother(state.image))
             if self.traits.many_minima:
                 state = settle(objective, state, schedule.last_settling)
             state = descend(objective, state, schedule.segment, self.minimizer, listen)
-            gains = bool(costs) and costs[len(costs) // 2] - costs[-1] > schedule.last_gain * abs(costs[-1])
+            gains = bool(costs) and costs[len(costs) // 2] - costs[-1] > least_gain * abs(costs[-1])
             is_last = ended.last_segments + 1 == schedule.last_segments
             if may_find and not (ended.seeks_no_more or is_last):
                 descended, state = state, self._find_lost_frames(objective, state, ended)
@@ -88,6 +92,7 @@ class Finisher:
                 gains = gains or not ended.seeks_no_more
             ended.finer, ended.last_segments = state, ended.last_segments + 1 if gains else schedule.last_segments
             self.save(ended)
+        objective = objective.with_changes(prior=first.prior.smoother(state.image))
         # a descent moves flat parts of the object slowly
         state = settle(objective, state, schedule.last_settling)
         if self.traits.many_minima and _chi_square(objective, state) > _chi_square(first, ended.state):

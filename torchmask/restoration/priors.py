@@ -54,8 +54,8 @@ class ObjectPrior(nn.Module):
         """Return the prior at the scale of an object (H', W') that was restored: the same one where it knows none."""
         return self
 
-    def smoother(self) -> ObjectPrior:
-        """Return the prior for the last descent: the same one where it knows none."""
+    def smoother(self, image: Tensor) -> ObjectPrior:
+        """Return the prior for the last descent, from `image` (H', W') on: the same one where it knows none."""
         return self
 
 
@@ -103,7 +103,7 @@ class TotalVariation(ObjectPrior):
         inverse = 1 / self._slopes(image)[2]
         return self.weight * (2 * inverse + inverse.roll(1, -2) + inverse.roll(1, -1))
 
-    def suited_to(self, image: Tensor) -> ObjectPrior:
+    def suited_to(self, image: Tensor) -> TotalVariation:
         """Return a `SmoothVariation` whose weight suits the gradients g of `image` (H', W').
 
         It is `weight` times 3 sum |g| / sum |g|^2: the rate mu of gradients that are drawn from exp(-mu |g|) in some
@@ -117,8 +117,14 @@ class TotalVariation(ObjectPrior):
         rate = 3 * float(squared.sqrt().sum() / squared.sum())
         return SmoothVariation(self.weight * rate, epsilon=self.epsilon)
 
-    def smoother(self) -> ObjectPrior:
-        """Return a `SmoothVariation` of the same weight, with a tenth of it on bends."""
+    def smoother(self, image: Tensor) -> ObjectPrior:
+        """Return the `SmoothVariation` that suits `image` (H', W') if that is heavier, or one of the same weight.
+
+        In bright frames a lighter one would follow what the model does not know of them.
+        """
+        suited = self.suited_to(image)
+        if suited.weight > self.weight:
+            return suited
         return SmoothVariation(self.weight, bending=_BENDING, epsilon=self.epsilon)
 
     def _slopes(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -181,7 +187,7 @@ class SmoothVariation(TotalVariation):
         straight = 8 * inverse + left + above + inverse.roll(-1, -1) + inverse.roll(-1, -2)
         return super().curvature(image) + straight + 2 * (inverse + left + above + left.roll(1, -2))
 
-    def smoother(self) -> ObjectPrior:
+    def smoother(self, image: Tensor) -> ObjectPrior:
         return self
 
     def _bends(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -91,8 +91,9 @@ class Schedule:
     last_modes : number of modes of each sub-aperture of a mask in the last descent of frames that are not faint
     last_modes_full : the same of a full pupil, however faint
     last_segments : maximum number of segments of that descent; 0: there is none
-    last_gain : it ends when the second half of a segment lowers the cost by less than this fraction, unless phases of
-        lost frames have been found
+    last_gain : for a mask, it ends when the second half of a segment lowers the cost by less than this fraction, unless
+        phases of lost frames have been found
+    last_gain_full : the same for a full pupil
     lost : after each segment of the last descent, phases are retrieved of a mask's frames whose chi-square is above
         that of noise by more than this and three standard deviations of noise; infinite: of none
     reflections : number of reflections by which they are
@@ -151,7 +152,8 @@ class Schedule:
     last_modes: int = 28
     last_modes_full: int = 351
     last_segments: int = 20
-    last_gain: float = 0.003
+    last_gain: float = 0.001
+    last_gain_full: float = 0.003
     lost: float = 0.05
     reflections: int = 100
     retrievals: int = 8
