@@ -22,7 +22,7 @@ from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.motion import Setting
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.objective import Free, MyopicObjective
-from torchmask.restoration.priors import EdgePreserving, SmoothVariation, TotalVariation
+from torchmask.restoration.priors import EdgePreserving, SmoothVariation, TotalVariation, rate_of_slopes
 from torchmask.restoration.projected_lbfgs import Minimum, ProjectedLBFGS
 from torchmask.restoration.recipe import ModelRecipe
 from torchmask.restoration.schedule import Schedule
@@ -189,20 +189,18 @@ def hill(height):
 
 
 def test_the_prior_of_the_last_descent_is_smoother():
-    steep, gentle = hill(1e3), hill(1.0)
     prior = TotalVariation(2.0, 0.3)
-    smooth = prior.smoother(steep)
-    assert isinstance(smooth, SmoothVariation)
-    assert (smooth.weight, smooth.bending, smooth.epsilon) == (2.0, 0.1, 0.3)
-    assert smooth.smoother(gentle) is smooth
-    assert (own := EdgePreserving()).smoother(gentle) is own
-    # Where the object's own scale asks for more weight it has that, and where it asks for less it does not.
-    suited = [prior.suited_to(image).weight for image in (steep, gentle)]
-    assert suited[0] < 2.0 < suited[1]
-    heavier = prior.smoother(gentle)
-    assert isinstance(heavier, SmoothVariation)
-    assert (heavier.weight, heavier.bending, heavier.epsilon) == (suited[1], 0.25, 0.3)
-    assert prior.smoother(torch.zeros(24, 24)).weight == 2.0
+    rate = rate_of_slopes(hill(1.0))
+    scales = [(rate / 0.5, 2.0, 0.1), (rate / 1.5, 3.0, 0.25), (rate / 2.9, 5.8, 0.25), (rate / 3.1, 6.0, 0.25)]
+    for height, weight, bending in scales:  # the weight is that of the slopes where it is heavier, up to three times
+        smooth = prior.smoother(hill(height))
+        assert isinstance(smooth, SmoothVariation)
+        assert (smooth.weight, smooth.bending, smooth.epsilon) == pytest.approx((weight, bending, 0.3), rel=1e-9)
+    dark = prior.smoother(torch.zeros(24, 24))
+    assert isinstance(dark, SmoothVariation)
+    assert (dark.weight, dark.bending) == (2.0, 0.1)
+    assert smooth.smoother(hill(1.0)) is smooth
+    assert (own := EdgePreserving()).smoother(hill(1.0)) is own
 
 
 def test_each_segment_of_the_last_descent_has_the_prior_of_its_object(explained, monkeypatch):
@@ -214,7 +212,7 @@ def test_each_segment_of_the_last_descent_has_the_prior_of_its_object(explained,
         weights.append(objective.prior.weight)
         for cost in (3.0, 2.0, 1.0):
             rest[2](cost, 1, lambda: None)
-        return replace(state, image=state.image / 3)
+        return replace(state, image=state.image / 1.5)
 
     def settle(objective, state, n_iterations):
         weights.append(objective.prior.weight)
@@ -223,15 +221,14 @@ def test_each_segment_of_the_last_descent_has_the_prior_of_its_object(explained,
     monkeypatch.setattr(finish, "descend", descend)
     monkeypatch.setattr(finish, "settle", settle)
     monkeypatch.setattr(finish, "recalibrate", lambda objective, state, power, **more: state)
-    scale = TotalVariation().suited_to(state.image).weight
     objective = objective.with_changes(prior=TotalVariation(0.5))
-    begun = replace(state, image=state.image * scale / 2)  # whose own scale is 2, and 6 and 18 later
+    begun = replace(state, image=state.image * rate_of_slopes(state.image) / 1.2)  # of this rate, and 1.8 and 2.7 later
     schedule = Schedule(segment=1, last_segments=2, last_gain=0.0, lost=math.inf)
     monkeypatch.setattr(
         finish, "integrate_aberrations", lambda given, state, *rest, **more: (state, given.prior.weight)
     )
     found, progress = ended(objective, begun, Setting.of(objective), schedule, end=End.BOTH)
-    assert weights == pytest.approx([1.0, 3.0, 9.0], rel=1e-9)
+    assert weights == pytest.approx([0.6, 0.9, 1.35], rel=1e-9)
     assert found.prior.weight == weights[-1]
     assert progress.n_evaluations - 6 == 0.5
 
@@ -315,6 +312,7 @@ def test_lost_frames_are_looked_for_between_segments(change, calls, observe, fiv
     options |= {
         "last_segments": change.get("last_segments", 4),
         "last_gain": change.get("last_gain", 1.0),
+        "last_gain_full": 1.0,
         "last_modes_full": 15,
     }
     options |= {"averaged": 1, "candidates": ()}

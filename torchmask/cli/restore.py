@@ -83,7 +83,8 @@ class Options(BandOptions, StackOptions, OIFITSOptions, WorkerOptions, RunOption
     prior: bool = True
     """Weight the aberrations by their von Karman statistics."""
     tv_weight: float = 1.0
-    """Weight of the total variation of the object, dimensionless; a larger weight gives a smoother image."""
+    """Weight of the total variation of the object, dimensionless; a larger weight gives a smoother image. At the end it
+    is multiplied by what suits the object, in bright light only if that is above 1."""
     max_iterations: int = 4000
     """Maximum number of iterations over all starts, each of at most 1000; a full pupil averages three starts, unless
     its phases are retrieved before."""
