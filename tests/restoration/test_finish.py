@@ -196,15 +196,17 @@ def test_the_prior_of_the_last_descent_is_smoother():
         smooth = prior.smoother(hill(height))
         assert isinstance(smooth, SmoothVariation)
         assert (smooth.weight, smooth.bending, smooth.epsilon) == pytest.approx((weight, bending, 0.3), rel=1e-9)
-    dark = prior.smoother(torch.zeros(24, 24))
-    assert isinstance(dark, SmoothVariation)
-    assert (dark.weight, dark.bending) == (2.0, 0.1)
+    for image in (torch.zeros(24, 24), None):
+        same = prior.smoother(image)
+        assert isinstance(same, SmoothVariation)
+        assert (same.weight, same.bending) == (2.0, 0.1)
     assert smooth.smoother(hill(1.0)) is smooth
     assert (own := EdgePreserving()).smoother(hill(1.0)) is own
 
 
-def test_each_segment_of_the_last_descent_has_the_prior_of_its_object(explained, monkeypatch):
-    """It is that of the search at the scale of the object, whatever that was before; the integration begins anew."""
+@pytest.mark.parametrize(("end", "expected"), [(End.LAST_DESCENT, [0.6, 0.9, 1.35]), (End.BOTH, [0.5, 0.5, 0.5])])
+def test_each_segment_of_the_last_descent_has_the_prior_of_its_object(end, expected, explained, monkeypatch):
+    """It is that of the search at the scale of the object, whatever that was before; an integration finds its own."""
     objective, state = explained
     weights = []
 
@@ -225,12 +227,14 @@ def test_each_segment_of_the_last_descent_has_the_prior_of_its_object(explained,
     begun = replace(state, image=state.image * rate_of_slopes(state.image) / 1.2)  # of this rate, and 1.8 and 2.7 later
     schedule = Schedule(segment=1, last_segments=2, last_gain=0.0, lost=math.inf)
     monkeypatch.setattr(
-        finish, "integrate_aberrations", lambda given, state, *rest, **more: (state, given.prior.weight)
+        finish,
+        "integrate_aberrations",
+        lambda given, state, *rest, **more: (state, 100 * (given.prior is objective.prior)),
     )
-    found, progress = ended(objective, begun, Setting.of(objective), schedule, end=End.BOTH)
-    assert weights == pytest.approx([0.6, 0.9, 1.35], rel=1e-9)
+    found, progress = ended(objective, begun, Setting.of(objective), schedule, end=end)
+    assert weights == pytest.approx(expected, rel=1e-9)
     assert found.prior.weight == weights[-1]
-    assert progress.n_evaluations - 6 == 0.5
+    assert progress.n_evaluations == 6 + 100 * end.integrates
 
 
 def test_a_result_holds_the_modes_of_the_search(observe, five_holes):

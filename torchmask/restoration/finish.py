@@ -22,6 +22,7 @@ from torchmask.restoration.escapes import centre_on_pixels, settle
 from torchmask.restoration.marginal import integrate_aberrations
 from torchmask.restoration.motion import Setting
 from torchmask.restoration.objective import MyopicObjective
+from torchmask.restoration.priors import ObjectPrior
 from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.retrieval import retrieve_lost_frames
 from torchmask.restoration.schedule import Schedule
@@ -47,7 +48,7 @@ class Finisher:
         """Update `ended`, and return the objective of its state."""
         prior = objective.prior  # which the integration suits to the object by itself
         if end.descends:
-            objective = self._descend(objective, ended)
+            objective = self._descend(objective, ended, end)
         if end.integrates:
             rounds = self.schedule.fine_rounds if end.descends else self.schedule.rounds
             how = (self.schedule, self.minimizer, self.callback)
@@ -58,7 +59,7 @@ class Finisher:
             ended.integrated = True
         return objective
 
-    def _descend(self, objective: MyopicObjective, ended: Progress) -> MyopicObjective:
+    def _descend(self, objective: MyopicObjective, ended: Progress, end: End) -> MyopicObjective:
         """Run the last descent, with the same effects.
 
         For a full pupil its result is dropped if the mean chi-square rises: frames in poor minima count little in it,
@@ -73,6 +74,10 @@ class Finisher:
         searched = not (self.traits.many_minima or self.traits.estimated)
         may_find = searched and objective.model.pupil.n_rasters == 1 and len(state.z) > 1
 
+        def prior_of(state: State) -> ObjectPrior:
+            # an integration finds the object's scale, and would find too heavy a one in what a heavier prior leaves
+            return first.prior.smoother(None if end.integrates else state.image)
+
         def listen(cost: float, evaluations: int, variables: Variables) -> None:
             costs.append(cost)
             report(cost, evaluations, variables)
@@ -80,7 +85,7 @@ class Finisher:
         while ended.last_segments < schedule.last_segments:
             costs.clear()
             state = self._recalibrate(objective, state)
-            objective = objective.with_changes(prior=first.prior.smoother(state.image))
+            objective = objective.with_changes(prior=prior_of(state))
             if self.traits.many_minima:
                 state = settle(objective, state, schedule.last_settling)
             state = descend(objective, state, schedule.segment, self.minimizer, listen)
@@ -92,7 +97,7 @@ class Finisher:
                 gains = gains or not ended.seeks_no_more
             ended.finer, ended.last_segments = state, ended.last_segments + 1 if gains else schedule.last_segments
             self.save(ended)
-        objective = objective.with_changes(prior=first.prior.smoother(state.image))
+        objective = objective.with_changes(prior=prior_of(state))
         # a descent moves flat parts of the object slowly
         state = settle(objective, state, schedule.last_settling)
         if self.traits.many_minima and _chi_square(objective, state) > _chi_square(first, ended.state):

@@ -55,8 +55,11 @@ class ObjectPrior(nn.Module):
         """Return the prior at the scale of an object (H', W') that was restored: the same one where it knows none."""
         return self
 
-    def smoother(self, image: Tensor) -> ObjectPrior:
-        """Return the prior for the last descent, from `image` (H', W') on: the same one where it knows none."""
+    def smoother(self, image: Tensor | None) -> ObjectPrior:
+        """Return the prior for the last descent, from `image` (H', W') on: the same one where it knows none.
+
+        `image` is None where the scale of the object is to be left alone.
+        """
         return self
 
 
@@ -112,14 +115,14 @@ class TotalVariation(ObjectPrior):
         rate = rate_of_slopes(image)
         return SmoothVariation(self.weight * rate, epsilon=self.epsilon) if rate > 0 else self
 
-    def smoother(self, image: Tensor) -> ObjectPrior:
+    def smoother(self, image: Tensor | None) -> ObjectPrior:
         """Return a `SmoothVariation` for bright frames of an object, so far `image` (H', W').
 
         It has the weight that suits the object if that is heavier, by up to a factor of 3: the heavier a prior, the
         gentler are the slopes that it leaves, which suit a heavier one. Else it has the same weight, and less of it on
         bends: a lighter one would follow what the model does not know of the frames.
         """
-        rate = min(rate_of_slopes(image), _HEAVIEST)
+        rate = 1.0 if image is None else min(rate_of_slopes(image), _HEAVIEST)
         if rate > 1:
             return SmoothVariation(self.weight * rate, epsilon=self.epsilon)
         return SmoothVariation(self.weight, bending=_BENDING, epsilon=self.epsilon)
@@ -184,7 +187,7 @@ class SmoothVariation(TotalVariation):
         straight = 8 * inverse + left + above + inverse.roll(-1, -1) + inverse.roll(-1, -2)
         return super().curvature(image) + straight + 2 * (inverse + left + above + left.roll(1, -2))
 
-    def smoother(self, image: Tensor) -> ObjectPrior:
+    def smoother(self, image: Tensor | None) -> ObjectPrior:
         return self
 
     def _bends(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
