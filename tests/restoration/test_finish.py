@@ -188,20 +188,51 @@ def hill(height):
     return height * torch.exp(-3 * (x**2 + x[:, None] ** 2))
 
 
-def test_the_prior_of_the_last_descent_is_smoother():
+def test_the_priors_of_the_last_descent():
+    """One where the weight of the slopes is heavier, up to three times; else from the given one down to theirs."""
     prior = TotalVariation(2.0, 0.3)
     rate = rate_of_slopes(hill(1.0))
-    scales = [(rate / 0.5, 2.0, 0.1), (rate / 1.5, 3.0, 0.25), (rate / 2.9, 5.8, 0.25), (rate / 3.1, 6.0, 0.25)]
-    for height, weight, bending in scales:  # the weight is that of the slopes where it is heavier, up to three times
-        smooth = prior.smoother(hill(height))
-        assert isinstance(smooth, SmoothVariation)
-        assert (smooth.weight, smooth.bending, smooth.epsilon) == pytest.approx((weight, bending, 0.3), rel=1e-9)
+    for height, weight in [(rate / 1.5, 3.0), (rate / 2.9, 5.8), (rate / 3.1, 6.0)]:
+        (heavier,) = prior.choices(hill(height))
+        assert isinstance(heavier, SmoothVariation)
+        assert (heavier.weight, heavier.bending, heavier.epsilon) == pytest.approx((weight, 0.25, 0.3), rel=1e-9)
+    every = [2.0, 1.26, 0.8, 0.5, 0.32, 0.2, 0.126]
+    for its_rate, weights in [(0.97, every[:1]), (0.5, every[:2]), (0.2, every[:4]), (0.01, every)]:
+        lighter = prior.choices(hill(rate / its_rate))
+        assert [choice.weight for choice in lighter] == pytest.approx(weights, rel=1e-9)
+        assert {(type(choice), choice.bending, choice.epsilon) for choice in lighter} == {(SmoothVariation, 0.1, 0.3)}
     for image in (torch.zeros(24, 24), None):
-        same = prior.smoother(image)
+        (same,) = prior.choices(image)
         assert isinstance(same, SmoothVariation)
         assert (same.weight, same.bending) == (2.0, 0.1)
-    assert smooth.smoother(hill(1.0)) is smooth
-    assert (own := EdgePreserving()).smoother(hill(1.0)) is own
+    for own in (heavier, EdgePreserving()):
+        assert own.choices(hill(1.0)) == (own,)
+
+
+def test_the_frames_choose_the_prior_of_each_segment_and_of_the_end(explained, monkeypatch):
+    """Of points, which a heavy prior would smooth, a lighter one; the choice is asked of the state at hand."""
+    objective, state = explained
+    asked = []
+
+    def choose(objective, state, priors, n_iterations):
+        asked.append((float(state.image.max()), len(priors), n_iterations, objective.model.aberrations.n_modes))
+        return priors[len(asked)]
+
+    def descend(objective, state, *rest):
+        for cost in (3.0, 2.0, 1.0):
+            rest[2](cost, 1, lambda: None)
+        return replace(state, image=1.5 * state.image)
+
+    monkeypatch.setattr(finish, "choose_prior", choose)
+    monkeypatch.setattr(finish, "descend", descend)
+    monkeypatch.setattr(finish, "recalibrate", lambda objective, state, power, **more: state)
+    monkeypatch.setattr(finish, "settle", lambda objective, state, n_iterations: state)
+    begun = replace(state, image=state.image * rate_of_slopes(state.image) / 0.05)
+    schedule = Schedule(segment=1, last_segments=2, last_gain=0.0, lost=math.inf, comparing=7)
+    found, _ = ended(objective, begun, Setting.of(objective), schedule)
+    peak, n_modes = float(begun.image.max()), objective.model.aberrations.n_modes
+    assert asked == [(pytest.approx(peak * 1.5**number), 7, 7, n_modes) for number in range(3)]
+    assert found.prior.weight == pytest.approx(0.25)
 
 
 @pytest.mark.parametrize(("end", "expected"), [(End.LAST_DESCENT, [0.6, 0.9, 1.35]), (End.BOTH, [0.5, 0.5, 0.5])])

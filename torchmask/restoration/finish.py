@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from torchmask.record import Callback
 from torchmask.restoration.calibration import calibrate, recalibrate
 from torchmask.restoration.checkpoint import Progress
+from torchmask.restoration.cross_validation import choose_prior
 from torchmask.restoration.descent import Variables, descend
 from torchmask.restoration.escapes import centre_on_pixels, settle
 from torchmask.restoration.marginal import integrate_aberrations
@@ -76,7 +77,8 @@ class Finisher:
 
         def prior_of(state: State) -> ObjectPrior:
             # an integration finds the object's scale, and would find too heavy a one in what a heavier prior leaves
-            return first.prior.smoother(None if end.integrates else state.image)
+            priors = first.prior.choices(None if end.integrates else state.image)
+            return choose_prior(objective, state, priors, schedule.comparing)
 
         def listen(cost: float, evaluations: int, variables: Variables) -> None:
             costs.append(cost)

@@ -11,6 +11,7 @@ _PROBES = 8  # random vectors that estimate the diagonal of a Hessian
 _SEED = 0
 _BENDING = 0.1  # weight of bends over that of slopes at the end of bright frames: 0 to 0.25 tried
 _HEAVIEST = 3.0  # factor on a prior for bright frames: up to 2.8 seen and up to 3.2 tried
+_LIGHTER = (0.63, 0.4, 0.25, 0.16, 0.1, 0.063)  # factors to choose from
 
 
 class ObjectPrior(nn.Module):
@@ -55,12 +56,13 @@ class ObjectPrior(nn.Module):
         """Return the prior at the scale of an object (H', W') that was restored: the same one where it knows none."""
         return self
 
-    def smoother(self, image: Tensor | None) -> ObjectPrior:
-        """Return the prior for the last descent, from `image` (H', W') on: the same one where it knows none.
+    def choices(self, image: Tensor | None) -> tuple[ObjectPrior, ...]:
+        """Return the priors for the last descent, from `image` (H', W') on; the frames choose one of them.
 
+        The heaviest comes first (`cross_validation.choose_prior`). A prior that knows no others is the only one.
         `image` is None where the scale of the object is to be left alone.
         """
-        return self
+        return (self,)
 
 
 class TotalVariation(ObjectPrior):
@@ -115,17 +117,18 @@ class TotalVariation(ObjectPrior):
         rate = rate_of_slopes(image)
         return SmoothVariation(self.weight * rate, epsilon=self.epsilon) if rate > 0 else self
 
-    def smoother(self, image: Tensor | None) -> ObjectPrior:
-        """Return a `SmoothVariation` for bright frames of an object, so far `image` (H', W').
+    def choices(self, image: Tensor | None) -> tuple[ObjectPrior, ...]:
+        """Return `SmoothVariation` of several weights for bright frames of an object, so far `image` (H', W').
 
-        It has the weight that suits the object if that is heavier, by up to a factor of 3: the heavier a prior, the
-        gentler are the slopes that it leaves, which suit a heavier one. Else it has the same weight, and less of it on
-        bends: a lighter one would follow what the model does not know of the frames.
+        If the weight that suits the object's slopes is heavier, by up to a factor of 3, it is the only one: the heavier
+        a prior, the gentler are the slopes that it leaves, which suit a heavier one. Else they go from the given weight
+        down to that one, with less weight on bends.
         """
         rate = 1.0 if image is None else min(rate_of_slopes(image), _HEAVIEST)
         if rate > 1:
-            return SmoothVariation(self.weight * rate, epsilon=self.epsilon)
-        return SmoothVariation(self.weight, bending=_BENDING, epsilon=self.epsilon)
+            return (SmoothVariation(self.weight * rate, epsilon=self.epsilon),)
+        factors = [1.0, *(factor for factor in _LIGHTER if factor > rate > 0)]
+        return tuple(SmoothVariation(self.weight * f, bending=_BENDING, epsilon=self.epsilon) for f in factors)
 
     def _slopes(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         dy, dx = gradient(image)
@@ -187,8 +190,8 @@ class SmoothVariation(TotalVariation):
         straight = 8 * inverse + left + above + inverse.roll(-1, -1) + inverse.roll(-1, -2)
         return super().curvature(image) + straight + 2 * (inverse + left + above + left.roll(1, -2))
 
-    def smoother(self, image: Tensor | None) -> ObjectPrior:
-        return self
+    def choices(self, image: Tensor | None) -> tuple[ObjectPrior, ...]:
+        return (self,)
 
     def _bends(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         dy, dx = gradient(image)

@@ -90,6 +90,7 @@ class Schedule:
         full pupil before each of its segments and of those between rounds of phase retrieval
     last_modes : number of modes of each sub-aperture of a mask in the last descent of frames that are not faint
     last_modes_full : the same of a full pupil, however faint
+    comparing : number of iterations that fit the object to half of the frames, to compare priors for that descent
     last_segments : maximum number of segments of that descent; 0: there is none
     last_gain : for a mask, it ends when the second half of a segment lowers the cost by less than this fraction, unless
         phases of lost frames have been found
@@ -151,6 +152,7 @@ class Schedule:
     last_settling: int = 80
     last_modes: int = 28
     last_modes_full: int = 351
+    comparing: int = 20
     last_segments: int = 20
     last_gain: float = 0.001
     last_gain_full: float = 0.003
