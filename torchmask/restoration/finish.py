@@ -1,12 +1,12 @@
 """The end of a restoration: a finer model, and in noisy light through a mask its aberrations are integrated out.
 
 A descent from far away takes few modes per sub-aperture. Close to the solution, more of them take away much of what the
-model leaves unexplained. So once the search has ended, the aberrations gain modes, and the object a smoother prior
-(`ObjectPrior.smoother`), and that descent goes on while it gains. Where noise leaves the aberrations of a mask
-uncertain, they are integrated out after it, or in its place if frames are faint. Between its segments the phases of
-frames are retrieved that a mask's search has left in poor minima (`retrieval`). For a full pupil its segments begin
-with the object settled for the aberrations at hand: a joint descent is too slow at the frequencies that a full pupil
-hardly passes, in which most of the error in bright light would lie.
+model leaves unexplained. So once the search has ended, the aberrations gain modes, and the object a prior that suits it
+(`ObjectPrior.choices`, `cross_validation`), and that descent goes on while it gains. Where noise leaves the aberrations
+of a mask uncertain, they are integrated out after it, or in its place if frames are faint. Between its segments the
+phases of frames are retrieved that a mask's search has left in poor minima (`retrieval`). For a full pupil its segments
+begin with the object settled for the aberrations at hand: a joint descent is too slow at the frequencies that a full
+pupil hardly passes, in which most of the error in bright light would lie.
 """
 
 from __future__ import annotations
