@@ -56,39 +56,89 @@ def state_of(image, n_frames):
     return State(image, torch.zeros(n_frames, 3, dtype=torch.float64), Calibration(ones, ones, 1.0))
 
 
+def closed_form(frames, precision, price, weights):
+    """Return the misfit of each weight for sharp frames and a ridge.
+
+    Each half has the object (p sum of frames - price) / (p n + w), where that is positive.
+    """
+    misfits = []
+    for weight in weights:
+        total = 0.0
+        for fitted, other in ((frames[0::2], frames[1::2]), (frames[1::2], frames[0::2])):
+            image = ((precision * fitted.sum(0) - price) / (precision * len(fitted) + weight)).clamp(min=0)
+            total += float(0.5 * precision * (image - other).square().sum())
+        misfits.append(total)
+    return misfits
+
+
+def last_better(misfits):
+    """Return the index of the misfit before the first that is no lower."""
+    rises = [i for i in range(len(misfits) - 1) if misfits[i + 1] >= misfits[i]]
+    return rises[0] if rises else len(misfits) - 1
+
+
+def chosen(frames, precision, price, weights):
+    begun = state_of(frames.mean(0).clamp(min=0), len(frames))
+    priors = [Ridge(weight) for weight in weights]
+    return choose_prior(SharpFrames(frames, precision, price), begun, priors, 50).weight
+
+
 @settings(max_examples=60, deadline=None)
 @given(
     seed=st.integers(0, 10**6),
     n_frames=st.integers(2, 7),
     precision=st.floats(0.1, 10.0),
-    price=st.sampled_from([0.0, 0.2]),
-    level=st.floats(1.5, 6.0),
+    price=st.sampled_from([0.0, 1.0]),
+    level=st.floats(0.3, 3.0),
+    heaviest=st.floats(-2.0, 4.0),
 )
-def test_the_choice_is_that_of_the_closed_form(seed, n_frames, precision, price, level):
-    """Sharp frames and a ridge: each half has the object (p sum of frames - price) / (p n + w), where that is positive.
-
-    Two misfits that agree to the precision of the descents may be taken for each other.
-    """
+def test_the_choice_is_that_of_the_closed_form(seed, n_frames, precision, price, level, heaviest):
+    """Two misfits that agree to the precision of the descents may be taken for each other."""
     generator = torch.Generator().manual_seed(seed)
-    truth = level * torch.rand(SHAPE, generator=generator, dtype=torch.float64)
-    noise = torch.randn(n_frames, *SHAPE, generator=generator, dtype=torch.float64) / precision**0.5
-    frames = truth + noise
-    priors = [Ridge(precision * factor) for factor in (4.0, 2.0, 1.0, 0.5, 0.2)]
+    scale = precision**-0.5
+    truth = level * scale * torch.rand(SHAPE, generator=generator, dtype=torch.float64)
+    frames = truth + scale * torch.randn(n_frames, *SHAPE, generator=generator, dtype=torch.float64)
+    weights = [precision * 2.0 ** (heaviest - i) for i in range(5)]
+    price = price * precision * scale
+    misfits = closed_form(frames, precision, price, weights)
+    found = chosen(frames, precision, price, weights)
+    assert misfits[weights.index(found)] == pytest.approx(misfits[last_better(misfits)], rel=1e-6)
 
-    def misfit(weight):
-        total = 0.0
-        for fitted, other in ((frames[0::2], frames[1::2]), (frames[1::2], frames[0::2])):
-            image = ((precision * fitted.sum(0) - price) / (precision * len(fitted) + weight)).clamp(min=0)
-            total += float(0.5 * precision * (image - other).square().sum())
-        return total
 
-    misfits = [misfit(prior.weight) for prior in priors]
-    rises = [i for i in range(len(priors) - 1) if misfits[i + 1] >= misfits[i]]
-    best = rises[0] if rises else len(priors) - 1
-    found = choose_prior(
-        SharpFrames(frames, precision, price), state_of(frames.mean(0).clamp(min=0), n_frames), priors, 50
-    )
-    assert misfit(found.weight) == pytest.approx(misfits[best], rel=1e-6)
+@pytest.mark.parametrize(
+    ("weights", "index"),
+    [
+        ([3.0, 1.5, 1.0, 0.75], 3),  # each is better than the one before
+        ([3.0, 0.75, 0.05, 0.02], 1),
+        ([0.75, 0.05, 0.02], 0),
+        ([3.0, 6.0, 0.75], 0),  # the third, which is best, is not tried once the second is worse
+    ],
+)
+def test_the_choice_ends_at_the_first_that_is_no_better(weights, index):
+    """Two sharp frames of ones with noise of 0.8, for which the best ridge has a weight of about 0.8^2."""
+    noise = 0.8 * torch.randn(2, 40, 40, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    frames = 1 + noise
+    misfits = closed_form(frames, 1.0, 0.0, weights)
+    assert last_better(misfits) == index
+    assert chosen(frames, 1.0, 0.0, weights) == weights[index]
+
+
+def test_a_price_of_light_counts_in_the_fit_alone():
+    """It takes light from the object of either half, as a heavier prior does, so that a lighter one is chosen."""
+    noise = 0.8 * torch.randn(2, 40, 40, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    frames, weights = 2 + noise, [0.6, 0.3, 0.15, 0.08, 0.01]
+    found = {}
+    for price in (0.0, 0.3):
+        misfits = closed_form(frames, 1.0, price, weights)
+        found[price] = chosen(frames, 1.0, price, weights)
+        assert found[price] == weights[last_better(misfits)]
+    assert found[0.3] < found[0.0]
+
+
+def test_no_priors_are_no_choice():
+    frames = torch.ones(2, *SHAPE)
+    with pytest.raises(ValueError, match="no priors to choose from"):
+        choose_prior(SharpFrames(frames, 1.0, 0.0), state_of(frames[0], 2), (), 5)
 
 
 @pytest.mark.parametrize(("n_frames", "n_priors"), [(1, 3), (4, 1)])
@@ -98,14 +148,11 @@ def test_one_frame_or_one_prior_leaves_no_choice(n_frames, n_priors, monkeypatch
     assert choose_prior(SharpFrames(frames, 1.0, 0.0), state_of(frames[0], n_frames), priors, 5) is priors[0]
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_halves_are_compared_as_by_whole_descents(seed, explain):
-    """For blurred frames the misfit of each prior is that of two long descents of the object of a half."""
-    objective, state = explain(n_frames=5, noise=0.3)
-    generator = torch.Generator().manual_seed(seed)
-    noise = torch.randn(objective.frames.shape, dtype=torch.float64, generator=generator)
-    objective.frames = objective.model(state.image, state.z) + 0.3 * noise
-    priors = [SmoothVariation(factor, bending=0.1) for factor in (3.0, 1.0, 0.3)]
+@pytest.mark.parametrize("noise", [0.3, 1.0])
+def test_halves_are_compared_as_by_whole_descents(noise, explain):
+    """For blurred frames the choice is that of long descents of the object of each half."""
+    objective, state = explain(n_frames=5, noise=noise)
+    priors = [SmoothVariation(factor, bending=0.1) for factor in (6.0, 2.0, 0.6, 0.06, 0.006)]
 
     def misfit(prior):
         total = 0.0
@@ -118,6 +165,6 @@ def test_halves_are_compared_as_by_whole_descents(seed, explain):
         return total
 
     misfits = [misfit(prior) for prior in priors]
-    rises = [i for i in range(len(priors) - 1) if misfits[i + 1] >= misfits[i]]
-    best = rises[0] if rises else len(priors) - 1
+    best = last_better(misfits)
+    assert 0 < best < len(priors) - 1
     assert choose_prior(objective, state, priors, 100) is priors[best]

@@ -209,8 +209,8 @@ def test_the_priors_of_the_last_descent():
         assert own.choices(hill(1.0)) == (own,)
 
 
-def test_the_frames_choose_the_prior_of_each_segment_and_of_the_end(explained, monkeypatch):
-    """Of points, which a heavy prior would smooth, a lighter one; the choice is asked of the state at hand."""
+def test_the_frames_choose_the_prior_of_each_segment_and_of_the_end(explained, five_holes, monkeypatch):
+    """They are asked with the object at hand and the finer modes; before an integration they are not asked."""
     objective, state = explained
     asked = []
 
@@ -229,10 +229,14 @@ def test_the_frames_choose_the_prior_of_each_segment_and_of_the_end(explained, m
     monkeypatch.setattr(finish, "settle", lambda objective, state, n_iterations: state)
     begun = replace(state, image=state.image * rate_of_slopes(state.image) / 0.05)
     schedule = Schedule(segment=1, last_segments=2, last_gain=0.0, lost=math.inf, comparing=7)
-    found, _ = ended(objective, begun, Setting.of(objective), schedule)
-    peak, n_modes = float(begun.image.max()), objective.model.aberrations.n_modes
-    assert asked == [(pytest.approx(peak * 1.5**number), 7, 7, n_modes) for number in range(3)]
+    setting = Setting.of(objective, finer=lambda: basis_of(five_holes, 8))
+    found, _ = ended(objective, begun, setting, schedule)
+    peak = float(begun.image.max())
+    assert asked == [(pytest.approx(peak * 1.5**number), 7, 7, 8) for number in range(3)]
     assert found.prior.weight == pytest.approx(0.25)
+    monkeypatch.setattr(finish, "choose_prior", None)
+    monkeypatch.setattr(finish, "integrate_aberrations", lambda given, state, *rest, **more: (state, 0))
+    ended(objective, begun, setting, schedule, end=End.BOTH)
 
 
 @pytest.mark.parametrize(("end", "expected"), [(End.LAST_DESCENT, [0.6, 0.9, 1.35]), (End.BOTH, [0.5, 0.5, 0.5])])

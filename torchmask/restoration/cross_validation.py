@@ -1,10 +1,10 @@
 """The prior under which frames predict each other best, by cross-validation.
 
 Which weight suits a prior depends on the object, on how well the mask covers its frequencies, and on what of the frames
-the model does not know: neither its slopes nor the cost tell. But the frames of a stack show the same object. Under too
-light a prior an object that is fitted to half of them follows their noise, under too heavy a one it loses what they
-show, and either way it predicts the other half less well (two-fold cross-validation: Stone, J. R. Stat. Soc. B 36, 111,
-1974). The aberrations stay those that were found from all frames.
+the model does not know: neither its slopes alone nor the cost tell. But the frames of a stack show the same object.
+Under too light a prior an object that is fitted to half of them follows their noise, under too heavy a one it loses
+what they show, and either way it predicts the other half less well (two-fold cross-validation: Stone, J. R. Stat. Soc.
+B 36, 111, 1974). The aberrations stay those that were found from all frames.
 """
 
 from __future__ import annotations
@@ -26,11 +26,16 @@ from torchmask.restoration.state import State
 def choose_prior(
     objective: MyopicObjective, state: State, priors: Sequence[ObjectPrior], n_iterations: int
 ) -> ObjectPrior:
-    """Return the first of `priors` that is better than the next, by the misfit of each half of the frames to an object
-    that is fitted to the other half in `n_iterations`, or the last.
+    """Go down `priors`, the heaviest first, as long as each is better than the one before, and return the last better.
 
-    Frames take turns. One frame, or one prior, leaves no choice.
+    What counts is the misfit of each half of the frames to an object that is fitted to the other half, in
+    `n_iterations` from the one before; the first begins at the object of all frames, which favours it a little. Frames
+    take turns. One frame, or one prior, leaves no choice.
+
+    Raises ValueError without any prior.
     """
+    if not priors:
+        raise ValueError("there are no priors to choose from: `choices` has to return at least one")
     best, least = priors[0], math.inf
     if len(priors) == 1 or len(state.z) == 1:
         return best
@@ -47,7 +52,10 @@ def choose_prior(
 
 @dataclass(frozen=True)
 class _Misfit:
-    """Misfit of some frames as a function of how the object (H', W') changes, to second order, for given aberrations.
+    """Misfit of some frames as a function of how the object (H', W') changes, for given aberrations.
+
+    The gradient is exact. The Hessian is that of frames as large as the field with even noise and no free background,
+    for all priors alike.
 
     image : the object that changes
     slope, power : gradient (H', W') and Hessian (H', W'/2 + 1) of `MyopicObjective.object_quadratic`

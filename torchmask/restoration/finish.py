@@ -77,8 +77,9 @@ class Finisher:
 
         def prior_of(state: State) -> ObjectPrior:
             # an integration finds the object's scale, and would find too heavy a one in what a heavier prior leaves
-            priors = first.prior.choices(None if end.integrates else state.image)
-            return choose_prior(objective, state, priors, schedule.comparing)
+            if end.integrates:
+                return first.prior.choices(None)[0]
+            return choose_prior(objective, state, first.prior.choices(state.image), schedule.comparing)
 
         def listen(cost: float, evaluations: int, variables: Variables) -> None:
             costs.append(cost)

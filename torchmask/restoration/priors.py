@@ -60,7 +60,7 @@ class ObjectPrior(nn.Module):
         """Return the priors for the last descent, from `image` (H', W') on; the frames choose one of them.
 
         The heaviest comes first (`cross_validation.choose_prior`). A prior that knows no others is the only one.
-        `image` is None where the scale of the object is to be left alone.
+        `image` is None where the scale of the object is to be left alone: then the first is taken.
         """
         return (self,)
 
@@ -121,8 +121,8 @@ class TotalVariation(ObjectPrior):
         """Return `SmoothVariation` of several weights for bright frames of an object, so far `image` (H', W').
 
         If the weight that suits the object's slopes is heavier, by up to a factor of 3, it is the only one: the heavier
-        a prior, the gentler are the slopes that it leaves, which suit a heavier one. Else they go from the given weight
-        down to that one, with less weight on bends.
+        a prior, the gentler are the slopes that it leaves, which suit a heavier one. Else they go down from the given
+        weight, by up to a factor of 16 but not below that one, with less weight on bends.
         """
         rate = 1.0 if image is None else min(rate_of_slopes(image), _HEAVIEST)
         if rate > 1:
