@@ -47,8 +47,8 @@ class SharpFrames:
 
     def object_quadratic(self, image, z, calibration):
         assert len(z) == len(self.frames) == len(calibration.transmission)
-        power = torch.full_like(torch.fft.rfft2(image).real, self.precision * len(self.frames))
-        return self.precision * (image - self.frames).sum(0), power
+        each = self.precision / calibration.noise_inflation[:, None, None]
+        return (each * (image - self.frames)).sum(0), torch.full_like(torch.fft.rfft2(image).real, float(each.sum()))
 
 
 def state_of(image, n_frames):
@@ -121,6 +121,27 @@ def test_the_choice_ends_at_the_first_that_is_no_better(weights, index):
     misfits = closed_form(frames, 1.0, 0.0, weights)
     assert last_better(misfits) == index
     assert chosen(frames, 1.0, 0.0, weights) == weights[index]
+
+
+def test_frames_count_by_their_noise():
+    """The choice is that of the frames with all their noise, and another one than for even noise."""
+    generator, inflation = torch.Generator().manual_seed(0), torch.tensor([1.0, 1.0, 30.0, 30.0], dtype=torch.float64)
+    noise = 0.8 * torch.randn(4, 40, 40, generator=generator, dtype=torch.float64)
+    frames, weights = 1 + noise * inflation[:, None, None].sqrt(), [10.0, 5.0, 2.5, 1.2, 0.6, 0.3]
+    begun = state_of(torch.ones(40, 40, dtype=torch.float64), 4)
+    found = [
+        choose_prior(SharpFrames(frames, 1.0, 0.0), state, [Ridge(weight) for weight in weights], 50).weight
+        for state in (begun, begun.calibrated(noise_inflation=inflation))
+    ]
+    misfits = []
+    for weight in weights:
+        total = 0.0
+        for a, b in (([0, 2], [1, 3]), ([1, 3], [0, 2])):
+            each = 1 / inflation[:, None, None]
+            image = ((each[a] * frames[a]).sum(0) / (each[a].sum() + weight)).clamp(min=0)
+            total += float(0.5 * (each[b] * (image - frames[b]).square()).sum())
+        misfits.append(total)
+    assert found[1] == weights[last_better(misfits)] != found[0]
 
 
 def test_a_price_of_light_counts_in_the_fit_alone():

@@ -84,7 +84,7 @@ class Options(BandOptions, StackOptions, OIFITSOptions, WorkerOptions, RunOption
     """Weight the aberrations by their von Karman statistics."""
     tv_weight: float = 1.0
     """Weight of the total variation of the object, dimensionless; a larger weight gives a smoother image. At the end it
-    is multiplied by what suits the object: in noisy frames its slopes say by what, in brighter ones the frames do."""
+    is multiplied by what suits the object: its slopes say by what, or in bright light the frames, if that is less."""
     max_iterations: int = 4000
     """Maximum number of iterations over all starts, each of at most 1000; a full pupil averages three starts, unless
     its phases are retrieved before."""

@@ -26,7 +26,7 @@ from torchmask.restoration.state import State
 def choose_prior(
     objective: MyopicObjective, state: State, priors: Sequence[ObjectPrior], n_iterations: int
 ) -> ObjectPrior:
-    """Go down `priors`, the heaviest first, as long as each is better than the one before, and return the last better.
+    """Go down `priors`, the heaviest first, as long as each is better than the one before, and return the best.
 
     What counts is the misfit of each half of the frames to an object that is fitted to the other half, in
     `n_iterations` from the one before; the first begins at the object of all frames, which favours it a little. Frames
@@ -57,7 +57,7 @@ class _Misfit:
     The gradient is exact. The Hessian is that of frames as large as the field with even noise and no free background,
     for all priors alike.
 
-    image : the object that changes
+    image : the object from which changes count
     slope, power : gradient (H', W') and Hessian (H', W'/2 + 1) of `MyopicObjective.object_quadratic`
     price : of the object's light, which is no misfit
     """

@@ -21,6 +21,7 @@ _COUNTS = (
     "rounds",
     "fine_rounds",
     "renewal",
+    "comparing",
 )
 _RANGES = {
     **dict.fromkeys(_COUNTS, (1, math.inf)),
