@@ -57,16 +57,19 @@ def state_of(image, n_frames):
 
 
 def closed_form(frames, precision, price, weights):
-    """Return the misfit of each weight for sharp frames and a ridge.
+    """Return the misfit of each weight for sharp frames and a ridge; the precision is one, or one of each frame (T,).
 
-    Each half has the object (p sum of frames - price) / (p n + w), where that is positive.
+    Each half has the object (sum of p frames - price) / (sum of p + w), where that is positive.
     """
+    each = torch.as_tensor(precision, dtype=frames.dtype).expand(len(frames))[:, None, None]
+    halves = slice(0, None, 2), slice(1, None, 2)
     misfits = []
     for weight in weights:
         total = 0.0
-        for fitted, other in ((frames[0::2], frames[1::2]), (frames[1::2], frames[0::2])):
-            image = ((precision * fitted.sum(0) - price) / (precision * len(fitted) + weight)).clamp(min=0)
-            total += float(0.5 * precision * (image - other).square().sum())
+        for fitted, other in (halves, halves[::-1]):
+            light = (each[fitted] * frames[fitted]).sum(0) - price
+            image = (light / (each[fitted].sum() + weight)).clamp(min=0)
+            total += float(0.5 * (each[other] * (image - frames[other]).square()).sum())
         misfits.append(total)
     return misfits
 
@@ -133,14 +136,7 @@ def test_frames_count_by_their_noise():
         choose_prior(SharpFrames(frames, 1.0, 0.0), state, [Ridge(weight) for weight in weights], 50).weight
         for state in (begun, begun.calibrated(noise_inflation=inflation))
     ]
-    misfits = []
-    for weight in weights:
-        total = 0.0
-        for a, b in (([0, 2], [1, 3]), ([1, 3], [0, 2])):
-            each = 1 / inflation[:, None, None]
-            image = ((each[a] * frames[a]).sum(0) / (each[a].sum() + weight)).clamp(min=0)
-            total += float(0.5 * (each[b] * (image - frames[b]).square()).sum())
-        misfits.append(total)
+    misfits = closed_form(frames, 1 / inflation, 0.0, weights)
     assert found[1] == weights[last_better(misfits)] != found[0]
 
 
