@@ -9,8 +9,8 @@
 Each draw is another mask (but for the full pupil), scene, turbulence and noise, and goes through every combination of
 d/r0, photons and frames. The frames are made end to end with the full von Karman phase. They are restored by the
 library's defaults, told the read-out noise alone. The reference is the better of two that know more: the positive
-object of least total variation for the true PSFs, and, for bright frames, the library's for the true aberrations. A
-restoration succeeds where its score is within 1.3 of that. The Cramer-Rao bound of a mask's first draw stands beside.
+object of least total variation for the true PSFs, and the library's for the true aberrations. A restoration succeeds
+where its score is within 1.3 of that. The Cramer-Rao bound of a mask's first draw stands beside.
 
 The figure, the table and the numbers go to a new folder, and with them success_mask.json or success_full.json, the
 counts that `torchmask plan` interpolates (in torchmask/planning). Make smearing_map anew after it, which counts on
@@ -67,7 +67,6 @@ from torchmask.simulation.exposures import simulate_observation
 from torchmask.spectra import NoisePSD, PowerLawPSD
 
 TRUE_MODES = {"mask": 36, "full": 351}  # by which the true aberrations are given, per hole or of the full pupil
-BRIGHT = 5e6  # electrons in all frames; in fainter ones noise hides the light that leaves the field
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,16 +177,14 @@ def restore(options: Options, pupils: Sequence[Aperture], callback: Callback) ->
     tasks = [common | draw | of_pupil(pupils[draw["draw"]]) for draw in draws]
     folder, settings = options.sweep / "tasks", options.keywords(callback)
     results = run_tasks(measure, tasks, folder, stage="success", **settings)
-    bright = [task for task in tasks if task["n_photons"] * task["n_frames"] >= BRIGHT]
-    given = iter(run_tasks(measure_given, bright, folder, stage="given", **settings))
-    references = [next(given)["known"] if task in bright else math.inf for task in tasks]
+    given = run_tasks(measure_given, tasks, folder, stage="given", **settings)
     predicted = predictions(options, pupils, callback)
     return [
         draw
         | dict(result)
-        | {"known": min(result["known"], reference), "known_psfs": result["known"]}
+        | {"known": min(result["known"], reference["known"]), "known_psfs": result["known"]}
         | {"predicted": predicted[tuple(draw[name] for name in ("draw", *KEYS))]}
-        for draw, result, reference in zip(draws, results, references, strict=True)
+        for draw, result, reference in zip(draws, results, given, strict=True)
     ]
 
 

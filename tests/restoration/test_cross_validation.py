@@ -152,6 +152,21 @@ def test_a_price_of_light_counts_in_the_fit_alone():
     assert found[0.3] < found[0.0]
 
 
+def test_the_first_prior_has_no_advantage_by_where_it_begins(monkeypatch):
+    """The object of all frames knows the half that it is to predict, so the objects of the halves leave it twice."""
+    settle, share = cross_validation.settle_object, 0.8
+
+    def settle_in_part(centre, gradient, power, prior, n_iterations):
+        there = settle(centre, gradient, power, prior, 50)[1]
+        return 0.0, centre + share * (there - centre)
+
+    noise = 0.8 * torch.randn(2, 40, 40, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    frames, weights = 2 + noise, [0.5, 0.3, 0.1]
+    misfits = closed_form(frames, 1.0, 0.0, weights)
+    monkeypatch.setattr(cross_validation, "settle_object", settle_in_part)
+    assert chosen(frames, 1.0, 0.0, weights) == weights[last_better(misfits)] != weights[0]
+
+
 def test_no_priors_are_no_choice():
     frames = torch.ones(2, *SHAPE)
     with pytest.raises(ValueError, match="no priors to choose from"):

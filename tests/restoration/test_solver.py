@@ -465,8 +465,9 @@ def test_frames_are_faint_by_how_they_change(explained):
 
 def test_nothing_is_integrated_over_what_is_known(explained):
     objective, _ = explained
-    for free in (Free.OBJECT, Free.ABERRATIONS | Free.COMMON):
-        assert solver_of(objective.with_changes(free=free), schedule=Schedule(faint=math.inf)).end is End.NONE
+    for free, end in ((Free.OBJECT, End.OBJECT), (Free.ABERRATIONS | Free.COMMON, End.NONE)):
+        assert solver_of(objective.with_changes(free=free), schedule=Schedule(faint=math.inf)).end is end
+    assert not End.OBJECT.integrates
 
 
 # --- whole restorations

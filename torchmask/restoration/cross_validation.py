@@ -29,8 +29,8 @@ def choose_prior(
     """Go down `priors`, the heaviest first, as long as each is better than the one before, and return the best.
 
     What counts is the misfit of each half of the frames to an object that is fitted to the other half, in
-    `n_iterations` from the one before; the first begins at the object of all frames, which favours it a little. Frames
-    take turns. One frame, or one prior, leaves no choice.
+    `n_iterations` from the one before; the first has twice as many, from the object of all frames on. Frames take
+    turns. One frame, or one prior, leaves no choice.
 
     Raises ValueError without any prior.
     """
@@ -40,7 +40,8 @@ def choose_prior(
     if len(priors) == 1 or len(state.z) == 1:
         return best
     halves = [_Misfit.of(objective, state, slice(first, None, 2)) for first in (0, 1)]
-    changes = [torch.zeros_like(state.image)] * 2
+    # the object of all frames knows the half that it is to predict
+    changes = [half.settle(torch.zeros_like(state.image), priors[0], n_iterations) for half in halves]
     for prior in priors:
         changes = [half.settle(change, prior, n_iterations) for half, change in zip(halves, changes, strict=True)]
         misfit = sum(half.rise(change) for half, change in zip(halves, reversed(changes), strict=True))

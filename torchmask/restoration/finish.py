@@ -6,7 +6,8 @@ model leaves unexplained. So once the search has ended, the aberrations gain mod
 of a mask uncertain, they are integrated out after it, or in its place if frames are faint. Between its segments the
 phases of frames are retrieved that a mask's search has left in poor minima (`retrieval`). For a full pupil its segments
 begin with the object settled for the aberrations at hand: a joint descent is too slow at the frequencies that a full
-pupil hardly passes, in which most of the error in bright light would lie.
+pupil hardly passes, in which most of the error in bright light would lie. Where the aberrations are known, the object
+alone descends once more, under the prior of its whole family (`ObjectPrior.family`) that the frames choose.
 """
 
 from __future__ import annotations
@@ -72,13 +73,14 @@ class Finisher:
         most, done = (number * schedule.segment for number in (schedule.last_segments, ended.last_segments))
         report, costs = ended.reporter("last descent", most, self.callback, done), []
         least_gain = schedule.last_gain_full if self.traits.many_minima else schedule.last_gain
-        searched = not (self.traits.many_minima or self.traits.estimated)
+        searched = not (self.traits.many_minima or self.traits.estimated or end is End.OBJECT)
         may_find = searched and objective.model.pupil.n_rasters == 1 and len(state.z) > 1
 
+        chosen = self._choose_for_all(objective, ended.state, end)
+
         def prior_of(state: State) -> ObjectPrior:
-            # an integration finds the object's scale, and would find too heavy a one in what a heavier prior leaves
-            if end.integrates:
-                return first.prior.choices(None)[0]
+            if chosen is not None:
+                return chosen
             return choose_prior(objective, state, first.prior.choices(state.image), schedule.comparing)
 
         def listen(cost: float, evaluations: int, variables: Variables) -> None:
@@ -103,10 +105,17 @@ class Finisher:
         objective = objective.with_changes(prior=prior_of(state))
         # a descent moves flat parts of the object slowly
         state = settle(objective, state, schedule.last_settling)
-        if self.traits.many_minima and _chi_square(objective, state) > _chi_square(first, ended.state):
+        if end is End.FULL_PUPIL and _chi_square(objective, state) > _chi_square(first, ended.state):
             return first
         ended.state = state
         return objective
+
+    def _choose_for_all(self, objective: MyopicObjective, state: State, end: End) -> ObjectPrior | None:
+        """Return the prior of all segments; None if it is chosen anew before each."""
+        if end is End.OBJECT and len(state.z) > 1:
+            return choose_prior(objective, state, objective.prior.family(), self.schedule.last_settling)
+        # an integration finds the object's scale, and would find too heavy a one in what a heavier prior leaves
+        return objective.prior.choices(None)[0] if end.integrates or end is End.OBJECT else None
 
     def _recalibrate(self, objective: MyopicObjective, state: State) -> State:
         if not self.schedule.recalibrates:

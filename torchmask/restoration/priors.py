@@ -9,9 +9,10 @@ from torchmask.numbers import require
 
 _PROBES = 8  # random vectors that estimate the diagonal of a Hessian
 _SEED = 0
-_BENDING = 0.1  # weight of bends over that of slopes at the end of bright frames: 0 to 0.25 tried
+_BENDS = 0.25  # weight of bends over that of slopes
+_FEW_BENDS = 0.1  # the same for the factors up to 1: 0 to 0.25 tried
 _HEAVIEST = 3.0  # factor on a prior for bright frames: up to 2.8 seen and up to 3.2 tried
-_LIGHTER = (0.63, 0.4, 0.25, 0.16, 0.1, 0.063)  # factors to choose from
+_FACTORS = (2.5, 1.6, 1.0, 0.63, 0.4, 0.25, 0.16, 0.1, 0.063, 0.04, 0.025)  # on a prior, to choose from
 
 
 class ObjectPrior(nn.Module):
@@ -56,11 +57,18 @@ class ObjectPrior(nn.Module):
         """Return the prior at the scale of an object (H', W') that was restored: the same one where it knows none."""
         return self
 
-    def choices(self, image: Tensor | None) -> tuple[ObjectPrior, ...]:
-        """Return the priors for the last descent, from `image` (H', W') on; the frames choose one of them.
+    def family(self) -> tuple[ObjectPrior, ...]:
+        """Return such priors of several weights, the heaviest first; the frames choose one if aberrations are known.
 
-        The heaviest comes first (`cross_validation.choose_prior`). A prior that knows no others is the only one.
-        `image` is None where the scale of the object is to be left alone: then the first is taken.
+        See `cross_validation.choose_prior`. A prior that knows no others is the only one.
+        """
+        return (self,)
+
+    def choices(self, image: Tensor | None) -> tuple[ObjectPrior, ...]:
+        """Return those of the `family` for the last descent, from `image` (H', W') on, if aberrations are unknown.
+
+        Frames have bent those to an object that follows their noise, and would choose too light a prior alone. `image`
+        is None where the scale of the object is to be left alone: then the first is taken.
         """
         return (self,)
 
@@ -117,18 +125,25 @@ class TotalVariation(ObjectPrior):
         rate = rate_of_slopes(image)
         return SmoothVariation(self.weight * rate, epsilon=self.epsilon) if rate > 0 else self
 
+    def family(self) -> tuple[ObjectPrior, ...]:
+        """Return `SmoothVariation` of 2.5 to 0.025 times the weight, the light ones with less weight on bends."""
+        return tuple(map(self._smooth, _FACTORS))
+
     def choices(self, image: Tensor | None) -> tuple[ObjectPrior, ...]:
         """Return `SmoothVariation` of several weights for bright frames of an object, so far `image` (H', W').
 
         If the weight that suits the object's slopes is heavier, by up to a factor of 3, it is the only one: the heavier
         a prior, the gentler are the slopes that it leaves, which suit a heavier one. Else they go down from the given
-        weight, by up to a factor of 16 but not below that one, with less weight on bends.
+        weight, by up to a factor of 40 but not below that one, with less weight on bends.
         """
         rate = 1.0 if image is None else min(rate_of_slopes(image), _HEAVIEST)
         if rate > 1:
-            return (SmoothVariation(self.weight * rate, epsilon=self.epsilon),)
-        factors = [1.0, *(factor for factor in _LIGHTER if factor > rate > 0)]
-        return tuple(SmoothVariation(self.weight * f, bending=_BENDING, epsilon=self.epsilon) for f in factors)
+            return (self._smooth(rate),)
+        return tuple(self._smooth(factor) for factor in _FACTORS if factor == 1 or 1 > factor > rate > 0)
+
+    def _smooth(self, factor: float) -> SmoothVariation:
+        bending = _FEW_BENDS if factor <= 1 else _BENDS
+        return SmoothVariation(self.weight * factor, bending=bending, epsilon=self.epsilon)
 
     def _slopes(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         dy, dx = gradient(image)
@@ -166,7 +181,7 @@ class SmoothVariation(TotalVariation):
     27.2
     """
 
-    def __init__(self, weight: float = 1.0, bending: float = 0.25, epsilon: float = 0.01) -> None:
+    def __init__(self, weight: float = 1.0, bending: float = _BENDS, epsilon: float = 0.01) -> None:
         super().__init__(weight, epsilon)
         require("bending", bending)
         self.bending: float = float(bending)
@@ -189,6 +204,9 @@ class SmoothVariation(TotalVariation):
         left, above = inverse.roll(1, -1), inverse.roll(1, -2)
         straight = 8 * inverse + left + above + inverse.roll(-1, -1) + inverse.roll(-1, -2)
         return super().curvature(image) + straight + 2 * (inverse + left + above + left.roll(1, -2))
+
+    def family(self) -> tuple[ObjectPrior, ...]:
+        return (self,)
 
     def choices(self, image: Tensor | None) -> tuple[ObjectPrior, ...]:
         return (self,)

@@ -92,13 +92,11 @@ class Solver:
         self.first_inflation: float = max(1.0, stack.change / schedule.first_inflation)
         turbulent = Free.ABERRATIONS in objective.free and traits.prior_on_aberrations and not traits.estimated
         self.prior_r0: float | None = traits.r0 if turbulent else None  # of the aberrations' prior, at first [m]
-        is_open = traits.prior_on_aberrations and Free.OBJECT | Free.ABERRATIONS in objective.free
-        many_ends = is_open and traits.many_minima and not traits.estimated
+        many_ends = turbulent and Free.OBJECT in objective.free and traits.many_minima
         self.averages: bool = many_ends and schedule.averaged > 1
         retrievable = objective.model.pupil.n_rasters == 1 and len(objective.frames) > 1
         self.retrieves: bool = many_ends and schedule.retrievals > 0 and retrievable
-        goes_on = many_ends or (is_open and not traits.many_minima)
-        self.end: End = End.of(stack.change, schedule, of_mask=not traits.many_minima) if goes_on else End.NONE
+        self.end: End = End.of(stack.change, traits, schedule, objective.free)
         self.judge: Judge = Judge(self.setting, stack, traits, schedule, self.end)
 
     def solve(self, known: Known, start: RestorationResult | None = None, file: Checkpoint | None = None) -> Progress:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from torchmask.optics.aperture import Aperture, SparseAperture
+from torchmask.restoration.objective import Free
 from torchmask.restoration.schedule import Schedule
 
 
@@ -18,22 +19,28 @@ class End(Enum):
     LAST_DESCENT = "object and aberrations descend once more, with more modes"
     BOTH = "the aberrations of noisy frames are integrated out after a last descent"
     FULL_PUPIL = "object and aberrations of a full pupil descend once more, with more modes and the object settled"
+    OBJECT = "the object descends once more, the aberrations being known"
 
     @classmethod
-    def of(cls, change: float, schedule: Schedule, *, of_mask: bool) -> End:
+    def of(cls, change: float, traits: Traits, schedule: Schedule, free: Free) -> End:
         """Return the end for frames that change from one to the next by so many noise variances."""
-        if not of_mask:
-            return cls.FULL_PUPIL if schedule.last_segments else cls.NONE
+        descends = schedule.last_segments > 0
+        if Free.ABERRATIONS not in free:
+            return cls.OBJECT if descends else cls.NONE
+        if Free.OBJECT not in free or not traits.prior_on_aberrations:
+            return cls.NONE
+        if traits.many_minima:
+            return cls.FULL_PUPIL if descends and not traits.estimated else cls.NONE
         if change < schedule.faint:
             return cls.INTEGRATION
-        if not schedule.last_segments:
+        if not descends:
             return cls.NONE
         return cls.BOTH if change < schedule.noisy else cls.LAST_DESCENT
 
     @property
     def descends(self) -> bool:
         """Whether a last descent follows."""
-        return self in (End.LAST_DESCENT, End.BOTH, End.FULL_PUPIL)
+        return self in (End.LAST_DESCENT, End.BOTH, End.FULL_PUPIL, End.OBJECT)
 
     @property
     def integrates(self) -> bool:
