@@ -75,9 +75,8 @@ def closed_form(frames, precision, price, weights):
 
 
 def last_better(misfits):
-    """Return the index of the misfit before the first that is no lower."""
-    rises = [i for i in range(len(misfits) - 1) if misfits[i + 1] >= misfits[i]]
-    return rises[0] if rises else len(misfits) - 1
+    """Return the index of the first misfit that the next two do not fall below, or of the least of the last ones."""
+    return next(i for i, misfit in enumerate(misfits) if all(later >= misfit for later in misfits[i + 1 : i + 3]))
 
 
 def chosen(frames, precision, price, weights):
@@ -114,10 +113,12 @@ def test_the_choice_is_that_of_the_closed_form(seed, n_frames, precision, price,
         ([3.0, 1.5, 1.0, 0.75], 3),  # each is better than the one before
         ([3.0, 0.75, 0.05, 0.02], 1),
         ([0.75, 0.05, 0.02], 0),
-        ([3.0, 6.0, 0.75], 0),  # the third, which is best, is not tried once the second is worse
+        ([3.0, 6.0, 0.75], 2),  # one that is worse does not matter
+        ([3.0, 6.0, 5.0, 0.75], 0),  # the last, which is best, is not tried once two in a row are worse
+        ([3.0, 6.0], 0),
     ],
 )
-def test_the_choice_ends_at_the_first_that_is_no_better(weights, index):
+def test_the_choice_ends_where_two_in_a_row_are_no_better(weights, index):
     """Two sharp frames of ones with noise of 0.8, for which the best ridge has a weight of about 0.8^2."""
     noise = 0.8 * torch.randn(2, 40, 40, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     frames = 1 + noise

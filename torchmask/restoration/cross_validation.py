@@ -21,12 +21,14 @@ from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.priors import ObjectPrior
 from torchmask.restoration.state import State
 
+_PATIENCE = 2  # under a heavy prior objects that are not yet at rest may look better than they are
+
 
 @torch.no_grad()
 def choose_prior(
     objective: MyopicObjective, state: State, priors: Sequence[ObjectPrior], n_iterations: int
 ) -> ObjectPrior:
-    """Go down `priors`, the heaviest first, as long as each is better than the one before, and return the best.
+    """Go down `priors`, the heaviest first, until two in a row are no better than the best so far, and return that.
 
     What counts is the misfit of each half of the frames to an object that is fitted to the other half, in
     `n_iterations` from the one before; the first has twice as many, from the object of all frames on. Frames take
@@ -36,18 +38,19 @@ def choose_prior(
     """
     if not priors:
         raise ValueError("there are no priors to choose from: `choices` has to return at least one")
-    best, least = priors[0], math.inf
+    best, least, its_number = priors[0], math.inf, 0
     if len(priors) == 1 or len(state.z) == 1:
         return best
     halves = [_Misfit.of(objective, state, slice(first, None, 2)) for first in (0, 1)]
     # the object of all frames knows the half that it is to predict
     changes = [half.settle(torch.zeros_like(state.image), priors[0], n_iterations) for half in halves]
-    for prior in priors:
+    for number, prior in enumerate(priors):
         changes = [half.settle(change, prior, n_iterations) for half, change in zip(halves, changes, strict=True)]
         misfit = sum(half.rise(change) for half, change in zip(halves, reversed(changes), strict=True))
-        if misfit >= least:
+        if misfit < least:
+            best, least, its_number = prior, misfit, number
+        elif number - its_number == _PATIENCE:
             break
-        best, least = prior, misfit
     return best
 
 

@@ -23,7 +23,7 @@ from torchmask.restoration.descent import Variables, descend
 from torchmask.restoration.escapes import centre_on_pixels, settle
 from torchmask.restoration.marginal import integrate_aberrations
 from torchmask.restoration.motion import Setting
-from torchmask.restoration.objective import MyopicObjective
+from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.priors import ObjectPrior
 from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.retrieval import retrieve_lost_frames
@@ -113,6 +113,7 @@ class Finisher:
     def _choose_for_all(self, objective: MyopicObjective, state: State, end: End) -> ObjectPrior | None:
         """Return the prior of all segments; None if it is chosen anew before each."""
         if end is End.OBJECT and len(state.z) > 1:
+            state = self._recalibrate(objective, state)
             return choose_prior(objective, state, objective.prior.family(), self.schedule.last_settling)
         # an integration finds the object's scale, and would find too heavy a one in what a heavier prior leaves
         return objective.prior.choices(None)[0] if end.integrates or end is End.OBJECT else None
@@ -120,7 +121,9 @@ class Finisher:
     def _recalibrate(self, objective: MyopicObjective, state: State) -> State:
         if not self.schedule.recalibrates:
             return state
-        return recalibrate(objective, state, self.traits.fit_power, follow_r0=self.traits.r0_is_open)
+        # known aberrations are in no poor minima, which a higher power is for
+        power = self.traits.fit_power if Free.ABERRATIONS in objective.free else 1
+        return recalibrate(objective, state, power, follow_r0=self.traits.r0_is_open)
 
     def _find_lost_frames(self, objective: MyopicObjective, state: State, ended: Progress) -> State:
         """Return the state with the phases of frames that a descent has lost, and an object that suits them; the state

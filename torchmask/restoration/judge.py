@@ -106,7 +106,8 @@ class Judge:
         """
         if decrease <= self.traits.tolerance:
             return True
-        if not self.end.descends or self.traits.many_minima or decrease > self.schedule.nearly_at_rest:
+        may_be_rough = self.end in (End.LAST_DESCENT, End.BOTH)
+        if not may_be_rough or decrease > self.schedule.nearly_at_rest:
             return False
         verdict = self.verdict(objective, progress.ending)
         return verdict.explained and self.most_starts(verdict) == 1

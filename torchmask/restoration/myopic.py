@@ -225,7 +225,7 @@ class MyopicDeconvolution:
             Standard deviations of the pixels' noise [electrons]. Photon noise in them, which follows the frames, is
             evened out (`even_photons`), so that bright pixels keep their weight. None: the same for all pixels.
         coefficients : (T, N, J) tensor or array, optional
-            Known aberrations [rad rms], which stay fixed: non-blind deconvolution.
+            Known aberrations [rad rms], which stay fixed (non-blind); the frames choose how heavy the prior is then.
         covariance : (N J, N J) tensor or array, optional
             Covariance of the errors of `coefficients` [rad^2], ordered by sub-aperture, the same for all frames. The
             coefficients are then refined, with these errors as their prior. Errors below 1 mrad count as 1 mrad.

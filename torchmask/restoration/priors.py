@@ -65,10 +65,11 @@ class ObjectPrior(nn.Module):
         return (self,)
 
     def choices(self, image: Tensor | None) -> tuple[ObjectPrior, ...]:
-        """Return those of the `family` for the last descent, from `image` (H', W') on, if aberrations are unknown.
+        """Return the priors to choose from for the last descent, from `image` (H', W') on, if aberrations are unknown.
 
-        Frames have bent those to an object that follows their noise, and would choose too light a prior alone. `image`
-        is None where the scale of the object is to be left alone: then the first is taken.
+        They are fewer than the `family`: once aberrations have been bent to an object that follows the noise of its
+        frames, these predict each other best under too light a prior. `image` is None where the scale of the object is
+        to be left alone: then the first is taken.
         """
         return (self,)
 
@@ -126,7 +127,7 @@ class TotalVariation(ObjectPrior):
         return SmoothVariation(self.weight * rate, epsilon=self.epsilon) if rate > 0 else self
 
     def family(self) -> tuple[ObjectPrior, ...]:
-        """Return `SmoothVariation` of 2.5 to 0.025 times the weight, the light ones with less weight on bends."""
+        """Return `SmoothVariation` of 2.5 to 0.025 times the weight, with less weight on bends from 1 down."""
         return tuple(map(self._smooth, _FACTORS))
 
     def choices(self, image: Tensor | None) -> tuple[ObjectPrior, ...]:
