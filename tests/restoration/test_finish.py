@@ -208,16 +208,19 @@ def test_the_priors_of_the_last_descent():
         assert isinstance(same, SmoothVariation)
         assert (same.weight, same.bending) == (2.0, 0.1)
     for own in (heavier, EdgePreserving()):
-        assert own.choices(hill(1.0)) == own.family() == (own,)
+        assert own.choices(hill(1.0)) == own.family(hill(1.0)) == (own,)
 
 
 def test_the_priors_for_known_aberrations():
-    """Heavier and lighter ones than the given, with its epsilon; the heavier ones bend less."""
-    family = TotalVariation(2.0, 0.3).family()
+    """Lighter ones than the given, with its epsilon, and heavier ones, which bend less, if the slopes suit those."""
+    rate = rate_of_slopes(hill(1.0))
+    family = TotalVariation(2.0, 0.3).family(hill(rate / 1.01))
     weights = [5.0, 3.2, 2.0, 1.26, 0.8, 0.5, 0.32, 0.2, 0.126, 0.08, 0.05]
     assert [prior.weight for prior in family] == pytest.approx(weights, rel=1e-9)
     assert [prior.bending for prior in family] == 2 * [0.25] + 9 * [0.1]
     assert {(type(prior), prior.epsilon) for prior in family} == {(SmoothVariation, 0.3)}
+    lighter = TotalVariation(2.0, 0.3).family(hill(rate / 0.99))
+    assert [prior.weight for prior in lighter] == pytest.approx(weights[2:], rel=1e-9)
 
 
 def test_the_frames_choose_the_prior_of_each_segment_and_of_the_end(explained, five_holes, monkeypatch):
@@ -321,8 +324,8 @@ def test_known_aberrations_keep_one_prior_that_the_frames_choose(traits, explain
     objective = objective.with_changes(prior=TotalVariation(0.5), free=Free.OBJECT)
     schedule = Schedule(segment=1, last_segments=3, last_gain=0.0, last_gain_full=0.0, last_settling=7, comparing=3)
     found, progress = ended(objective, state, Setting.of(objective), schedule, end=End.OBJECT, traits=traits)
-    assert asked == [(state, [prior.weight for prior in objective.prior.family()], 7)]
-    assert used == 3 * [found.prior.weight] == 3 * [1.25]
+    assert asked == [(state, [prior.weight for prior in objective.prior.family(state.image)], 7)]
+    assert used == 3 * [found.prior.weight] == 3 * [asked[0][1][0]]
     assert torch.equal(progress.state.z, state.z)
     assert not torch.equal(progress.state.image, state.image)
 
@@ -374,7 +377,6 @@ def test_the_prior_that_frames_choose_is_better_than_the_given_one_for_known_abe
         method = MyopicDeconvolution(five_holes, GRID, 3, readout_noise=0.0, schedule=schedule)
         found = method.restore(frames, coefficients=coefficients, valid=valid)
         return relative_error(found.object, light, GRID.cutoff(1.0))
-
 
     assert error(Schedule()) < 0.9 * error(Schedule(last_segments=0))
 

@@ -114,7 +114,7 @@ class Finisher:
         """Return the prior of all segments; None if it is chosen anew before each."""
         if end is End.OBJECT and len(state.z) > 1:
             state = self._recalibrate(objective, state)
-            return choose_prior(objective, state, objective.prior.family(), self.schedule.last_settling)
+            return choose_prior(objective, state, objective.prior.family(state.image), self.schedule.last_settling)
         # an integration finds the object's scale, and would find too heavy a one in what a heavier prior leaves
         return objective.prior.choices(None)[0] if end.integrates or end is End.OBJECT else None
 

@@ -57,19 +57,18 @@ class ObjectPrior(nn.Module):
         """Return the prior at the scale of an object (H', W') that was restored: the same one where it knows none."""
         return self
 
-    def family(self) -> tuple[ObjectPrior, ...]:
-        """Return such priors of several weights, the heaviest first; the frames choose one if aberrations are known.
+    def family(self, image: Tensor) -> tuple[ObjectPrior, ...]:
+        """Return priors to choose from if aberrations are known, the heaviest first; `image` (H', W') is the object.
 
-        See `cross_validation.choose_prior`. A prior that knows no others is the only one.
+        A prior that knows no others is the only one.
         """
         return (self,)
 
     def choices(self, image: Tensor | None) -> tuple[ObjectPrior, ...]:
         """Return the priors to choose from for the last descent, from `image` (H', W') on, if aberrations are unknown.
 
-        They are fewer than the `family`: once aberrations have been bent to an object that follows the noise of its
-        frames, these predict each other best under too light a prior. `image` is None where the scale of the object is
-        to be left alone: then the first is taken.
+        They are fewer than the `family`: once aberrations are bent to an object that follows noise, frames predict each
+        other best under too light a prior. `image` is None where no scale is to be found: then the first is taken.
         """
         return (self,)
 
@@ -126,9 +125,12 @@ class TotalVariation(ObjectPrior):
         rate = rate_of_slopes(image)
         return SmoothVariation(self.weight * rate, epsilon=self.epsilon) if rate > 0 else self
 
-    def family(self) -> tuple[ObjectPrior, ...]:
-        """Return `SmoothVariation` of 2.5 to 0.025 times the weight, with less weight on bends from 1 down."""
-        return tuple(map(self._smooth, _FACTORS))
+    def family(self, image: Tensor) -> tuple[ObjectPrior, ...]:
+        """Return `SmoothVariation` of 2.5 to 0.025 times the weight, with less weight on bends from 1 down.
+
+        The slopes have to suit more than 1 for those above it, as bright frames of a full pupil take long to tell.
+        """
+        return tuple(self._smooth(factor) for factor in _FACTORS if factor <= 1 or rate_of_slopes(image) > 1)
 
     def choices(self, image: Tensor | None) -> tuple[ObjectPrior, ...]:
         """Return `SmoothVariation` of several weights for bright frames of an object, so far `image` (H', W').
@@ -206,7 +208,7 @@ class SmoothVariation(TotalVariation):
         straight = 8 * inverse + left + above + inverse.roll(-1, -1) + inverse.roll(-1, -2)
         return super().curvature(image) + straight + 2 * (inverse + left + above + left.roll(1, -2))
 
-    def family(self) -> tuple[ObjectPrior, ...]:
+    def family(self, image: Tensor) -> tuple[ObjectPrior, ...]:
         return (self,)
 
     def choices(self, image: Tensor | None) -> tuple[ObjectPrior, ...]:
