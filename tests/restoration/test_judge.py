@@ -170,7 +170,7 @@ def test_a_start_in_faint_frames_is_given_up_where_it_costs_much_more(explain):
 
 
 def test_a_start_that_explains_the_frames_ends_when_nearly_at_rest(explain):
-    """The last descent goes on from there; a wrong object, faint frames or a start that is the end must be at rest."""
+    """The last descent goes on from there; otherwise it has to be at rest."""
     objective, state = explain(noise=0.003)
     schedule = Schedule(nearly_at_rest=0.01)
     known, wrong = (Progress(Candidates(found, 1)) for found in (state, replace(state, z=0 * state.z)))
@@ -186,6 +186,7 @@ def test_a_start_that_explains_the_frames_ends_when_nearly_at_rest(explain):
     assert not rests(known, 0.009, End.NONE)
     assert not rests(known, 0.009, End.INTEGRATION)
     assert not rests(known, 0.009, End.FULL_PUPIL)
+    assert not rests(known, 0.009, End.OBJECT)
     assert rests(known, 0.011, tolerance=0.02)
     for progress in (known, wrong):
         assert rests(progress, 0.001)
