@@ -382,7 +382,7 @@ def test_refuses_shapes_that_disagree(observation, restored, restoring):
     ("name", "limit", "dtype"),
     [
         ("skylab_1e7_mask", 0.062, torch.float64),
-        ("skylab_1e7_full", 0.0737, torch.float32),
+        ("mgs_1e6_full", 0.08, torch.float32),
     ],
 )
 def test_reference_stacks(name, limit, dtype, shared_stack):
