@@ -58,10 +58,7 @@ class ObjectPrior(nn.Module):
         return self
 
     def family(self, image: Tensor) -> tuple[ObjectPrior, ...]:
-        """Return priors to choose from if aberrations are known, the heaviest first; `image` (H', W') is the object.
-
-        A prior that knows no others is the only one.
-        """
+        """Return the priors to choose from for known aberrations and the object `image` (H', W'), the heaviest first."""
         return (self,)
 
     def choices(self, image: Tensor | None) -> tuple[ObjectPrior, ...]:
