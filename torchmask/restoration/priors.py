@@ -58,7 +58,7 @@ class ObjectPrior(nn.Module):
         return self
 
     def family(self, image: Tensor) -> tuple[ObjectPrior, ...]:
-        """Return the priors to choose from for known aberrations and the object `image` (H', W'), the heaviest first."""
+        """Return the priors to choose from for known aberrations and the object `image` (H', W'), heaviest first."""
         return (self,)
 
     def choices(self, image: Tensor | None) -> tuple[ObjectPrior, ...]:
