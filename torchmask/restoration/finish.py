@@ -75,7 +75,6 @@ class Finisher:
         least_gain = schedule.last_gain_full if self.traits.many_minima else schedule.last_gain
         searched = not (self.traits.many_minima or self.traits.estimated or end is End.OBJECT)
         may_find = searched and objective.model.pupil.n_rasters == 1 and len(state.z) > 1
-
         chosen = self._choose_for_all(objective, ended.state, end)
 
         def prior_of(state: State) -> ObjectPrior:

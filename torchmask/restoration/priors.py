@@ -127,7 +127,8 @@ class TotalVariation(ObjectPrior):
 
         The slopes have to suit more than 1 for those above it, as bright frames of a full pupil take long to tell.
         """
-        return tuple(self._smooth(factor) for factor in _FACTORS if factor <= 1 or rate_of_slopes(image) > 1)
+        heaviest = _FACTORS[0] if rate_of_slopes(image) > 1 else 1.0
+        return tuple(self._smooth(factor) for factor in _FACTORS if factor <= heaviest)
 
     def choices(self, image: Tensor | None) -> tuple[ObjectPrior, ...]:
         """Return `SmoothVariation` of several weights for bright frames of an object, so far `image` (H', W').
