@@ -11,6 +11,7 @@ import torch
 from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.grid import Grid
 from torchmask.interferometry.calibration import calibrate_mask
+from torchmask.interferometry.fringe_power import FringePower
 from torchmask.interferometry.which_mask import ORIENTATIONS, MaskLook, look_at_mask
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.detector import Detector
@@ -83,6 +84,23 @@ def test_noise_says_nothing(value):
     generator = torch.Generator().manual_seed(0)
     noise = value + torch.randn(6, 64, 64, generator=generator, dtype=torch.float64)
     assert look_at_mask(noise, MASK, GRID) == MaskLook()
+
+
+def test_a_share_below_zero_contradicts_no_mask():
+    """Six frames of a ball show -0.37 +- 0.47 of the right mask's pattern, more than two errors below the least."""
+    grid = Grid.nyquist(1.0, 550e-9, 32)
+    y, x = torch.meshgrid(torch.arange(-16, 16), torch.arange(-16, 16), indexing="ij")
+    ball = (1 - (x / 9) ** 2 - (y / 9) ** 2).clamp(min=0).sqrt().double()
+    mask = SparseAperture.from_catalog("golay9", 1.0, 0.15)
+    seed = torch.Generator().manual_seed(2)
+    frames = simulate_observation(
+        ball * (1e5 / ball.sum()), mask, grid, TurbulencePhase(0.2, 20.0), Detector(1.5), 6, seed
+    ).frames
+    power = FringePower.of(frames, mask, grid)
+    assert power is not None
+    share, error = power.match(mask)
+    assert share + 2 * error < 0.6  # the least that the right mask has
+    assert look_at_mask(frames, mask, grid) == MaskLook()
 
 
 def test_what_a_symmetric_mask_cannot_show_is_said(frames):

@@ -97,8 +97,8 @@ def _contradiction(power: FringePower, aperture: SparseAperture, others: dict[st
 
 
 def _may_be(match: Match) -> bool:
-    """Return whether the fringes may be those of the mask."""
-    return match.share + 2 * match.error > _RIGHT
+    """Return whether the fringes may be those of the mask; a share below 0 is noise."""
+    return max(match.share, 0.0) + 2 * match.error > _RIGHT
 
 
 def _shown(match: Match) -> str:
