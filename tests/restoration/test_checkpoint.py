@@ -24,6 +24,7 @@ from torchmask.restoration.projected_lbfgs import ProjectedLBFGS
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.solver import Solver
 from torchmask.restoration.state import Calibration, State
+from torchmask.restoration.traits import Refinement
 
 CPU = torch.device("cpu")
 
@@ -52,6 +53,11 @@ def progress_with(**changes):
         "alike": True,
         "finer": random_state(5),
         "last_segments": 2,
+        "refinement": Refinement.ON,
+        "averaged": 3,
+        "retrieved": True,
+        "seeks_no_more": True,
+        "rate": 0.4,
     }
     return Progress(several(random_state(0), 4), **given | changes)
 

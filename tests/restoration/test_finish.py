@@ -22,10 +22,11 @@ from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.motion import Setting
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.objective import Free, MyopicObjective
-from torchmask.restoration.priors import EdgePreserving, SmoothVariation, TotalVariation, rate_of_slopes
+from torchmask.restoration.priors import EdgePreserving, SmoothVariation, TotalVariation
 from torchmask.restoration.projected_lbfgs import Minimum, ProjectedLBFGS
 from torchmask.restoration.recipe import ModelRecipe
 from torchmask.restoration.schedule import Schedule
+from torchmask.restoration.slopes import rate_of_slopes
 from torchmask.restoration.solver import Solver
 from torchmask.restoration.traits import End, Refinement, Traits
 from torchmask.simulation.scene import SceneOptions, make_scene
@@ -168,8 +169,57 @@ def test_aberrations_are_integrated_out_after_the_last_descent_or_in_its_place(e
     found, progress = ended(objective, state, Setting.of(objective), schedule, records, end=end)
     assert [record.stage for record in records] == stages
     assert progress.integrated is (end is not End.LAST_DESCENT)
-    assert isinstance(found.prior, SmoothVariation) is end.descends
+    assert isinstance(found.prior, SmoothVariation)  # that of the integration, or of the last descent without it
     assert progress.n_evaluations >= sum(2 + 2 if stage == "integration" else 1 for stage in stages)
+
+
+@pytest.mark.parametrize(
+    ("prior", "rate", "n_segments"),
+    [
+        (TotalVariation(0.5), 0.3, 3),
+        (TotalVariation(0.5), 1.0, 0),
+        (TotalVariation(0.5), math.inf, 0),
+        (EdgePreserving(), 0.3, 0),
+    ],
+)
+def test_a_search_under_a_lighter_prior_descends_under_the_given_one_again(
+    prior, rate, n_segments, explained, monkeypatch
+):
+    """With the noise estimated anew each time; the integration begins from there, under a prior of that scale."""
+    objective, state = explained
+    course, records = [], []
+
+    def descend(objective, state, n_iterations, minimizer, listen):
+        course.append((objective.prior, n_iterations))
+        listen(1.0, 7, lambda: None)
+        return replace(state, image=2 * state.image)
+
+    def integrate(objective, state, *rest, **more):
+        course.extend([objective.prior, state.image])
+        return state, 0
+
+    monkeypatch.setattr(finish, "descend", descend)
+
+    def recalibrate(objective, state, power, **more):
+        course.append("recalibrated")
+        return state
+
+    monkeypatch.setattr(finish, "recalibrate", recalibrate)
+    monkeypatch.setattr(finish, "integrate_aberrations", integrate)
+    schedule = Schedule(faint_segments=3, segment=4)
+    progress = Progress(Candidates(state, 1), rate=rate)
+    finisher = Finisher(
+        Setting.of(objective), schedule, ProjectedLBFGS(), records.append, TRAITS, lambda progress: None
+    )
+    finisher.finish(objective.with_changes(prior=prior), progress, End.INTEGRATION)
+    *segments, own, image = course
+    assert segments == n_segments * ["recalibrated", (prior, 4)]
+    assert torch.equal(image, 2**n_segments * state.image)
+    assert repr(own) == repr(prior.suited_to(image))
+    assert progress.n_evaluations == 7 * n_segments
+    assert [(record.stage, record.step) for record in records] == [
+        ("before integration", number + 1) for number in range(n_segments)
+    ]
 
 
 def test_nothing_follows_the_search_of_a_schedule_without_last_segments(observe, five_holes):
@@ -255,7 +305,7 @@ def test_the_frames_choose_the_prior_of_each_segment_and_of_the_end(explained, f
 
 @pytest.mark.parametrize(("end", "expected"), [(End.LAST_DESCENT, [0.6, 0.9, 1.35]), (End.BOTH, [0.5, 0.5, 0.5])])
 def test_each_segment_of_the_last_descent_has_the_prior_of_its_object(end, expected, explained, monkeypatch):
-    """It is that of the search at the scale of the object, whatever that was before; an integration finds its own."""
+    """It is the given one at the scale of the object, whatever that was before; an integration has that of its own."""
     objective, state = explained
     weights = []
 
@@ -275,14 +325,18 @@ def test_each_segment_of_the_last_descent_has_the_prior_of_its_object(end, expec
     objective = objective.with_changes(prior=TotalVariation(0.5))
     begun = replace(state, image=state.image * rate_of_slopes(state.image) / 1.2)  # of this rate, and 1.8 and 2.7 later
     schedule = Schedule(segment=1, last_segments=2, last_gain=0.0, lost=math.inf)
-    monkeypatch.setattr(
-        finish,
-        "integrate_aberrations",
-        lambda given, state, *rest, **more: (state, 100 * (given.prior is objective.prior)),
-    )
+    integrated = []
+
+    def integrate(given, state, *rest, **more):
+        integrated.append(given.prior)
+        return state, 100
+
+    monkeypatch.setattr(finish, "integrate_aberrations", integrate)
     found, progress = ended(objective, begun, Setting.of(objective), schedule, end=end)
     assert weights == pytest.approx(expected, rel=1e-9)
-    assert found.prior.weight == weights[-1]
+    assert integrated == ([found.prior] if end.integrates else [])
+    assert found.prior.weight == pytest.approx(1.35, rel=1e-9)
+    assert isinstance(found.prior, SmoothVariation)
     assert progress.n_evaluations == 6 + 100 * end.integrates
 
 

@@ -153,18 +153,18 @@ def test_a_start_in_faint_frames_is_given_up_where_it_costs_much_more(explain):
     above = (costs[0] - costs[1]) / state.z.numel()
     assert above > 0
 
-    def given_up(hopeless, end=End.INTEGRATION, iterations=300, rival=state, is_twin=False):
+    def given_up(hopeless, end=End.INTEGRATION, iterations=300, rival=state, starts=1):
         schedule = Schedule(hopeless=hopeless, promising=0.0)
         judge = Judge(Setting.of(objective), stack_of(objective), TRAITS, schedule, end)
         before = None if rival is None else Ending(rival, Status.CONVERGED)
         now = Candidates(worse.with_noise_inflation(3.0), 1)
-        return judge.gives_up(objective, Progress(now, iterations * [1.0], rival=before), is_twin=is_twin)
+        return judge.gives_up(objective, Progress(now, iterations * [1.0], starts=starts, rival=before))
 
     assert given_up(0.999 * above)
     assert not given_up(1.001 * above)
     assert not given_up(0.0, End.LAST_DESCENT)
-    assert given_up(math.inf, End.LAST_DESCENT, is_twin=True)
-    assert not given_up(math.inf, is_twin=True)
+    assert given_up(math.inf, End.LAST_DESCENT, starts=2)
+    assert not given_up(math.inf, starts=2)
     assert not given_up(0.0, iterations=299)
     assert not given_up(0.0, rival=None)
 

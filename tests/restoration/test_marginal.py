@@ -26,13 +26,6 @@ GRID = Grid.nyquist(1.0, 550e-9, 32, oversampling=1.2)
 BRIEF = Schedule(moves=3, renewal=2, segment=3)
 
 
-class OfOneScale(TotalVariation):
-    """Whatever the object."""
-
-    def suited_to(self, image):
-        return self
-
-
 def one_piston(noise, n_frames, identical=False, weight=1.0):
     """Frames of a block through two holes, whose only aberration is the one difference of their pistons."""
     pair = SparseAperture([[-0.3, 0.0], [0.3, 0.05]], 0.36, 1.0)
@@ -46,7 +39,7 @@ def one_piston(noise, n_frames, identical=False, weight=1.0):
     if identical:
         frames = frames[:1].expand_as(frames).clone()
     ones = torch.ones(n_frames, dtype=torch.float64)
-    objective = MyopicObjective(model, frames, torch.tensor([[[noise**-2]]]).double(), OfOneScale(weight))
+    objective = MyopicObjective(model, frames, torch.tensor([[[noise**-2]]]).double(), TotalVariation(weight))
     return objective, State(image, z, Calibration(ones, ones, 1.0))
 
 
@@ -168,26 +161,6 @@ def test_one_seed_one_result_and_a_record_of_every_round(explain):
     assert not torch.equal(first.image, other.image)
     assert [record.step for record in records] == [1, 2, 3, 4] * 3
     assert all(record.stage == "integration" and 0 <= record.scalars["accepted"] <= 1 for record in records)
-
-
-def test_the_prior_has_the_scale_that_the_object_suggests():
-    """As with a prior of that scale from the beginning, whatever weight it has by itself."""
-    objective, state = one_piston(10.0, 10)
-    state = replace(
-        state, image=state.image + torch.rand(state.image.shape, generator=torch.Generator().manual_seed(2))
-    )
-    suited = TotalVariation().suited_to(state.image)
-
-    class AsSuited(TotalVariation):
-        def suited_to(self, image):
-            return suited
-
-    found = []
-    for prior in (TotalVariation(), AsSuited(), OfOneScale()):
-        changed, how = objective.with_changes(prior=prior), {"seed": 0, "follow_r0": False}
-        found.append(integrate_aberrations(changed, state, 4, BRIEF, ProjectedLBFGS(), **how)[0].image)
-    assert torch.equal(found[0], found[1])
-    assert not torch.allclose(found[0], found[2], rtol=0.01)
 
 
 def test_the_object_is_the_mean_of_the_later_rounds(monkeypatch):

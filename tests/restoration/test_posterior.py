@@ -24,7 +24,8 @@ from torchmask.restoration.posterior import (
     evenness,
     smooth,
 )
-from torchmask.restoration.priors import TotalVariation, divergence, gradient
+from torchmask.restoration.priors import TotalVariation
+from torchmask.restoration.slopes import divergence, gradient
 from torchmask.restoration.state import Calibration, State
 from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene

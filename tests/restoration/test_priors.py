@@ -13,9 +13,8 @@ from torchmask.restoration.priors import (
     ObjectPrior,
     SmoothVariation,
     TotalVariation,
-    divergence,
-    gradient,
 )
+from torchmask.restoration.slopes import divergence, gradient
 
 
 def squares(image):
@@ -189,10 +188,23 @@ def test_gradients_of_one_rate_are_known_by_it():
     assert abs(found / rate - 1) < 4 * (0.5 + (120 / 36 - 1)) ** 0.5 / n**0.5  # of E|g|, and of E|g|^2: 120 / mu^4
 
 
+@pytest.mark.parametrize("prior", [TotalVariation(2.0, 0.3), SmoothVariation(2.0, 0.2, 0.3)])
+def test_a_search_in_faint_light_has_a_lighter_prior_for_an_object_of_steep_slopes(prior):
+    """By up to a factor of four; the prior itself keeps its weight."""
+    for rate, weight in ((0.01, 0.5), (0.25, 0.5), (0.4, 0.8)):
+        found = prior.in_search(rate)
+        assert type(found) is type(prior)
+        assert found.weight == pytest.approx(weight, rel=1e-12)
+        assert float(found(rough())) == pytest.approx(float(prior(rough())) * weight / 2, rel=1e-12)
+    assert prior.weight == 2.0
+
+
 def test_priors_without_a_scale_stay_as_they_are():
     flat = torch.full((4, 4), 3.0)
     for prior in (EdgePreserving(), as_prior(squares), TotalVariation()):
         assert prior.suited_to(flat) is prior
+    for prior in (EdgePreserving(), as_prior(squares)):
+        assert prior.in_search(0.3) is prior
     other = EdgePreserving()
     assert other.suited_to(rough()) is other
 

@@ -11,6 +11,7 @@ import torch
 from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture
 from torchmask.record import Record
+from torchmask.restoration import solver
 from torchmask.restoration.calibration import calibrate, fit_of_frames, recalibrate, sharpen_noise_inflation
 from torchmask.restoration.candidates import Candidates, play_stage, with_candidates
 from torchmask.restoration.checkpoint import Ending, Progress, Status
@@ -19,8 +20,10 @@ from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.objective import Free
+from torchmask.restoration.priors import TotalVariation
 from torchmask.restoration.projected_lbfgs import Minimum, ProjectedLBFGS
 from torchmask.restoration.schedule import Schedule
+from torchmask.restoration.slopes import rate_of_slopes
 from torchmask.restoration.solver import Solver
 from torchmask.restoration.starts import Known
 from torchmask.restoration.traits import End, Refinement, Traits
@@ -429,6 +432,91 @@ def test_aberrations_of_faint_frames_are_integrated_out(faint, traits, integrate
     assert progress.integrated is integrated
     assert [record.step for record in records if record.stage == "integration"] == ([1, 2] if integrated else [])
     assert len(progress.costs) == min(5, traits.get("max_iterations", 5))
+
+
+class Course:
+    """Stands in for the descents of a restoration, at each of whose ends the object's slopes have a given rate."""
+
+    def __init__(self, monkeypatch, truth, rates):
+        self.truth, self.rates, self.weights, self.ends = truth, list(rates), [], []
+        monkeypatch.setattr(solver, "descend", self.descend)
+        monkeypatch.setattr(solver, "recalibrate", lambda objective, state, power, **more: state)
+        monkeypatch.setattr(solver.Finisher, "finish", self.finish)
+
+    def descend(self, objective, state, n_iterations, minimizer, listen):
+        for cost in (3.0, 2.0):
+            listen(cost, 1, lambda: None)
+        self.weights.append(objective.prior.weight)
+        rate = self.rates.pop(0)
+        scale = rate_of_slopes(self.truth.image) / rate if rate else 0.0
+        return replace(state, image=self.truth.image * scale)
+
+    def finish(self, objective, ended, end):
+        self.ends.append(objective.prior)
+        return objective
+
+    def solve(self, objective, faint=math.inf, max_iterations=12, sharp_after=4, file=None, **known):
+        numbers = {"segment": 2, "start_iterations": 8, "sharp_after": sharp_after, "escapes": 0, "starts": 2}
+        schedule = Schedule(faint=faint, nearly_at_rest=-math.inf, **numbers, **ALL_MISSED)
+        traits = {"max_iterations": max_iterations, "tolerance": -math.inf}
+        return solver_of(objective, schedule=schedule, **traits).solve(Known(**known), file=file)
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({}, [2.0, 2.0, 1.4, 1.4, 1.4, 1.4]),
+        ({"faint": 0.0}, 6 * [2.0]),
+        ({"sharp_after": 0}, [2.0, 1.8, 1.8, 1.8, 1.8, 1.8]),  # not by the mean frame
+        ({"max_iterations": 4}, [2.0, 2.0]),
+    ],
+)
+def test_a_faint_search_has_the_prior_that_suits_its_first_sharp_object(options, expected, explained, monkeypatch):
+    """Later starts keep it; the end has the given one, and bright frames always."""
+    objective, truth = explained
+    course, prior = Course(monkeypatch, truth, [0.9, 0.7, 0.1, 2.0, 0.6, 0.5]), TotalVariation(2.0)
+    progress = course.solve(objective.with_changes(prior=prior), **options)
+    assert course.weights == pytest.approx(expected, rel=1e-9)
+    assert course.ends == ([prior] if len(expected) > 2 else [])
+    assert (progress.rate < 1) == (expected != [2.0] * len(expected))
+
+
+def test_an_object_without_slopes_leaves_the_prior_of_a_faint_search(explained, monkeypatch):
+    """Until another segment finds some."""
+    objective, truth = explained
+    course = Course(monkeypatch, truth, [0.9, 0.0, 0.5, 0.1, 0.1, 0.1])
+    course.solve(objective.with_changes(prior=TotalVariation(2.0)))
+    assert course.weights == pytest.approx([2.0, 2.0, 2.0, 1.0, 1.0, 1.0], rel=1e-9)
+
+
+def test_a_faint_search_from_a_sensors_estimate_keeps_the_given_prior(explained, monkeypatch):
+    """A single frame of unknown aberrations does not."""
+    objective, truth = explained
+    sensed = {"coefficients": 0 * objective.model.aberrations.coefficients(truth.z)}
+    sensed["covariance"] = torch.eye(truth.z.shape[1], dtype=torch.float64)
+    for frames, known, last in ((slice(0, 1), {}, 0.5), (slice(None), sensed, 2.0)):
+        few = objective.of_frames(frames).with_changes(prior=TotalVariation(2.0))
+        course = Course(monkeypatch, truth.of_frames(frames), 4 * [0.1])
+        course.solve(few, **known)
+        assert course.weights == [2.0, 2.0, last, last]
+
+
+def test_a_faint_search_goes_on_under_the_prior_that_its_file_tells(explained, monkeypatch):
+    objective, truth = explained
+    course = Course(monkeypatch, truth, [0.7, 0.7, 0.1])
+
+    class File:
+        def load(self, device):
+            begun = [1.0] * 8
+            return Progress(
+                Candidates(truth, 1), begun, began=8, starts=2, rival=Ending(truth, Status.CONVERGED), rate=0.3
+            )
+
+        def save(self, progress):
+            assert progress.rate == 0.3
+
+    course.solve(objective.with_changes(prior=TotalVariation(2.0)), file=File())
+    assert course.weights == pytest.approx([0.6, 0.6], rel=1e-9)
 
 
 @pytest.mark.parametrize(

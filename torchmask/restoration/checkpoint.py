@@ -71,6 +71,8 @@ class Progress:
     averaged : number of starts whose objects have been averaged, before the last descent
     retrieved : whether phases have been retrieved, after the present start or in the last descent
     seeks_no_more : whether phases of frames that the search has lost are no longer looked for in the last descent
+    rate : that of the slopes of the first sharp object in faint light, which the search's prior suits; infinite until
+        it is seen, and 1 where it is not looked for
     """
 
     candidates: Candidates
@@ -91,6 +93,7 @@ class Progress:
     averaged: int = 1
     retrieved: bool = False
     seeks_no_more: bool = False
+    rate: float = 1.0
 
     @property
     def state(self) -> State:
@@ -110,6 +113,16 @@ class Progress:
     def iterations(self) -> int:
         """Number of iterations of the present start."""
         return len(self.costs) - self.began
+
+    def limit(self, most: int, of_start: int) -> Status:
+        """Return which limit on the iterations, of all starts or of one, has been reached, or RUNNING."""
+        if len(self.costs) >= most:
+            return Status.ITERATION_LIMIT
+        return Status.RUNNING if self.iterations < of_start else Status.START_LIMIT
+
+    def last_iteration(self, most: int, of_start: int) -> int:
+        """Return the number of the present start's last iteration under these limits, counted over all starts."""
+        return min(self.began + of_start, most)
 
     def reporter(self, stage: str, n_steps: int, callback: Callback | None, done: int = 0) -> Listener:
         """Return a listener of a descent after the search: it counts its evaluations and reports its iterations.
@@ -142,6 +155,7 @@ _NUMBERS = (
     "averaged",
     "retrieved",
     "seeks_no_more",
+    "rate",
 )
 # arrays of an ending
 _NEEDED = ("image", "z", "geometry", "modes", "status", *(item.name for item in fields(Calibration)))

@@ -3,11 +3,12 @@
 A descent from far away takes few modes per sub-aperture. Close to the solution, more of them take away much of what the
 model leaves unexplained. So once the search has ended, the aberrations gain modes, and the object a prior that suits it
 (`ObjectPrior.choices`, `cross_validation`), and that descent goes on while it gains. Where noise leaves the aberrations
-of a mask uncertain, they are integrated out after it, or in its place if frames are faint. Between its segments the
-phases of frames are retrieved that a mask's search has left in poor minima (`retrieval`). For a full pupil its segments
-begin with the object settled for the aberrations at hand: a joint descent is too slow at the frequencies that a full
-pupil hardly passes, in which most of the error in bright light would lie. Where the aberrations are known, the object
-alone descends once more, under the prior of its whole family (`ObjectPrior.family`) that the frames choose.
+of a mask uncertain, they are integrated out after it, or in its place if frames are faint, under a prior at the scale
+of the object; a faint search under a lighter prior descends under the given one before. Between segments of the last
+descent the phases of frames are retrieved that a mask's search has left in poor minima (`retrieval`). For a full pupil
+its segments begin with the object settled for the aberrations at hand: a joint descent is too slow at the frequencies
+that a full pupil hardly passes, in which most of the error in bright light would lie. Where the aberrations are known,
+the object alone descends once more, under the prior of its whole family (`ObjectPrior.family`) that the frames choose.
 """
 
 from __future__ import annotations
@@ -48,15 +49,17 @@ class Finisher:
 
     def finish(self, objective: MyopicObjective, ended: Progress, end: End) -> MyopicObjective:
         """Update `ended`, and return the objective of its state."""
-        prior = objective.prior  # which the integration suits to the object by itself
+        prior = objective.prior
         if end.descends:
             objective = self._descend(objective, ended, end)
+        elif ended.rate < 1 and prior.in_search(ended.rate) is not prior:
+            self._descend_again(objective, ended)
         if end.integrates:
             rounds = self.schedule.fine_rounds if end.descends else self.schedule.rounds
             how = (self.schedule, self.minimizer, self.callback)
             known = {"seed": self.traits.seed, "follow_r0": self.traits.r0_is_open}
-            given = objective.with_changes(prior=prior)
-            ended.state, spent = integrate_aberrations(given, ended.state, rounds, *how, **known)
+            objective = objective.with_changes(prior=prior.suited_to(ended.state.image))
+            ended.state, spent = integrate_aberrations(objective, ended.state, rounds, *how, **known)
             ended.n_evaluations += spent
             ended.integrated = True
         return objective
@@ -108,6 +111,14 @@ class Finisher:
             return first
         ended.state = state
         return objective
+
+    def _descend_again(self, objective: MyopicObjective, ended: Progress) -> None:
+        """Descend under the given prior again: a lighter one finds more, but bends aberrations to noise."""
+        segments = self.schedule.faint_segments
+        listen = ended.reporter("before integration", segments * self.schedule.segment, self.callback)
+        for _ in range(segments):
+            state = self._recalibrate(objective, ended.state)
+            ended.state = descend(objective, state, self.schedule.segment, self.minimizer, listen)
 
     def _choose_for_all(self, objective: MyopicObjective, state: State, end: End) -> ObjectPrior | None:
         """Return the prior of all segments; None if it is chosen anew before each."""

@@ -121,7 +121,11 @@ class Judge:
             return 1
         return self.schedule.glance if self.end is End.INTEGRATION else self.schedule.start_iterations + 1
 
-    def gives_up(self, objective: MyopicObjective, progress: Progress, *, is_twin: bool) -> bool:
+    def is_twin(self, start: int) -> bool:
+        """Return whether the start of this number is from a twin: of a mask, all but the first and few others are."""
+        return not self.traits.many_minima and (start - 1) % (self.schedule.twins + 1) > 0
+
+    def gives_up(self, objective: MyopicObjective, progress: Progress) -> bool:
         """Return whether it is time to see that the present start, if from a twin, is not well ahead of the best.
 
         In faint frames, whose residual does not tell, any start is given up that costs much more than the best.
@@ -132,7 +136,7 @@ class Judge:
         if self.end is End.INTEGRATION:
             above = self._cost(objective, now.state) - self._cost(objective, best.state)
             return above > self.schedule.hopeless * now.state.z.numel()
-        if not is_twin:
+        if not self.is_twin(progress.starts):
             return False
         left, least = (self.verdict(objective, ending).excess for ending in (now, best))
         return left >= self.schedule.promising * least

@@ -4,8 +4,7 @@ A joint estimate of the object and the aberrations of all frames is biased: ever
 which are fitted to its noise (Neyman & Scott, Econometrica 16, 1, 1948; for blind deconvolution Levin et al., IEEE
 Trans. Pattern Anal. 33, 2354, 2011). The aberrations are therefore integrated out by stochastic expectation
 maximisation (Celeux & Diebolt, Comput. Stat. Q. 2, 73, 1985): the object is fitted to a sample of the aberrations,
-which are then moved on for the new object, and the result is its mean over the later rounds. The prior on the object
-has the scale that the object suggests.
+which are then moved on for the new object, and the result is its mean over the later rounds.
 """
 
 from __future__ import annotations
@@ -132,14 +131,13 @@ def integrate_aberrations(
     """
     generator = torch.Generator().manual_seed(seed)
     sampler, size, spent = AberrationSampler(objective, state, generator), schedule.move_size, 0
-    suited = objective.with_changes(prior=objective.prior.suited_to(state.image))
     total, first = torch.zeros_like(state.image), rounds // 2
     for number in range(rounds):
         if number and number % schedule.renewal == 0:
             sampler = AberrationSampler(objective, state, generator)
         z, accepted = sampler.sample(state, schedule.moves, size)
         size = size * _ADAPTED if accepted > _ACCEPTED else size / _ADAPTED
-        state = settle(suited, replace(state, z=z), schedule.settling)
+        state = settle(objective, replace(state, z=z), schedule.settling)
         state = unwrap_pistons(objective, state)
         state = follow_turbulence(objective, state) if follow_r0 else state
         if number >= first:

@@ -26,7 +26,7 @@ from torchmask.restoration.adjoint import curvature
 from torchmask.restoration.linearization import Linearization
 from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.placement import slopes_of_frames
-from torchmask.restoration.priors import divergence, gradient
+from torchmask.restoration.slopes import divergence, gradient
 from torchmask.restoration.state import State
 
 _REACH = 0.7  # smoothing of the gradients' variance [1 / cut-off]: 0.5 to 1.4 tried, see docs/tried.md

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import copy
+
 import torch
 from torch import Tensor, nn
 
 from torchmask.numbers import require
+from torchmask.restoration.slopes import divergence, gradient, rate_of_slopes
 
 _PROBES = 8  # random vectors that estimate the diagonal of a Hessian
 _SEED = 0
 _BENDS = 0.25  # weight of bends over that of slopes
 _FEW_BENDS = 0.1  # the same for the factors up to 1: 0 to 0.25 tried
 _HEAVIEST = 3.0  # factor on a prior for bright frames: up to 2.8 seen and up to 3.2 tried
+_LIGHTEST = 0.25  # factor on a prior in the search
 _FACTORS = (2.5, 1.6, 1.0, 0.63, 0.4, 0.25, 0.16, 0.1, 0.063, 0.04, 0.025)  # on a prior, to choose from
 
 
@@ -52,6 +56,13 @@ class ObjectPrior(nn.Module):
                 (curved,) = torch.autograd.grad(slope, leaf, signs, retain_graph=True, materialize_grads=True)
                 diagonal += signs * curved / _PROBES
         return diagonal.clamp(min=0)
+
+    def in_search(self, rate: float) -> ObjectPrior:
+        """Return the prior of a search in faint light for an object whose slopes have a rate between 0 and 1.
+
+        See `rate_of_slopes`. It is `self` where it knows no scale.
+        """
+        return self
 
     def suited_to(self, image: Tensor) -> ObjectPrior:
         """Return the prior at the scale of an object (H', W') that was restored: the same one where it knows none."""
@@ -113,6 +124,15 @@ class TotalVariation(ObjectPrior):
     def curvature(self, image: Tensor) -> Tensor:
         inverse = 1 / self._slopes(image)[2]
         return self.weight * (2 * inverse + inverse.roll(1, -2) + inverse.roll(1, -1))
+
+    def in_search(self, rate: float) -> TotalVariation:
+        """Return a copy with the weight times the rate, but at least times 0.25.
+
+        The penalty of a subclass has to be proportional to its attribute `weight`, a float.
+        """
+        lighter = copy.copy(self)
+        lighter.weight = self.weight * max(rate, _LIGHTEST)
+        return lighter
 
     def suited_to(self, image: Tensor) -> ObjectPrior:
         """Return a `SmoothVariation` whose weight suits the gradients of `image` (H', W'): `weight` times their rate.
@@ -275,25 +295,3 @@ class EdgePreserving(ObjectPrior):
 
     def extra_repr(self) -> str:
         return f"weight={self.weight:g}, threshold={self.threshold:g}"
-
-
-def rate_of_slopes(image: Tensor) -> float:
-    """Return 3 sum |g| / sum |g|^2 of the gradients g of `image` (H', W'); 0 if there are none.
-
-    It is the rate mu of gradients that are drawn from exp(-mu |g|) in some pixels, whose moments are E|g| = 2 / mu and
-    E|g|^2 = 6 / mu^2, and zero in the others, however many.
-    """
-    dy, dx = gradient(image)
-    squared = dy**2 + dx**2
-    total = float(squared.sum())
-    return 3 * float(squared.sqrt().sum()) / total if total > 0 else 0.0
-
-
-def gradient(image: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the periodic forward differences of (..., H, W) along the rows' axis (dy) and the columns' axis (dx)."""
-    return image.roll(-1, -2) - image, image.roll(-1, -1) - image
-
-
-def divergence(dy: Tensor, dx: Tensor) -> Tensor:
-    """Return the adjoint of `gradient`."""
-    return dy.roll(1, -2) - dy + dx.roll(1, -1) - dx

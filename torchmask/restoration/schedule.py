@@ -43,7 +43,8 @@ class Schedule:
     start_iterations : maximum number of iterations of one start
     nearly_at_rest : a start of a mask that explains the frames, unless they are faint, ends as soon as a segment lowers
         the cost by less than this fraction, as the last descent goes on from there
-    sharp_after : number of iterations after which the object is sharp enough to escape from local minima
+    sharp_after : number of iterations after which the object is sharp enough to escape from local minima, and in faint
+        light to choose the prior of the rest of the search
     escapes : maximum number of escapes in one start, each of which restarts outlying frames, changes their
         fringes in a band and shifts the object
     first_inflation : the initial noise variance is the residual variance of the mean frame divided by this
@@ -81,6 +82,7 @@ class Schedule:
     faint : change from frame to frame, in noise variances, below which frames are faint: the aberrations are integrated
         out in place of a last descent
     noisy : the same below which they are integrated out after the last descent
+    faint_segments : number of segments under the given prior between a search under a lighter one and the integration
     rounds : number of rounds of the integration of faint frames; the object is the mean of the second half of them
     fine_rounds : the same after a last descent
     moves : number of moves of the aberrations' samples in a round
@@ -145,6 +147,7 @@ class Schedule:
     still: float = 1e-4
     faint: float = 5.0
     noisy: float = 30.0
+    faint_segments: int = 2
     rounds: int = 100
     fine_rounds: int = 50
     moves: int = 10

@@ -3,15 +3,16 @@
 The first start is from zero aberrations for a mask, and a tournament of random candidates for a full pupil. The descent
 proceeds in segments. Between two of them, the scales of the variables, the transmissions, the strength of the
 turbulence and the noise are updated; the assumed noise falls from the residual of the mean frame to the true noise, or
-to the residual of the model, if that is larger. Once the object is sharp, frames and object escape from local minima;
-when nothing changes any more, each frame is weighted by how well it fits. A start ends when a segment gains nothing, or
-little if it explains the frames, or its iterations are used up. Then phases of a full pupil's bright frames are
-retrieved. If it missed the object, or frames are faint, others start, from random aberrations or twins of the object;
-the best is kept, or the mean for a full pupil. What follows is told in `finish`.
+to that of the model, if that is larger. Once the object is sharp, frames and object escape from local minima, and in
+faint light the prior suits it; when nothing changes any more, each frame is weighted by how well it fits. A start ends
+when a segment gains nothing, or little if it explains the frames, or its iterations are used up. Then phases of a full
+pupil's bright frames are retrieved. If it missed the object, or frames are faint, others start, from random aberrations
+or twins of the object; the best is kept, or the mean for a full pupil. What follows is told in `finish`.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -30,10 +31,12 @@ from torchmask.restoration.judge import Judge
 from torchmask.restoration.motion import Setting
 from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.placement import distance, is_misplaced
+from torchmask.restoration.priors import ObjectPrior
 from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.result import RestorationResult
 from torchmask.restoration.retrieval import retrieve_phases
 from torchmask.restoration.schedule import Schedule
+from torchmask.restoration.slopes import rate_of_slopes
 from torchmask.restoration.starts import (
     Known,
     expected_parameters,
@@ -89,6 +92,7 @@ class Solver:
         self.minimizer: Minimizer = minimizer
         self.callback: Callback | None = callback
         self._how: tuple[Traits, Schedule, Minimizer] = (traits, schedule, minimizer)
+        self._limits: tuple[int, int] = (traits.max_iterations, schedule.start_iterations)
         self.first_inflation: float = max(1.0, stack.change / schedule.first_inflation)
         turbulent = Free.ABERRATIONS in objective.free and traits.prior_on_aberrations and not traits.estimated
         self.prior_r0: float | None = traits.r0 if turbulent else None  # of the aberrations' prior, at first [m]
@@ -97,6 +101,7 @@ class Solver:
         retrievable = objective.model.pupil.n_rasters == 1 and len(objective.frames) > 1
         self.retrieves: bool = many_ends and schedule.retrievals > 0 and retrievable
         self.end: End = End.of(stack.change, traits, schedule, objective.free)
+        self.given: ObjectPrior = objective.prior
         self.judge: Judge = Judge(self.setting, stack, traits, schedule, self.end)
 
     def solve(self, known: Known, start: RestorationResult | None = None, file: Checkpoint | None = None) -> Progress:
@@ -117,7 +122,8 @@ class Solver:
             average_starts(self.objective, ended, self.schedule, self.minimizer, self.callback)
         if self.end is not End.NONE and (ended.starts > 1 or not cut_short):
             how = (self.schedule, self.minimizer, self.callback, self.traits, save_nothing if cut_short else save)
-            self.objective = Finisher(self.setting, *how).finish(self.objective, ended, self.end)
+            given = self.objective.with_changes(prior=self.given)
+            self.objective = Finisher(self.setting, *how).finish(given, ended, self.end)
         return ended
 
     def begin(self, known: Known, start: RestorationResult | None) -> Progress:
@@ -125,7 +131,8 @@ class Solver:
         state = self._first_state(known)
         if start is None:
             first = first_candidates(self.objective, state, self.traits, self.schedule, self.traits.seed)
-            return Progress(first, refinement=self.traits.refinement)
+            rate = math.inf if known.nothing and self.end is End.INTEGRATION else 1.0
+            return Progress(first, refinement=self.traits.refinement, rate=rate)
         warm, n_known = start_from_result(self.objective, state, start, self.unit)
         warm = self.setting.in_motion(warm, self.traits.seed, start.motion)
         self._place(warm)
@@ -140,6 +147,7 @@ class Solver:
     def run(self, progress: Progress, may_start_again: bool, save: Callable[[Progress], None]) -> Progress:
         """Continue until the restoration ends; `save` is called after every segment."""
         while progress.status is Status.RUNNING:
+            self._suit_prior(progress)
             go_on = self._play if progress.candidates.n_each > 1 else self._advance
             go_on(progress)
             if progress.status is not Status.RUNNING:
@@ -159,6 +167,14 @@ class Solver:
         self.objective = self.setting.objective_at(self.objective, state)
         return self.objective
 
+    def _suit_prior(self, progress: Progress) -> None:
+        """Let all starts of a faint search have the prior that suits the object of the first, once it is sharp."""
+        is_sharp = progress.starts == 1 and progress.iterations >= max(self.schedule.sharp_after, 1)
+        if is_sharp and math.isinf(progress.rate):
+            progress.rate = rate_of_slopes(progress.state.image) or math.inf
+        if progress.rate < 1:
+            self.objective = self.objective.with_changes(prior=self.given.in_search(progress.rate))
+
     def _look_at_place(self, progress: Progress) -> None:
         """Decide whether to refine the mask's geometry, once the object is sharp enough to show an error in it."""
         if progress.refinement is Refinement.IF_SEEN and progress.iterations >= self.schedule.sharp_after:
@@ -167,8 +183,7 @@ class Solver:
 
     def _first_state(self, known: Known) -> State:
         z = expected_parameters(self.objective, known.coefficients)
-        weight = 1.0 if self.traits.prior_on_aberrations or self.traits.estimated else 0.0
-        return first_state(self.objective, z, known.object, self.first_inflation, weight)
+        return first_state(self.objective, z, known.object, self.first_inflation, self.traits.aberration_weight)
 
     def _play(self, progress: Progress) -> None:
         """Play one stage of the tournament; end the tournament if no iterations are left."""
@@ -181,7 +196,7 @@ class Solver:
             lambda objective, state: self._descend(progress, objective, state, n_iterations),
             lambda objective, state: self._recalibrate(objective, state, sharpen=False),
         )
-        progress.status = self._limit(progress)
+        progress.status = progress.limit(*self._limits)
         if progress.status is not Status.RUNNING:
             played = Candidates(played.state.of_frames(slice(len(self.objective.frames))), 1)
         progress.candidates = played
@@ -201,10 +216,10 @@ class Solver:
         is_still = distance(place, state.geometry) < schedule.still
         at_rest = is_still and self.judge.is_at_rest(objective, progress, decrease)
         self._look_at_place(progress)
-        if self.judge.gives_up(objective, progress, is_twin=self._is_twin(progress)):
+        if self.judge.gives_up(objective, progress):
             progress.status = Status.GIVEN_UP
             return
-        goes_on = (limit := self._limit(progress)) is Status.RUNNING
+        goes_on = (limit := progress.limit(*self._limits)) is Status.RUNNING
         if goes_on and Free.ABERRATIONS in objective.free and progress.escapes < schedule.escapes:
             moved_nothing = progress.iterations == done
             if moved_nothing or Free.OBJECT not in objective.free or progress.iterations >= schedule.sharp_after:
@@ -219,20 +234,6 @@ class Solver:
         if goes_on and (at_rest or progress.iterations >= schedule.sharp_after):
             progress.state = self.setting.in_motion(progress.state, self.traits.seed)
 
-    def _is_twin(self, progress: Progress) -> bool:
-        """Return whether the present start is from a twin: those of a mask are, but for its first and few others."""
-        return not self.traits.many_minima and (progress.starts - 1) % (self.schedule.twins + 1) > 0
-
-    def _limit(self, progress: Progress) -> Status:
-        """Return which limit on iterations has been reached, or RUNNING."""
-        if len(progress.costs) >= self.traits.max_iterations:
-            return Status.ITERATION_LIMIT
-        return Status.RUNNING if progress.iterations < self.schedule.start_iterations else Status.START_LIMIT
-
-    def _last_iteration(self, progress: Progress) -> int:
-        """Return the number of the present start's last iteration, counted over all starts."""
-        return min(progress.began + self.schedule.start_iterations, self.traits.max_iterations)
-
     def _descend(self, progress: Progress, objective: MyopicObjective, state: State, n_iterations: int) -> State:
         n_each = progress.candidates.n_each
 
@@ -243,7 +244,7 @@ class Solver:
 
         if progress.refinement is Refinement.ON and progress.iterations:  # the first blurred object does not show it
             objective = objective.with_changes(free=objective.free | Free.PLACE)
-        left = self._last_iteration(progress) - len(progress.costs)
+        left = progress.last_iteration(*self._limits) - len(progress.costs)
         return descend(objective, state, min(n_iterations, left), self.minimizer, listen)
 
     def _recalibrate(self, objective: MyopicObjective, state: State, *, sharpen: bool) -> State:
@@ -280,7 +281,7 @@ class Solver:
     def _start_again(self, progress: Progress, best: Ending) -> None:
         progress.start_again(best)
         seed, state = self.traits.seed + progress.starts - 1, best.state
-        if self._is_twin(progress):
+        if self.judge.is_twin(progress.starts):
             progress.candidates = Candidates(twin_of(self._place(state), state, self.first_inflation, seed), 1)
         else:
             objective = self._place(replace(state, modes=Modes.STILL))
@@ -290,9 +291,9 @@ class Solver:
     def _report(self, progress: Progress, variables: Variables) -> None:
         if self.callback is None:
             return
-        step, arrays = len(progress.costs), {}
+        step, last, arrays = len(progress.costs), progress.last_iteration(*self._limits), {}
         if step == 1 or step % 10 == 0:
             image, z = variables()
             coefficients = self.objective.model.aberrations.coefficients(z[: len(self.objective.frames)])
             arrays = {"object": self.objective.model.window.crop(image) * self.unit, "coefficients": coefficients}
-        self.callback(Record("restoration", step, self._last_iteration(progress), {"cost": progress.costs[-1]}, arrays))
+        self.callback(Record("restoration", step, last, {"cost": progress.costs[-1]}, arrays))

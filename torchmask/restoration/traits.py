@@ -102,6 +102,11 @@ class Traits:
     exposure_tau0: float = 0.0
 
     @property
+    def aberration_weight(self) -> float:
+        """Weight of the aberrations' prior at first: 0 without one."""
+        return 1.0 if self.prior_on_aberrations or self.estimated else 0.0
+
+    @property
     def fit_power(self) -> int:
         """Power of their residual variance by which frames are weighted once the object has been found.
 
