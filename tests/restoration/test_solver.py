@@ -481,12 +481,16 @@ def test_a_faint_search_has_the_prior_that_suits_its_first_sharp_object(options,
     assert (progress.rate < 1) == (expected != [2.0] * len(expected))
 
 
-def test_an_object_without_slopes_leaves_the_prior_of_a_faint_search(explained, monkeypatch):
-    """Until another segment finds some."""
+@pytest.mark.parametrize(
+    ("rates", "expected"),
+    [([0.9, 0.0, 0.5, 0.1, 0.1, 0.1], [2.0, 2.0, 2.0, 1.0, 1.0, 1.0]), (4 * [0.0] + 4 * [0.1], 8 * [2.0])],
+)
+def test_an_object_without_slopes_leaves_the_prior_of_a_faint_search(rates, expected, explained, monkeypatch):
+    """Until another segment of the first start finds some; later starts are to be compared with that one."""
     objective, truth = explained
-    course = Course(monkeypatch, truth, [0.9, 0.0, 0.5, 0.1, 0.1, 0.1])
-    course.solve(objective.with_changes(prior=TotalVariation(2.0)))
-    assert course.weights == pytest.approx([2.0, 2.0, 2.0, 1.0, 1.0, 1.0], rel=1e-9)
+    course = Course(monkeypatch, truth, rates)
+    course.solve(objective.with_changes(prior=TotalVariation(2.0)), max_iterations=2 * len(rates))
+    assert course.weights == pytest.approx(expected, rel=1e-9)
 
 
 def test_a_faint_search_from_a_sensors_estimate_keeps_the_given_prior(explained, monkeypatch):
