@@ -10,6 +10,7 @@ import torch
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture
+from torchmask.optics.band import Band
 from torchmask.record import Record
 from torchmask.restoration import solver
 from torchmask.restoration.calibration import calibrate, fit_of_frames, recalibrate, sharpen_noise_inflation
@@ -491,6 +492,15 @@ def test_an_object_without_slopes_leaves_the_prior_of_a_faint_search(rates, expe
     course = Course(monkeypatch, truth, rates)
     course.solve(objective.with_changes(prior=TotalVariation(2.0)), max_iterations=2 * len(rates))
     assert course.weights == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_faint_search_in_a_band_keeps_the_given_prior(five_holes, explain, monkeypatch):
+    grid = Grid.nyquist(1.0, 550e-9, 32, oversampling=1.2)
+    for colours, last in (([550e-9], 0.5), ([520e-9, 580e-9], 2.0)):
+        objective, truth = explain(ExposureModel(five_holes, grid, 3, Band.of(colours)))
+        course = Course(monkeypatch, truth, 4 * [0.1])
+        course.solve(objective.with_changes(prior=TotalVariation(2.0)), max_iterations=8)
+        assert course.weights == [2.0, 2.0, last, last]
 
 
 def test_a_faint_search_from_a_sensors_estimate_keeps_the_given_prior(explained, monkeypatch):

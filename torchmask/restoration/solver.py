@@ -131,7 +131,8 @@ class Solver:
         state = self._first_state(known)
         if start is None:
             first = first_candidates(self.objective, state, self.traits, self.schedule, self.traits.seed)
-            rate = math.inf if known.nothing and self.end is End.INTEGRATION else 1.0
+            narrow = self.objective.model.pupil.n_rasters == 1  # in a band a lighter prior has lost stacks
+            rate = math.inf if narrow and known.nothing and self.end is End.INTEGRATION else 1.0
             return Progress(first, refinement=self.traits.refinement, rate=rate)
         warm, n_known = start_from_result(self.objective, state, start, self.unit)
         warm = self.setting.in_motion(warm, self.traits.seed, start.motion)
