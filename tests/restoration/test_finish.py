@@ -198,12 +198,11 @@ def test_a_search_under_a_lighter_prior_descends_under_the_given_one_again(
         course.extend([objective.prior, state.image])
         return state, 0
 
-    monkeypatch.setattr(finish, "descend", descend)
-
     def recalibrate(objective, state, power, **more):
         course.append("recalibrated")
         return state
 
+    monkeypatch.setattr(finish, "descend", descend)
     monkeypatch.setattr(finish, "recalibrate", recalibrate)
     monkeypatch.setattr(finish, "integrate_aberrations", integrate)
     schedule = Schedule(faint_segments=3, segment=4)
