@@ -534,7 +534,7 @@ def test_what_a_sensor_has_measured_is_not_retrieved(traits, calls, explained, m
 def test_a_search_that_is_cut_short_has_an_end_once_a_start_was_whole(observe, five_holes, tmp_path):
     """And leaves a file from which the search goes on if it may have more iterations."""
     seen = observe(n_frames=2, shape=(32, 32))
-    missed = {"chance": -1e9, "starts": 3, "doubtful_starts": 3, "faint": 0.0, "glance": 10**6, "escapes": 0}
+    missed = {"chance": -1e9, "starts": 3, "faint": 0.0, "glance": 10**6, "escapes": 0}
     schedule = Schedule(start_iterations=20, segment=10, sharp_after=15, last_segments=1, last_modes=8, **missed)
 
     def restore(max_iterations, checkpoint=None):

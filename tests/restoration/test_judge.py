@@ -133,20 +133,23 @@ def test_the_likelier_of_two_starts_is_kept(explain):
 
 
 def test_faint_frames_get_several_starts_though_they_are_explained(explain):
-    """Their chi-square does not tell a wrong object; in bright frames it does."""
+    """However many bring nothing better, which their chi-square does not tell; in bright frames it does."""
     objective, state = explain(noise=0.003)
-    ending, schedule = Ending(state, Status.CONVERGED), Schedule(faint_starts=4)
-    starts = []
-    for end in (End.LAST_DESCENT, End.INTEGRATION):
+    ending, schedule = Ending(state, Status.CONVERGED), Schedule(faint_starts=4, starts=9, in_vain=2)
+
+    def last_start(end, in_vain):
         judge = Judge(Setting.of(objective), stack_of(objective), TRAITS, schedule, end)
         verdict = judge.verdict(objective, ending)
         assert verdict.explained
-        starts.append(judge.most_starts(verdict))
-    assert starts == [1, 4]
+        begun = (Progress(Candidates(state, 1), starts=n, in_vain=in_vain) for n in range(1, 20))
+        return next(progress.starts for progress in begun if not judge.wants_another(verdict, progress))
+
+    assert [last_start(End.INTEGRATION, in_vain) for in_vain in (0, 2)] == [4, 4]
+    assert [last_start(End.LAST_DESCENT, in_vain) for in_vain in (0, 2)] == [9, 1]
 
 
 def test_a_start_in_faint_frames_is_given_up_where_it_costs_much_more(explain):
-    """By the cost for each aberration, with the noise as given; in bright frames by what it leaves."""
+    """By the cost for each aberration, with the noise as given; in bright frames by a fraction."""
     objective, state = explain(noise=0.003)
     worse = replace(state, z=0.5 * state.z)
     costs = [float(objective.value_and_gradients(s.image, s.z, s.calibration).value) for s in (worse, state)]
@@ -154,7 +157,7 @@ def test_a_start_in_faint_frames_is_given_up_where_it_costs_much_more(explain):
     assert above > 0
 
     def given_up(hopeless, end=End.INTEGRATION, iterations=300, rival=state, starts=1):
-        schedule = Schedule(hopeless=hopeless, promising=0.0)
+        schedule = Schedule(hopeless=hopeless, near=math.inf)
         judge = Judge(Setting.of(objective), stack_of(objective), TRAITS, schedule, end)
         before = None if rival is None else Ending(rival, Status.CONVERGED)
         now = Candidates(worse.with_noise_inflation(3.0), 1)
@@ -163,10 +166,49 @@ def test_a_start_in_faint_frames_is_given_up_where_it_costs_much_more(explain):
     assert given_up(0.999 * above)
     assert not given_up(1.001 * above)
     assert not given_up(0.0, End.LAST_DESCENT)
-    assert given_up(math.inf, End.LAST_DESCENT, starts=2)
+    assert not given_up(0.0, End.LAST_DESCENT, starts=2)
     assert not given_up(math.inf, starts=2)
     assert not given_up(0.0, iterations=299)
     assert not given_up(0.0, rival=None)
+
+
+@pytest.mark.parametrize("end", [End.LAST_DESCENT, End.BOTH, End.NONE])
+def test_a_twin_of_an_explained_mask_has_to_be_near_and_then_clearly_better(end, explain):
+    """By fractions of what the best so far costs beyond noise, which is half of the number of pixels."""
+    objective, state = explain(noise=0.003)
+
+    def beyond_noise(state):
+        noise = 0.5 * objective.frames.numel()
+        return float(objective.value_and_gradients(state.image, state.z, state.calibration).value) - noise
+
+    other = replace(state, z=0.999 * state.z)
+    low, high = sorted((state, other), key=beyond_noise)
+    above, part = beyond_noise(high) / beyond_noise(low) - 1, 1 - beyond_noise(low) / beyond_noise(high)
+    assert 0 < part < above
+
+    def judge_of(**numbers):
+        return Judge(Setting.of(objective), stack_of(objective), TRAITS, Schedule(**numbers), end)
+
+    def given_up(near, explained=True, **numbers):
+        judge, now = judge_of(near=near, **numbers), Candidates(high.with_noise_inflation(3.0), 1)
+        rival = Ending(low, Status.CONVERGED)
+        assert judge.verdict(objective, rival).explained is explained
+        return judge.gives_up(objective, Progress(now, 300 * [1.0], starts=5, rival=rival))
+
+    def replaces(better, now, rival, **numbers):
+        now, rival = (Ending(ending, Status.CONVERGED) for ending in (now, rival))
+        return judge_of(better=better, **numbers).compare(objective, now, rival).best is now
+
+    assert given_up(0.99 * above)
+    assert not given_up(1.01 * above)
+    assert replaces(0.99 * part, low, high)
+    assert not replaces(1.01 * part, low, high)
+    assert not replaces(0.0, high, low)
+    # where the frames are not explained, the residual tells, and the fifth start is from random aberrations
+    missed = {"chance": -1e9}
+    assert not given_up(0.0, explained=False, **missed)
+    left = [judge_of().verdict(objective, Ending(ending, Status.CONVERGED)).excess for ending in (low, high)]
+    assert replaces(math.inf, low, high, **missed) is (left[0] <= left[1])
 
 
 def test_a_start_that_explains_the_frames_ends_when_nearly_at_rest(explain):

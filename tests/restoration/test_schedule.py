@@ -44,7 +44,7 @@ def test_refuses_candidates_that_do_not_halve(candidates):
         ("segment", 0, "a whole number from 1 to inf"),
         ("segment", 2.5, "a whole number from 1 to inf"),
         ("starts", 0, "a whole number from 1 to inf"),
-        ("doubtful_starts", 0, "a whole number from 1 to inf"),
+        ("in_vain", -1, "a whole number from 0 to inf"),
         ("averaged", 0, "a whole number from 1 to inf"),
         ("rounds", 0, "a whole number from 1 to inf"),
         ("renewal", 0, "a whole number from 1 to inf"),

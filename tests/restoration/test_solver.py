@@ -31,7 +31,7 @@ from torchmask.restoration.traits import End, Refinement, Traits
 from torchmask.restoration.verdict import Finding
 
 ALL_MISSED = {"chance": -1e9}  # no fit is good enough
-NONE_MISSED = {"chance": math.inf}
+NONE_MISSED = {"chance": math.inf, "in_vain": 0}  # and none is to be improved
 PLAIN = {"sharp_after": 50, "escapes": 0}  # ends when a segment brings nothing more
 BRISK = {"segment": 5, "sharp_after": 3, "escapes": 0}
 UNIT = 500.0  # electrons
@@ -243,18 +243,54 @@ def test_a_twin_that_is_behind_is_given_up(explained):
         assert (progress.state is rival) is not goes_on
 
 
-def test_a_doubted_fit_gets_few_starts_and_a_missed_one_many(explained):
+def test_a_fit_is_improved_until_that_is_in_vain_and_a_doubted_one_as_long_as_it_may_be(explained):
     """A fit is doubted, though explained, if it leaves more than is expected."""
     objective, truth = explained
-    solver = solver_of(objective)
+    solver = solver_of(objective, schedule=Schedule(in_vain=2, starts=9, glance=300))
     verdict, schedule = solver.judge.verdict(solver.objective, Ending(truth, Status.CONVERGED)), solver.schedule
     noise = verdict.limit - 1 - schedule.model_errors * verdict.model_error
     doubtful = 1 + schedule.doubtful * verdict.model_error + noise
     assert doubtful < verdict.limit
-    for chi_square, n_starts in ((doubtful - 1e-6, 1), (doubtful + 1e-6, schedule.doubtful_starts)):
-        assert solver.judge.most_starts(replace(verdict, chi_square=chi_square)) == n_starts
-    for finding, n_starts in ((Finding.NOT_EXPLAINED, schedule.starts), (Finding.ONLY_NOISE, 1)):
-        assert solver.judge.most_starts(replace(verdict, finding=finding)) == n_starts
+    sure, doubted = (replace(verdict, chi_square=doubtful + change) for change in (-1e-6, 1e-6))
+    missed, noise = (replace(verdict, finding=finding) for finding in (Finding.NOT_EXPLAINED, Finding.ONLY_NOISE))
+
+    def again(verdict, in_vain=0, starts=1, n_iterations=0):
+        progress = Progress(Candidates(truth, 1), n_iterations * [1.0], starts=starts, in_vain=in_vain)
+        return solver.judge.wants_another(verdict, progress)
+
+    assert [again(sure, in_vain, 8) for in_vain in (0, 1, 2)] == [True, True, False]
+    assert [again(verdict, 7, 8) for verdict in (sure, doubted, missed, noise)] == [False, True, True, False]
+    assert not any(again(verdict, 0, 9) for verdict in (sure, doubted, missed))
+    assert not again(noise)
+    # of 1000 iterations
+    assert [again(sure, n_iterations=done) for done in (700, 701)] == [True, False]
+    assert [again(missed, n_iterations=done) for done in (999, 1000)] == [True, False]
+
+
+def test_twins_of_an_explained_mask_follow_until_two_are_in_vain(explained, monkeypatch):
+    """Each that is better by some percent begins the count anew, and is what the next twins are of."""
+    objective, truth = explained
+    scales = iter([0.9, 0.5, 0.95, 0.9, 1.0, 1.0, 0.97, 1.0])  # of the true object's brightness
+    begun, ends = [], []
+
+    def twin(objective, state, inflation, seed):
+        begun.append(state)
+        return replace(truth, image=next(scales) * truth.image)
+
+    def stay(self, progress):
+        progress.costs.append(1.0)
+        progress.status = Status.CONVERGED
+        ends.append(progress.state)
+
+    monkeypatch.setattr(solver, "twin_of", twin)
+    monkeypatch.setattr(Solver, "_advance", stay)
+    schedule = Schedule(sharp_after=0, in_vain=2, better=0.04, doubtful=math.inf, chance=math.inf, starts=9)
+    first = Progress(Candidates(replace(truth, image=0.8 * truth.image), 1))
+    progress = solver_of(objective, schedule=schedule).run(first, True, lambda _: None)
+    # 0.8; 0.9 is better; 0.5 is worse; 0.95 is better; 0.9 is worse; 1.0 is better; then two in vain
+    assert progress.starts == 8
+    assert progress.state is ends[5]
+    assert [next(n for n, end in enumerate(ends) if end is state) for state in begun] == [0, 1, 1, 3, 3, 5, 5]
 
 
 def test_a_start_too_short_to_tell_is_not_judged(explained):
@@ -595,7 +631,7 @@ def test_a_descent_at_rest_comes_to_an_end(observation):
 @pytest.mark.slow
 def test_a_missed_object_gets_a_second_start(observation, restoring, tmp_path):
     """Here nothing is missed, so the thresholds are lowered: the better of both is kept, resumed or not."""
-    once = restoring(schedule=Schedule(start_iterations=400)).restore(observation.frames)
+    once = restoring(schedule=Schedule(start_iterations=400, in_vain=0)).restore(observation.frames)
     assert len(once.cost) <= 400
     method = restoring(schedule=Schedule(start_iterations=400, alike=-1.0, starts=2, **ALL_MISSED))
     twice = method.restore(observation.frames)
@@ -620,7 +656,7 @@ def test_a_missed_object_gets_a_second_start(observation, restoring, tmp_path):
 @pytest.mark.slow
 def test_noise_alone_is_no_reason_for_another_start(observe, restoring):
     """In faint frames it is more than the share of the change from frame to frame that a good fit may leave."""
-    faint, brief = observe(n_frames=4, n_photons=1e3, seed=2), {"starts": 2, "faint": 0.0} | PLAIN
+    faint, brief = observe(n_frames=4, n_photons=1e3, seed=2), {"starts": 2, "in_vain": 0, "faint": 0.0} | PLAIN
     method = restoring(3, tolerance=0.01, schedule=Schedule(**brief))
     assert "starts" not in method.restore(faint.frames).message
     method = restoring(3, tolerance=0.01, schedule=Schedule(chance=0.0, **brief))

@@ -63,6 +63,7 @@ class Progress:
     began : number of iterations before the present start
     rival : final state of the best earlier start
     explained : final states of the starts that explain the frames, if the mean of several objects is wanted
+    in_vain : number of starts since the best one
     alike : whether the last two starts ended in the same result
     refinement : whether the position of the mask is fitted too, or will be if the frames require it
     finer : state of the last descent, which may have more modes; None before it
@@ -85,6 +86,7 @@ class Progress:
     began: int = 0
     rival: Ending | None = None
     explained: tuple[Ending, ...] = ()
+    in_vain: int = 0
     alike: bool = False
     refinement: Refinement = Refinement.OFF
     finer: State | None = None
@@ -150,6 +152,7 @@ _NUMBERS = (
     "escapes",
     "starts",
     "began",
+    "in_vain",
     "alike",
     "last_segments",
     "averaged",

@@ -67,8 +67,9 @@ class Judge:
     def compare(self, objective: MyopicObjective, now: Ending, rival: Ending | None) -> Comparison:
         """Compare the present ending with the best of the earlier ones, if there is one.
 
-        The better one has the smaller residual. In faint frames it is the earlier one, unless the later one alone
-        explains them, or is clearly likelier and no less explained.
+        The better one has the smaller residual. Where the earlier one explains the frames of a mask, it is that, unless
+        the later one costs clearly less; in faint frames unless it alone explains them, or costs clearly less and is no
+        less explained.
         """
         after = self.verdict(objective, now)
         if rival is None:
@@ -77,10 +78,10 @@ class Judge:
         if now.status is Status.GIVEN_UP:
             return Comparison(rival, before, after, alike=False)
         stays = before.excess < after.excess
-        if self.end is End.INTEGRATION:  # the residual does not tell, nor do costs that are close
-            lower = self._cost(objective, rival.state) - self._cost(objective, now.state)
-            alone = before.explained is not after.explained
-            stays = before.explained if alone else lower <= self.schedule.likelier
+        if self.end is End.INTEGRATION and before.explained is not after.explained:
+            stays = before.explained
+        elif self.end is End.INTEGRATION or (before.explained and not self.traits.many_minima):
+            stays = not self._costs_less(objective, now, rival)
         best, verdict = (rival, before) if stays else (now, after)
         near = self.schedule.alike * max(verdict.excess, verdict.limit - 1)
         # Starts of a mask end alike at a wrong twin too, which is no reason to stop.
@@ -93,53 +94,78 @@ class Judge:
             return self.schedule.starts
         if not verdict.explained or self.traits.many_minima:
             return 1
-        if self.end is End.INTEGRATION:
-            return self.schedule.faint_starts
+        return self.schedule.faint_starts if self.end is End.INTEGRATION else self.schedule.starts
+
+    def wants_another(self, verdict: Verdict, progress: Progress) -> bool:
+        """Return whether to start again if this is the verdict on the best start, and iterations are left for it."""
+        if progress.explained:
+            again, needed = len(progress.explained) < self.schedule.averaged, self.schedule.start_iterations
+        else:
+            again = progress.starts < self.most_starts(verdict) and not progress.alike
+            if self._may_improve(verdict) and not self._is_doubted(verdict):
+                again &= progress.in_vain < self.schedule.in_vain
+            # one that could be spared is not begun to be cut short before most are given up
+            needed = self.schedule.glance if verdict.explained else 1
+        return again and len(progress.costs) + needed <= self.traits.max_iterations
+
+    def _may_improve(self, verdict: Verdict) -> bool:
+        """Return whether twins follow though the best start explains the frames: of a mask, unless they are faint."""
+        return verdict.explained and not self.traits.many_minima and self.end is not End.INTEGRATION
+
+    def _is_doubted(self, verdict: Verdict) -> bool:
+        """Return whether a fit that explains the frames leaves more than is expected."""
         noise = verdict.limit - 1 - self.schedule.model_errors * verdict.model_error
-        is_doubtful = verdict.excess - noise > self.schedule.doubtful * verdict.model_error
-        return self.schedule.doubtful_starts if is_doubtful else 1
+        return verdict.excess - noise > self.schedule.doubtful * verdict.model_error
 
     def is_at_rest(self, objective: MyopicObjective, progress: Progress, decrease: float) -> bool:
         """Return whether the present start is at rest, its last segment having lowered the cost by the part `decrease`.
 
-        If it explains a mask's frames beyond doubt and a last descent goes on from it, it need not quite be.
+        If it explains a mask's frames and a last descent goes on from it, it need not quite be.
         """
         if decrease <= self.traits.tolerance:
             return True
         may_be_rough = self.end in (End.LAST_DESCENT, End.BOTH)
         if not may_be_rough or decrease > self.schedule.nearly_at_rest:
             return False
-        verdict = self.verdict(objective, progress.ending)
-        return verdict.explained and self.most_starts(verdict) == 1
+        return self.verdict(objective, progress.ending).explained
 
-    def least_iterations(self, verdict: Verdict) -> int:
-        """Return how many iterations have to be left for another start if this is the verdict on the best.
+    def is_twin(self, start: int, verdict: Verdict) -> bool:
+        """Return whether the start of this number is from a twin, if this is the verdict on the best so far.
 
-        A start that could be spared is not begun to be cut short, but in faint frames most are given up by then.
+        All further starts of a mask are, but for few where frames are faint or not explained.
         """
-        if not verdict.explained:
-            return 1
-        return self.schedule.glance if self.end is End.INTEGRATION else self.schedule.start_iterations + 1
-
-    def is_twin(self, start: int) -> bool:
-        """Return whether the start of this number is from a twin: of a mask, all but the first and few others are."""
-        return not self.traits.many_minima and (start - 1) % (self.schedule.twins + 1) > 0
+        in_turn = (start - 1) % (self.schedule.twins + 1) > 0
+        return not self.traits.many_minima and (in_turn or self._may_improve(verdict))
 
     def gives_up(self, objective: MyopicObjective, progress: Progress) -> bool:
         """Return whether it is time to see that the present start, if from a twin, is not well ahead of the best.
 
-        In faint frames, whose residual does not tell, any start is given up that costs much more than the best.
+        Where that one explains the frames, it need only be near. In faint frames, whose residual does not tell, any
+        start is given up that costs much more than the best.
         """
         if progress.rival is None or progress.iterations != self.schedule.glance:
             return False
         now, best = progress.ending, progress.rival
+        before = self._cost(objective, best.state)
+        above = self._cost(objective, now.state) - before
         if self.end is End.INTEGRATION:
-            above = self._cost(objective, now.state) - self._cost(objective, best.state)
             return above > self.schedule.hopeless * now.state.z.numel()
-        if not self.is_twin(progress.starts):
+        verdict = self.verdict(objective, best)
+        if not self.is_twin(progress.starts, verdict):
             return False
-        left, least = (self.verdict(objective, ending).excess for ending in (now, best))
-        return left >= self.schedule.promising * least
+        if verdict.explained:
+            return above > self.schedule.near * _beyond_noise(before, objective)
+        return self.verdict(objective, now).excess >= self.schedule.promising * verdict.excess
+
+    def _costs_less(self, objective: MyopicObjective, now: Ending, rival: Ending) -> bool:
+        """Return whether a later ending costs so much less than an earlier one that chance does not explain it.
+
+        In bright frames, whose residual is more than noise, that is a fraction of what they cost beyond noise.
+        """
+        least, before = self.schedule.likelier, self._cost(objective, rival.state)
+        if self.end is not End.INTEGRATION:
+            least = self.schedule.better * _beyond_noise(before, objective)
+        return before - self._cost(objective, now.state) > least
 
     def _cost(self, objective: MyopicObjective, state: State) -> float:
         """Return the joint cost of object and aberrations, comparable between starts: with the noise as given.
@@ -166,6 +192,11 @@ class Judge:
     def _left_out(self) -> LeftOut:
         n_modes = self.setting.still.n_modes
         return LeftOut.of(self.setting.told, n_modes, self.traits.r0, self.traits.outer_scale)
+
+
+def _beyond_noise(cost: float, objective: MyopicObjective) -> float:
+    """Return what remains of a cost, at least 0, without that expected of noise: half of the number of pixels."""
+    return max(0.0, cost - 0.5 * float((objective.precision.expand_as(objective.frames) > 0).sum()))
 
 
 def _parameters(objective: MyopicObjective, state: State) -> float:

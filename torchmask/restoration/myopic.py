@@ -89,8 +89,8 @@ class MyopicDeconvolution:
     aberration_prior : bool
         False: leave out 1/2 ||z||^2; z are then the Zernike coefficients themselves.
     max_iterations : int
-        Maximum number over all starts, each of at most 1000. A full pupil gets three, or one if phases are retrieved;
-        faint frames through a mask up to six. Else up to nine are made while none explains the frames.
+        Maximum number over all starts, each of at most 1000. A full pupil gets three, or one if phases are retrieved.
+        Through a mask up to nine are made while they bring more; six in faint frames, if they are explained.
     tolerance : float
         A start has converged when 100 iterations gain less than this part of the cost (see `Schedule.nearly_at_rest`).
     minimizer : Minimizer

@@ -15,7 +15,6 @@ _COUNTS = (
     "segment",
     "start_iterations",
     "starts",
-    "doubtful_starts",
     "faint_starts",
     "averaged",
     "rounds",
@@ -56,14 +55,20 @@ class Schedule:
         of modes beyond the aberration basis
     chance : allowance for chance that is added to this limit, in standard deviations of the stack's chi-square
     missed : for a full pupil, minimum of the allowed excess, as a fraction of the change from frame to frame
-    starts : maximum number of starts, where the object was missed
-    twins : number of further starts of a mask from twins of its object before one from random aberrations
+    starts : maximum number of starts
+    in_vain : a mask whose frames are explained beyond doubt, and not faint, starts until this number of starts in
+        succession, from twins of the best object, have brought nothing better; 0: there is none of these
     doubtful : the fit of a mask is doubted if the excess is larger than this number times that expected
-    doubtful_starts : maximum number of starts of a mask whose fit is explained but doubted
+    better : a later start replaces one that explains the frames of a mask if it costs less by this fraction of what
+        that one costs beyond noise
+    near : such a later start is given up if it costs more than the best so far by more than this fraction
+    twins : where a mask's frames are faint or not explained, number of further starts from twins of its object before
+        one from random aberrations
     faint_starts : maximum number of starts of a mask whose faint frames are explained, of which the likeliest is kept
-    likelier : cost by which a later of these starts has to be lower to replace an earlier one
+    likelier : cost by which a later start in faint frames has to be lower to replace an earlier one
     glance : number of iterations after which a start from a twin, or any later start in faint frames, may be given up
-    promising : a twin is, unless its excess chi-square is below this fraction of that of the best start so far
+    promising : where the best start so far does not explain the frames, a twin is given up unless its excess chi-square
+        is below this fraction of that of the best
     hopeless : a start in faint frames is, if its cost exceeds that of the best so far by more than this for each
         aberration of all frames
     averaged : for a full pupil, number of starts that explain the frames, from the mean of whose objects the end
@@ -125,9 +130,11 @@ class Schedule:
     chance: float = 2.0
     missed: float = 0.0013
     starts: int = 9
-    twins: int = 3
+    in_vain: int = 2
     doubtful: float = 1.0
-    doubtful_starts: int = 3
+    better: float = 0.04
+    near: float = 0.1
+    twins: int = 3
     faint_starts: int = 6
     likelier: float = 50.0
     glance: int = 300
@@ -207,7 +214,6 @@ class Schedule:
             first_inflation=math.inf,
             candidates=(),
             starts=1,
-            doubtful_starts=1,
             faint_starts=1,
             averaged=1,
             faint=0.0,

@@ -6,8 +6,9 @@ turbulence and the noise are updated; the assumed noise falls from the residual 
 to that of the model, if that is larger. Once the object is sharp, frames and object escape from local minima, and in
 faint light the prior suits it; when nothing changes any more, each frame is weighted by how well it fits. A start ends
 when a segment gains nothing, or little if it explains the frames, or its iterations are used up. Then phases of a full
-pupil's bright frames are retrieved. If it missed the object, or frames are faint, others start, from random aberrations
-or twins of the object; the best is kept, or the mean for a full pupil. What follows is told in `finish`.
+pupil's bright frames are retrieved. Others start from random aberrations or, for a mask, from twins of the best object,
+as long as they may find a better one (`judge`); the best is kept, or the mean for a full pupil. What follows is told in
+`finish`.
 """
 
 from __future__ import annotations
@@ -270,11 +271,8 @@ class Solver:
         best, verdict, now, progress.alike = self.judge.compare(self.objective, progress.ending, progress.rival)
         if self.averages and now.explained:
             progress.explained += (progress.ending,)
-        again = progress.starts < self.judge.most_starts(verdict) and not progress.alike
-        needed = self.judge.least_iterations(verdict)
-        if progress.explained:
-            again, needed = len(progress.explained) < self.schedule.averaged, self.schedule.start_iterations
-        if again and len(progress.costs) + needed <= self.traits.max_iterations:
+        progress.in_vain = 0 if best.state is progress.state else progress.in_vain + 1
+        if self.judge.wants_another(verdict, progress):
             self._start_again(progress, best)
         else:
             progress.state, progress.status, progress.decrease = best.state, best.status, best.decrease
@@ -282,7 +280,7 @@ class Solver:
     def _start_again(self, progress: Progress, best: Ending) -> None:
         progress.start_again(best)
         seed, state = self.traits.seed + progress.starts - 1, best.state
-        if self.judge.is_twin(progress.starts):
+        if self.judge.is_twin(progress.starts, self.judge.verdict(self.objective, best)):
             progress.candidates = Candidates(twin_of(self._place(state), state, self.first_inflation, seed), 1)
         else:
             objective = self._place(replace(state, modes=Modes.STILL))

@@ -1,10 +1,11 @@
-"""New starts of a mask that was missed, from the object's twins: other pistons of its holes, the same in all frames.
+"""New starts of a mask from its object's twins: other pistons of its holes, the same in all frames.
 
 The fringes of a mask fix each frame's pistons only up to a set of pistons common to all frames, which the phases of the
 object can take over: if every baseline were a point, the frames could not tell the two apart. That its baselines have a
 width, and that the object is positive and compact, decides between these twins, but a descent that has sharpened the
 wrong one does not leave it, and one from other aberrations of each frame often finds it again. Between the twins there
-is nothing to search but the common pistons, so a new start keeps what each frame has found and draws them anew.
+is nothing to search but the common pistons, so a new start keeps what each frame has found and draws them anew. From
+there a descent also leaves objects that are wrong otherwise, and that a descent under high noise alone finds again.
 """
 
 from __future__ import annotations
