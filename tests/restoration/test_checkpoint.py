@@ -57,6 +57,7 @@ def progress_with(**changes):
         "averaged": 3,
         "retrieved": True,
         "seeks_no_more": True,
+        "in_vain": 1,
         "rate": 0.4,
     }
     return Progress(several(random_state(0), 4), **given | changes)

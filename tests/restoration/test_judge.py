@@ -6,10 +6,12 @@ from dataclasses import replace
 import pytest
 import torch
 
+from torchmask.grid import Grid
 from torchmask.restoration import model_error
 from torchmask.restoration.aberrations import turbulent_basis
 from torchmask.restoration.candidates import Candidates
 from torchmask.restoration.checkpoint import Ending, Progress, Status
+from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.judge import Judge
 from torchmask.restoration.model_error import LeftOut, expected_error, fitted_parameters
@@ -166,7 +168,6 @@ def test_a_start_in_faint_frames_is_given_up_where_it_costs_much_more(explain):
     assert given_up(0.999 * above)
     assert not given_up(1.001 * above)
     assert not given_up(0.0, End.LAST_DESCENT)
-    assert not given_up(0.0, End.LAST_DESCENT, starts=2)
     assert not given_up(math.inf, starts=2)
     assert not given_up(0.0, iterations=299)
     assert not given_up(0.0, rival=None)
@@ -186,8 +187,9 @@ def test_a_twin_of_an_explained_mask_has_to_be_near_and_then_clearly_better(end,
     above, part = beyond_noise(high) / beyond_noise(low) - 1, 1 - beyond_noise(low) / beyond_noise(high)
     assert 0 < part < above
 
-    def judge_of(**numbers):
-        return Judge(Setting.of(objective), stack_of(objective), TRAITS, Schedule(**numbers), end)
+    def judge_of(nearly_at_rest=0.0, **numbers):
+        schedule = Schedule(nearly_at_rest=nearly_at_rest, **numbers)
+        return Judge(Setting.of(objective), stack_of(objective), TRAITS, schedule, end)
 
     def given_up(near, explained=True, **numbers):
         judge, now = judge_of(near=near, **numbers), Candidates(high.with_noise_inflation(3.0), 1)
@@ -204,11 +206,50 @@ def test_a_twin_of_an_explained_mask_has_to_be_near_and_then_clearly_better(end,
     assert replaces(0.99 * part, low, high)
     assert not replaces(1.01 * part, low, high)
     assert not replaces(0.0, high, low)
+    # starts may end before they are at rest, by so much of the whole cost
+    costs = [beyond_noise(ending) + 0.5 * objective.frames.numel() for ending in (low, high)]
+    assert given_up(0.0, nearly_at_rest=0.99 * (costs[1] - costs[0]) / costs[0])
+    assert not given_up(0.0, nearly_at_rest=1.01 * (costs[1] - costs[0]) / costs[0])
+    assert replaces(0.0, low, high, nearly_at_rest=0.99 * (costs[1] - costs[0]) / costs[1])
+    assert not replaces(0.0, low, high, nearly_at_rest=1.01 * (costs[1] - costs[0]) / costs[1])
     # where the frames are not explained, the residual tells, and the fifth start is from random aberrations
     missed = {"chance": -1e9}
     assert not given_up(0.0, explained=False, **missed)
     left = [judge_of().verdict(objective, Ending(ending, Status.CONVERGED)).excess for ending in (low, high)]
     assert replaces(math.inf, low, high, **missed) is (left[0] <= left[1])
+
+
+def test_a_start_that_explains_a_masks_frames_is_replaced_by_none_that_does_not(explain):
+    """Even if that costs less; through a full pupil the residual tells."""
+    objective, state = explain(noise=0.003)
+    dear = replace(state, image=0.99 * state.image)
+    cheap, explains = Ending(state, Status.CONVERGED), Ending(dear, Status.CONVERGED)
+    schedule = Schedule(better=0.0, nearly_at_rest=0.0, chance=math.inf)
+
+    def best(**options):
+        judge = Judge(Setting.of(objective), stack_of(objective), replace(TRAITS, **options), schedule)
+        assert judge.compare(objective, cheap, explains).best is cheap  # as long as both explain the frames
+        told = judge.verdict(objective, cheap)
+        judge._given[id(cheap.state), True] = cheap.state, replace(told, finding=Finding.NOT_EXPLAINED)
+        assert judge.verdict(objective, explains).explained
+        return judge.compare(objective, cheap, explains).best
+
+    assert best() is explains
+    assert best(many_minima=True) is cheap
+
+
+def test_a_mask_of_three_holes_has_no_twins(explain, three_holes):
+    """Their common pistons are a tilt, which shifts the object."""
+    for aperture, again in ((three_holes, False), (None, True)):
+        model = None
+        if aperture is not None:
+            basis = turbulent_basis(aperture, 3, 0, 0.25, 20.0)
+            model = ExposureModel(aperture, Grid.nyquist(1.0, 550e-9, 32, oversampling=1.2), basis)
+        objective, state = explain(model, noise=0.003)
+        judge = Judge(Setting.of(objective), stack_of(objective), TRAITS, Schedule(chance=math.inf))
+        verdict = judge.verdict(objective, Ending(state, Status.CONVERGED))
+        assert verdict.explained
+        assert judge.wants_another(verdict, Progress(Candidates(state, 1))) is again
 
 
 def test_a_start_that_explains_the_frames_ends_when_nearly_at_rest(explain):

@@ -252,25 +252,25 @@ def test_a_fit_is_improved_until_that_is_in_vain_and_a_doubted_one_as_long_as_it
     doubtful = 1 + schedule.doubtful * verdict.model_error + noise
     assert doubtful < verdict.limit
     sure, doubted = (replace(verdict, chi_square=doubtful + change) for change in (-1e-6, 1e-6))
-    missed, noise = (replace(verdict, finding=finding) for finding in (Finding.NOT_EXPLAINED, Finding.ONLY_NOISE))
+    missed, nothing = (replace(verdict, finding=finding) for finding in (Finding.NOT_EXPLAINED, Finding.ONLY_NOISE))
 
     def again(verdict, in_vain=0, starts=1, n_iterations=0):
         progress = Progress(Candidates(truth, 1), n_iterations * [1.0], starts=starts, in_vain=in_vain)
         return solver.judge.wants_another(verdict, progress)
 
     assert [again(sure, in_vain, 8) for in_vain in (0, 1, 2)] == [True, True, False]
-    assert [again(verdict, 7, 8) for verdict in (sure, doubted, missed, noise)] == [False, True, True, False]
+    assert [again(verdict, 7, 8) for verdict in (sure, doubted, missed, nothing)] == [False, True, True, False]
     assert not any(again(verdict, 0, 9) for verdict in (sure, doubted, missed))
-    assert not again(noise)
+    assert not again(nothing)
     # of 1000 iterations
-    assert [again(sure, n_iterations=done) for done in (700, 701)] == [True, False]
+    assert [again(sure, n_iterations=done) for done in (699, 700)] == [True, False]
     assert [again(missed, n_iterations=done) for done in (999, 1000)] == [True, False]
 
 
 def test_twins_of_an_explained_mask_follow_until_two_are_in_vain(explained, monkeypatch):
     """Each that is better by some percent begins the count anew, and is what the next twins are of."""
     objective, truth = explained
-    scales = iter([0.9, 0.5, 0.95, 0.9, 1.0, 1.0, 0.97, 1.0])  # of the true object's brightness
+    scales = iter([0.9, 0.5, 0.95, 0.9, 1.0, 1.0, 1.01])  # of the true object's brightness
     begun, ends = [], []
 
     def twin(objective, state, inflation, seed):
@@ -279,7 +279,7 @@ def test_twins_of_an_explained_mask_follow_until_two_are_in_vain(explained, monk
 
     def stay(self, progress):
         progress.costs.append(1.0)
-        progress.status = Status.CONVERGED
+        progress.status = Status.GIVEN_UP if len(ends) == 7 else Status.CONVERGED
         ends.append(progress.state)
 
     monkeypatch.setattr(solver, "twin_of", twin)
@@ -287,7 +287,7 @@ def test_twins_of_an_explained_mask_follow_until_two_are_in_vain(explained, monk
     schedule = Schedule(sharp_after=0, in_vain=2, better=0.04, doubtful=math.inf, chance=math.inf, starts=9)
     first = Progress(Candidates(replace(truth, image=0.8 * truth.image), 1))
     progress = solver_of(objective, schedule=schedule).run(first, True, lambda _: None)
-    # 0.8; 0.9 is better; 0.5 is worse; 0.95 is better; 0.9 is worse; 1.0 is better; then two in vain
+    # 0.8; 0.9 is better; 0.5 is worse; 0.95 is better; 0.9 is worse; 1.0 is better; one is no better, one is given up
     assert progress.starts == 8
     assert progress.state is ends[5]
     assert [next(n for n, end in enumerate(ends) if end is state) for state in begun] == [0, 1, 1, 3, 3, 5, 5]
@@ -570,7 +570,7 @@ def test_a_faint_search_goes_on_under_the_prior_that_its_file_tells(explained, m
 
 
 @pytest.mark.parametrize(
-    ("max_iterations", "n_starts", "n_iterations"), [(1000, 6, 30), (13, 3, 13), (12, 2, 10), (8, 2, 8), (7, 1, 5)]
+    ("max_iterations", "n_starts", "n_iterations"), [(1000, 6, 30), (14, 3, 14), (13, 2, 10), (9, 2, 9), (8, 1, 5)]
 )
 def test_faint_frames_get_starts_that_can_be_judged(max_iterations, n_starts, n_iterations, explained):
     """As many as there is time to see whether they are hopeless, the last of which may be cut short."""

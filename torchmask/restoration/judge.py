@@ -39,6 +39,7 @@ class Judge:
         self.traits: Traits = traits
         self.schedule: Schedule = schedule
         self.end: End = end
+        self.has_twins: bool = setting.still.n_subapertures > 3  # common pistons of three holes are a tilt
         self.contrast: float = stack.contrast
         self.noise: FrameNoise = stack.noise_of_frames
         self.tolerance: Tolerance = Tolerance(schedule.model_errors, schedule.chance, least)
@@ -67,9 +68,8 @@ class Judge:
     def compare(self, objective: MyopicObjective, now: Ending, rival: Ending | None) -> Comparison:
         """Compare the present ending with the best of the earlier ones, if there is one.
 
-        The better one has the smaller residual. Where the earlier one explains the frames of a mask, it is that, unless
-        the later one costs clearly less; in faint frames unless it alone explains them, or costs clearly less and is no
-        less explained.
+        The better one has the smaller residual. Where the earlier one explains a mask's frames, or these are faint, it
+        is that, unless the later one alone explains them, or costs clearly less and is no less explained.
         """
         after = self.verdict(objective, now)
         if rival is None:
@@ -78,10 +78,9 @@ class Judge:
         if now.status is Status.GIVEN_UP:
             return Comparison(rival, before, after, alike=False)
         stays = before.excess < after.excess
-        if self.end is End.INTEGRATION and before.explained is not after.explained:
-            stays = before.explained
-        elif self.end is End.INTEGRATION or (before.explained and not self.traits.many_minima):
-            stays = not self._costs_less(objective, now, rival)
+        if self.end is End.INTEGRATION or self._follows_twins(before):
+            alone = before.explained is not after.explained
+            stays = before.explained if alone else not self._costs_less(objective, now, rival)
         best, verdict = (rival, before) if stays else (now, after)
         near = self.schedule.alike * max(verdict.excess, verdict.limit - 1)
         # Starts of a mask end alike at a wrong twin too, which is no reason to stop.
@@ -98,18 +97,19 @@ class Judge:
 
     def wants_another(self, verdict: Verdict, progress: Progress) -> bool:
         """Return whether to start again if this is the verdict on the best start, and iterations are left for it."""
+        left = self.traits.max_iterations - len(progress.costs)
         if progress.explained:
-            again, needed = len(progress.explained) < self.schedule.averaged, self.schedule.start_iterations
-        else:
-            again = progress.starts < self.most_starts(verdict) and not progress.alike
-            if self._may_improve(verdict) and not self._is_doubted(verdict):
-                again &= progress.in_vain < self.schedule.in_vain
-            # one that could be spared is not begun to be cut short before most are given up
-            needed = self.schedule.glance if verdict.explained else 1
-        return again and len(progress.costs) + needed <= self.traits.max_iterations
+            return len(progress.explained) < self.schedule.averaged and left >= self.schedule.start_iterations
+        if progress.alike or progress.starts >= self.most_starts(verdict):
+            return False
+        is_sure = self._follows_twins(verdict) and not self._is_doubted(verdict)
+        if is_sure and (progress.in_vain >= self.schedule.in_vain or not self.has_twins):
+            return False
+        # one that could be spared is not begun to be cut short before most are given up
+        return left > (self.schedule.glance if verdict.explained else 0)
 
-    def _may_improve(self, verdict: Verdict) -> bool:
-        """Return whether twins follow though the best start explains the frames: of a mask, unless they are faint."""
+    def _follows_twins(self, verdict: Verdict) -> bool:
+        """Return whether twins may improve on a start that explains the frames: of a mask, unless they are faint."""
         return verdict.explained and not self.traits.many_minima and self.end is not End.INTEGRATION
 
     def _is_doubted(self, verdict: Verdict) -> bool:
@@ -132,40 +132,45 @@ class Judge:
     def is_twin(self, start: int, verdict: Verdict) -> bool:
         """Return whether the start of this number is from a twin, if this is the verdict on the best so far.
 
-        All further starts of a mask are, but for few where frames are faint or not explained.
+        All further starts of a mask are, but where frames are faint or not explained some are from random aberrations.
         """
         in_turn = (start - 1) % (self.schedule.twins + 1) > 0
-        return not self.traits.many_minima and (in_turn or self._may_improve(verdict))
+        return not self.traits.many_minima and (in_turn or self._follows_twins(verdict))
 
     def gives_up(self, objective: MyopicObjective, progress: Progress) -> bool:
-        """Return whether it is time to see that the present start, if from a twin, is not well ahead of the best.
+        """Return whether it is time to give up the present start, if it is from a twin: after some iterations.
 
-        Where that one explains the frames, it need only be near. In faint frames, whose residual does not tell, any
-        start is given up that costs much more than the best.
+        It is, unless it is near the best start, if that explains the frames, or else well ahead of it. In faint frames,
+        whose residual does not tell, any start is given up that costs much more than the best.
         """
         if progress.rival is None or progress.iterations != self.schedule.glance:
             return False
         now, best = progress.ending, progress.rival
-        before = self._cost(objective, best.state)
-        above = self._cost(objective, now.state) - before
         if self.end is End.INTEGRATION:
-            return above > self.schedule.hopeless * now.state.z.numel()
+            return self._saves(objective, best, now) > self.schedule.hopeless * now.state.z.numel()
         verdict = self.verdict(objective, best)
         if not self.is_twin(progress.starts, verdict):
             return False
         if verdict.explained:
-            return above > self.schedule.near * _beyond_noise(before, objective)
+            return self._saves(objective, best, now) > self._part(objective, best, self.schedule.near)
         return self.verdict(objective, now).excess >= self.schedule.promising * verdict.excess
 
     def _costs_less(self, objective: MyopicObjective, now: Ending, rival: Ending) -> bool:
-        """Return whether a later ending costs so much less than an earlier one that chance does not explain it.
+        """Return whether a later ending costs clearly less than an earlier one."""
+        least = self.schedule.likelier
+        if self.end is not End.INTEGRATION:  # there the residual is more than noise, and costs differ more by chance
+            least = self._part(objective, rival, self.schedule.better)
+        return self._saves(objective, now, rival) > least
 
-        In bright frames, whose residual is more than noise, that is a fraction of what they cost beyond noise.
-        """
-        least, before = self.schedule.likelier, self._cost(objective, rival.state)
-        if self.end is not End.INTEGRATION:
-            least = self.schedule.better * _beyond_noise(before, objective)
-        return before - self._cost(objective, now.state) > least
+    def _saves(self, objective: MyopicObjective, one: Ending, other: Ending) -> float:
+        """Return by how much one ending costs less than the other."""
+        return self._cost(objective, other.state) - self._cost(objective, one.state)
+
+    def _part(self, objective: MyopicObjective, ending: Ending, fraction: float) -> float:
+        """Return this fraction of what an ending costs beyond noise, but no less than starts may lack when they end."""
+        cost = self._cost(objective, ending.state)
+        of_noise = 0.5 * float((objective.precision.expand_as(objective.frames) > 0).sum())
+        return max(fraction * (cost - of_noise), self.schedule.nearly_at_rest * cost)
 
     def _cost(self, objective: MyopicObjective, state: State) -> float:
         """Return the joint cost of object and aberrations, comparable between starts: with the noise as given.
@@ -192,11 +197,6 @@ class Judge:
     def _left_out(self) -> LeftOut:
         n_modes = self.setting.still.n_modes
         return LeftOut.of(self.setting.told, n_modes, self.traits.r0, self.traits.outer_scale)
-
-
-def _beyond_noise(cost: float, objective: MyopicObjective) -> float:
-    """Return what remains of a cost, at least 0, without that expected of noise: half of the number of pixels."""
-    return max(0.0, cost - 0.5 * float((objective.precision.expand_as(objective.frames) > 0).sum()))
 
 
 def _parameters(objective: MyopicObjective, state: State) -> float:

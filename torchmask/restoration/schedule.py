@@ -55,13 +55,14 @@ class Schedule:
         of modes beyond the aberration basis
     chance : allowance for chance that is added to this limit, in standard deviations of the stack's chi-square
     missed : for a full pupil, minimum of the allowed excess, as a fraction of the change from frame to frame
-    starts : maximum number of starts
-    in_vain : a mask whose frames are explained beyond doubt, and not faint, starts until this number of starts in
-        succession, from twins of the best object, have brought nothing better; 0: there is none of these
-    doubtful : the fit of a mask is doubted if the excess is larger than this number times that expected
-    better : a later start replaces one that explains the frames of a mask if it costs less by this fraction of what
-        that one costs beyond noise
-    near : such a later start is given up if it costs more than the best so far by more than this fraction
+    starts : maximum number of starts, but for `averaged` and `faint_starts`
+    in_vain : a mask whose frames are explained beyond doubt, and not faint, starts until so many starts in succession,
+        from twins of the best object, have brought nothing better; 0: it starts once
+    doubtful : an explained fit of a mask is doubted if the excess is larger than this number times that expected, and
+        others are started as if it were not explained
+    better : where the best start so far explains the frames of a mask, a later one replaces it if it costs less by this
+        fraction of what the best costs beyond noise
+    near : there a twin is given up if it costs more than the best by more than this fraction of the same
     twins : where a mask's frames are faint or not explained, number of further starts from twins of its object before
         one from random aberrations
     faint_starts : maximum number of starts of a mask whose faint frames are explained, of which the likeliest is kept

@@ -266,7 +266,8 @@ class Solver:
 
         For a full pupil others begin until enough explain the frames, unless two agree.
         """
-        if progress.iterations <= self.schedule.sharp_after and progress.status is not Status.GIVEN_UP:
+        may_be_blurred = progress.rival is None or progress.status is Status.ITERATION_LIMIT
+        if may_be_blurred and progress.iterations <= self.schedule.sharp_after:
             return  # its object is not sharp enough to be judged
         best, verdict, now, progress.alike = self.judge.compare(self.objective, progress.ending, progress.rival)
         if self.averages and now.explained:
