@@ -206,12 +206,13 @@ def test_a_twin_of_an_explained_mask_has_to_be_near_and_then_clearly_better(end,
     assert replaces(0.99 * part, low, high)
     assert not replaces(1.01 * part, low, high)
     assert not replaces(0.0, high, low)
-    # starts may end before they are at rest, by so much of the whole cost
+    # starts may end before they are at rest, by three times so much of the whole cost
     costs = [beyond_noise(ending) + 0.5 * objective.frames.numel() for ending in (low, high)]
-    assert given_up(0.0, nearly_at_rest=0.99 * (costs[1] - costs[0]) / costs[0])
-    assert not given_up(0.0, nearly_at_rest=1.01 * (costs[1] - costs[0]) / costs[0])
-    assert replaces(0.0, low, high, nearly_at_rest=0.99 * (costs[1] - costs[0]) / costs[1])
-    assert not replaces(0.0, low, high, nearly_at_rest=1.01 * (costs[1] - costs[0]) / costs[1])
+    third = (costs[1] - costs[0]) / 3
+    assert given_up(0.0, nearly_at_rest=0.99 * third / costs[0])
+    assert not given_up(0.0, nearly_at_rest=1.01 * third / costs[0])
+    assert replaces(0.0, low, high, nearly_at_rest=0.99 * third / costs[1])
+    assert not replaces(0.0, low, high, nearly_at_rest=1.01 * third / costs[1])
     # where the frames are not explained, the residual tells, and the fifth start is from random aberrations
     missed = {"chance": -1e9}
     assert not given_up(0.0, explained=False, **missed)
@@ -258,7 +259,7 @@ def test_a_start_that_explains_the_frames_ends_when_nearly_at_rest(explain):
     schedule = Schedule(nearly_at_rest=0.01)
     known, wrong = (Progress(Candidates(found, 1)) for found in (state, replace(state, z=0 * state.z)))
 
-    def rests(progress, decrease, end=End.LAST_DESCENT, tolerance=0.001):
+    def rests(progress, decrease, end=End.LAST_DESCENT, tolerance=0.001, schedule=schedule):
         traits = replace(TRAITS, tolerance=tolerance, many_minima=end is End.FULL_PUPIL)
         judge = Judge(Setting.of(objective), stack_of(objective), traits, schedule, end)
         return judge.is_at_rest(objective, progress, decrease)
@@ -271,5 +272,11 @@ def test_a_start_that_explains_the_frames_ends_when_nearly_at_rest(explain):
     assert not rests(known, 0.009, End.FULL_PUPIL)
     assert not rests(known, 0.009, End.OBJECT)
     assert rests(known, 0.011, tolerance=0.02)
+    # explained, as any model error is allowed, but doubted, as no chance is
+    doubted = replace(schedule, model_errors=1e12, chance=-1e9, doubtful=0.0)
+    judge = Judge(Setting.of(objective), stack_of(objective), TRAITS, doubted, End.LAST_DESCENT)
+    assert judge.verdict(objective, known.ending).explained
+    assert not rests(known, 0.009, schedule=doubted)
+    assert rests(known, 0.009, schedule=replace(doubted, doubtful=1e12))
     for progress in (known, wrong):
         assert rests(progress, 0.001)

@@ -18,6 +18,8 @@ from torchmask.restoration.state import State
 from torchmask.restoration.traits import End, Traits
 from torchmask.restoration.verdict import Finding, FrameFits, Tolerance, Verdict, judge
 
+_LACKS = 3  # decreases of the last segment; of two stacks that went on, 2 to 4
+
 
 class Comparison(NamedTuple):
     """The better of two endings, the verdict on it and on the later one, and whether both leave the same residual."""
@@ -120,14 +122,15 @@ class Judge:
     def is_at_rest(self, objective: MyopicObjective, progress: Progress, decrease: float) -> bool:
         """Return whether the present start is at rest, its last segment having lowered the cost by the part `decrease`.
 
-        If it explains a mask's frames and a last descent goes on from it, it need not quite be.
+        If it explains a mask's frames beyond doubt and a last descent goes on from it, it need not quite be.
         """
         if decrease <= self.traits.tolerance:
             return True
         may_be_rough = self.end in (End.LAST_DESCENT, End.BOTH)
         if not may_be_rough or decrease > self.schedule.nearly_at_rest:
             return False
-        return self.verdict(objective, progress.ending).explained
+        verdict = self.verdict(objective, progress.ending)
+        return verdict.explained and not self._is_doubted(verdict)
 
     def is_twin(self, start: int, verdict: Verdict) -> bool:
         """Return whether the start of this number is from a twin, if this is the verdict on the best so far.
@@ -167,10 +170,13 @@ class Judge:
         return self._cost(objective, other.state) - self._cost(objective, one.state)
 
     def _part(self, objective: MyopicObjective, ending: Ending, fraction: float) -> float:
-        """Return this fraction of what an ending costs beyond noise, but no less than starts may lack when they end."""
+        """Return this fraction of what an ending costs beyond noise, but no less than starts may lack when they end.
+
+        A start that is nearly at rest falls by several times the last decrease before it is.
+        """
         cost = self._cost(objective, ending.state)
         of_noise = 0.5 * float((objective.precision.expand_as(objective.frames) > 0).sum())
-        return max(fraction * (cost - of_noise), self.schedule.nearly_at_rest * cost)
+        return max(fraction * (cost - of_noise), _LACKS * self.schedule.nearly_at_rest * cost)
 
     def _cost(self, objective: MyopicObjective, state: State) -> float:
         """Return the joint cost of object and aberrations, comparable between starts: with the noise as given.
