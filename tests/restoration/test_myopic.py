@@ -386,13 +386,13 @@ def test_refuses_shapes_that_disagree(observation, restored, restoring):
     ],
 )
 def test_reference_stacks(name, limit, dtype, shared_stack):
-    """One start, nothing known but the instrument.
+    """One call, nothing known but the instrument.
 
     The limit of the mask is that measured plus 2 % for another platform. The full pupil takes less time in float32. A
     start of it ends in another minimum after another rounding: the limit of one, without the mean of three,
     is a lead of 1.5 over the best peer.
     """
     stack = shared_stack(name)
-    method = MyopicDeconvolution(stack.aperture, stack.grid, schedule=Schedule(averaged=1, in_vain=0), dtype=dtype)
+    method = MyopicDeconvolution(stack.aperture, stack.grid, schedule=Schedule(averaged=1), dtype=dtype)
     result = method.restore(stack.frames)
     assert relative_error(result.object, stack.object, 0.5) < limit

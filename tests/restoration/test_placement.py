@@ -161,9 +161,8 @@ TRUE = MaskGeometry(math.radians(1.0), 1.006, 1.006)
 def turned(observe, five_holes):
     """Frames through a mask that lies otherwise than told, and their restorations."""
     seen = observe(TRUE.apply(five_holes), n_photons=3e6)
-    told = {"n_modes": 10, "schedule": Schedule(in_vain=0)}  # in less time
     restored = {
-        refine: MyopicDeconvolution(five_holes, seen.grid, **told, refine_geometry=refine).restore(seen.frames)
+        refine: MyopicDeconvolution(five_holes, seen.grid, 10, refine_geometry=refine).restore(seen.frames)
         for refine in (None, False)
     }
     return seen, restored

@@ -18,7 +18,7 @@ from torchmask.restoration.state import State
 from torchmask.restoration.traits import End, Traits
 from torchmask.restoration.verdict import Finding, FrameFits, Tolerance, Verdict, judge
 
-_LACKS = 3  # decreases of the last segment; of two stacks that went on, 2 to 4
+_LACKS = 3  # times the last decrease: by 2 to 4 times that two starts fell when they went on
 
 
 class Comparison(NamedTuple):
@@ -41,7 +41,8 @@ class Judge:
         self.traits: Traits = traits
         self.schedule: Schedule = schedule
         self.end: End = end
-        self.has_twins: bool = setting.still.n_subapertures > 3  # common pistons of three holes are a tilt
+        # common pistons of three holes are a tilt
+        self.has_twins: bool = not traits.many_minima and setting.still.n_subapertures > 3
         self.contrast: float = stack.contrast
         self.noise: FrameNoise = stack.noise_of_frames
         self.tolerance: Tolerance = Tolerance(schedule.model_errors, schedule.chance, least)
@@ -80,7 +81,7 @@ class Judge:
         if now.status is Status.GIVEN_UP:
             return Comparison(rival, before, after, alike=False)
         stays = before.excess < after.excess
-        if self.end is End.INTEGRATION or self._follows_twins(before):
+        if self.end is End.INTEGRATION or self._twins_may_improve(before):
             alone = before.explained is not after.explained
             stays = before.explained if alone else not self._costs_less(objective, now, rival)
         best, verdict = (rival, before) if stays else (now, after)
@@ -93,9 +94,9 @@ class Judge:
         """Return the maximum number of starts if this is the verdict on the best."""
         if verdict.finding is Finding.NOT_EXPLAINED:
             return self.schedule.starts
-        if not verdict.explained or self.traits.many_minima:
-            return 1
-        return self.schedule.faint_starts if self.end is End.INTEGRATION else self.schedule.starts
+        if verdict.explained and self.end is End.INTEGRATION:
+            return self.schedule.faint_starts
+        return self.schedule.starts if self._twins_may_improve(verdict) else 1
 
     def wants_another(self, verdict: Verdict, progress: Progress) -> bool:
         """Return whether to start again if this is the verdict on the best start, and iterations are left for it."""
@@ -104,15 +105,15 @@ class Judge:
             return len(progress.explained) < self.schedule.averaged and left >= self.schedule.start_iterations
         if progress.alike or progress.starts >= self.most_starts(verdict):
             return False
-        is_sure = self._follows_twins(verdict) and not self._is_doubted(verdict)
-        if is_sure and (progress.in_vain >= self.schedule.in_vain or not self.has_twins):
+        is_sure = self._twins_may_improve(verdict) and not self._is_doubted(verdict)
+        if is_sure and progress.in_vain >= self.schedule.in_vain:
             return False
         # one that could be spared is not begun to be cut short before most are given up
         return left > (self.schedule.glance if verdict.explained else 0)
 
-    def _follows_twins(self, verdict: Verdict) -> bool:
-        """Return whether twins may improve on a start that explains the frames: of a mask, unless they are faint."""
-        return verdict.explained and not self.traits.many_minima and self.end is not End.INTEGRATION
+    def _twins_may_improve(self, verdict: Verdict) -> bool:
+        """Return whether a start that explains a mask's frames may have a better twin, unless the frames are faint."""
+        return verdict.explained and self.has_twins and self.end is not End.INTEGRATION
 
     def _is_doubted(self, verdict: Verdict) -> bool:
         """Return whether a fit that explains the frames leaves more than is expected."""
@@ -138,7 +139,7 @@ class Judge:
         All further starts of a mask are, but where frames are faint or not explained some are from random aberrations.
         """
         in_turn = (start - 1) % (self.schedule.twins + 1) > 0
-        return not self.traits.many_minima and (in_turn or self._follows_twins(verdict))
+        return not self.traits.many_minima and (in_turn or self._twins_may_improve(verdict))
 
     def gives_up(self, objective: MyopicObjective, progress: Progress) -> bool:
         """Return whether it is time to give up the present start, if it is from a twin: after some iterations.
