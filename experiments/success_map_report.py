@@ -52,7 +52,7 @@ def markdown(setting: str, cells: Sequence[Mapping[str, Any]]) -> str:
 def figure(rows: Sequence[Mapping[str, Any]], cells: Sequence[Mapping[str, Any]], sizes: Sequence[float]) -> Figure:
     """Known, bound and blind over the photons: a column for each number of frames, a row for each of some d/r0."""
     numbers = sorted({cell["n_frames"] for cell in cells})
-    sheet = new_figure(5.2, 0.9 + 1.8 * len(sizes))
+    sheet = new_figure(1.0 + 1.4 * len(numbers), 0.9 + 1.8 * len(sizes))
     axes = sheet.subplots(len(sizes), len(numbers), sharex=True, sharey=True, squeeze=False)
     least = min(cell["known"] for cell in cells)
     ticks = [tick for tick in (0.02, 0.05, 0.1, 0.2, 0.5) if tick > least]
