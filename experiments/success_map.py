@@ -1,6 +1,6 @@
 """Where a blind restoration succeeds, over the size of the holes, the light and the number of frames.
 
-    python experiments/success_map.py                    # 336 restorations: four hours of one core
+    python experiments/success_map.py                    # 368 restorations: three hours of one core
     python experiments/success_map.py --draws 2 2 2 1    # fewer of each
     python experiments/success_map.py --pupil full --d-over-r0 2 4 7 10 --photons 1e5 1e6 1e7 1e8 \\
         --frames 5 10 1 --draws 3 3 2                    # 128 restorations through the full pupil
@@ -81,7 +81,7 @@ class Options(SweepOptions):
     """Electrons per frame through the mask or the full pupil."""
     frames: tuple[int, ...] = (5, 10, 20, 1)
     """Numbers of short exposures."""
-    draws: tuple[int, ...] = (7, 7, 4, 3)
+    draws: tuple[int, ...] = (7, 7, 6, 3)
     """Draws of mask, scene, turbulence and noise for each of the numbers of frames."""
     n_pixels: int = 64
     """Number of pixels per side of the image."""
