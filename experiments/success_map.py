@@ -1,6 +1,6 @@
 """Where a blind restoration succeeds, over the size of the holes, the light and the number of frames.
 
-    python experiments/success_map.py                    # 368 restorations: three hours of one core
+    python experiments/success_map.py                    # 368 restorations: over three hours of one core
     python experiments/success_map.py --draws 2 2 2 1    # fewer of each
     python experiments/success_map.py --pupil full --d-over-r0 2 4 7 10 --photons 1e5 1e6 1e7 1e8 \\
         --frames 5 10 1 --draws 3 3 2                    # 128 restorations through the full pupil

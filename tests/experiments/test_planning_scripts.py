@@ -17,6 +17,7 @@ import torchmask
 from torchmask.optics.aperture import SparseAperture
 from torchmask.planning.smearing import SmearingMap, phase_spread
 from torchmask.planning.success import SuccessMap
+from torchmask.planning.success import success_map as packaged_map
 
 THREE = SparseAperture([[0.0, 0.35], [0.3, -0.2], [-0.3, -0.2]], 0.25, 1.0)
 ATLAS = SuccessMap((1, 9), (1e4, 1e7), (0.1, 2.0), *(number * np.ones((2, 2, 2)) for number in (2, 1, 1.5)))
@@ -37,6 +38,16 @@ def test_a_tiny_map_is_what_the_plan_can_read(tmp_path, monkeypatch):
         assert outlook.restored == pytest.approx(row["known"] / row["predicted"])
     assert (tmp_path / "run/success_map.png").read_bytes().startswith(b"\x89PNG")
     assert sum(line.startswith("| ") for line in (tmp_path / "run/success_map.md").read_text().splitlines()) == 5
+
+
+def test_the_map_of_masks_that_comes_with_the_library_is_that_of_the_defaults():
+    options, held = success_map.Options(), packaged_map()
+    assert tuple(held.n_frames) == tuple(sorted(options.frames))
+    assert tuple(held.n_photons) == options.photons
+    assert tuple(held.d_over_r0) == options.d_over_r0
+    for n_frames, draws in zip(options.frames, options.draws, strict=True):
+        assert (held.tried[list(held.n_frames).index(n_frames)] == draws).all()
+    assert held.conditions.startswith(f"{held.tried.sum():g} restorations of {options.n_pixels} x")
 
 
 def test_a_full_pupil_is_observed_without_a_search_and_without_a_bound():
