@@ -92,7 +92,7 @@ def ended(
 ):
     progress = Progress(Candidates(state, 1), finer=finer)
     listen = None if records is None else records.append
-    finisher = Finisher(setting, schedule, minimizer or ProjectedLBFGS(), listen, traits, lambda progress: None)
+    finisher = Finisher(setting, schedule, minimizer or ProjectedLBFGS(), listen, traits, lambda progress: None, 1e3)
     return finisher.finish(objective, progress, end), progress
 
 
@@ -206,15 +206,18 @@ def test_a_search_under_a_lighter_prior_descends_under_the_given_one_again(
     monkeypatch.setattr(finish, "recalibrate", recalibrate)
     monkeypatch.setattr(finish, "integrate_aberrations", integrate)
     schedule = Schedule(faint_segments=3, segment=4)
+    end_rate, light = 0.8, 60.0
+    state = replace(state, image=state.image * rate_of_slopes(state.image) / end_rate / 2**n_segments)
     progress = Progress(Candidates(state, 1), rate=rate)
     finisher = Finisher(
-        Setting.of(objective), schedule, ProjectedLBFGS(), records.append, TRAITS, lambda progress: None
+        Setting.of(objective), schedule, ProjectedLBFGS(), records.append, TRAITS, lambda progress: None, light
     )
     finisher.finish(objective.with_changes(prior=prior), progress, End.INTEGRATION)
     *segments, own, image = course
     assert segments == n_segments * ["recalibrated", (prior, 4)]
     assert torch.equal(image, 2**n_segments * state.image)
-    assert repr(own) == repr(prior.suited_to(image))
+    assert repr(own) == repr(prior.suited_to(image, light))
+    assert own.weight == prior.weight * (light / 40 if isinstance(prior, TotalVariation) else 1)
     assert progress.n_evaluations == 7 * n_segments
     assert [(record.stage, record.step) for record in records] == [
         ("before integration", number + 1) for number in range(n_segments)
@@ -337,6 +340,19 @@ def test_each_segment_of_the_last_descent_has_the_prior_of_its_object(end, expec
     assert found.prior.weight == pytest.approx(1.35, rel=1e-9)
     assert isinstance(found.prior, SmoothVariation)
     assert progress.n_evaluations == 6 + 100 * end.integrates
+
+
+@pytest.mark.parametrize(("end", "weight"), [(End.INTEGRATION, 2.0), (End.BOTH, 0.8)])
+def test_gentle_slopes_are_held_where_no_last_descent_has_found_them(end, weight, explained, monkeypatch):
+    """In as much light as `ended` says."""
+    objective, state = explained
+    monkeypatch.setattr(finish, "descend", lambda objective, state, *rest: state)
+    monkeypatch.setattr(finish, "settle", lambda objective, state, n_iterations: state)
+    monkeypatch.setattr(finish, "recalibrate", lambda objective, state, power, **more: state)
+    monkeypatch.setattr(finish, "integrate_aberrations", lambda given, state, *rest, **more: (state, 0))
+    begun = replace(state, image=state.image * rate_of_slopes(state.image) / 0.8)
+    found, _ = ended(objective, begun, Setting.of(objective), Schedule(lost=math.inf), end=end)
+    assert found.prior.weight == pytest.approx(weight * objective.prior.weight, rel=1e-9)
 
 
 def test_a_result_holds_the_modes_of_the_search(observe, five_holes):

@@ -167,12 +167,32 @@ def test_a_variation_suited_to_an_object_has_the_scale_of_its_gradients():
     point = torch.zeros(8, 8, dtype=torch.float64)
     point[3, 3] = 5.0  # gradients of 5, 5 and 5 sqrt 2
     rate = 3 * (2 + 2**0.5) / (5 * 4)
-    suited = TotalVariation(2.0, 0.3).suited_to(point)
+    suited = TotalVariation(2.0, 0.3).suited_to(point, 0.0)
     assert isinstance(suited, SmoothVariation)
     assert suited.weight == pytest.approx(2 * rate, rel=1e-12)
     assert suited.epsilon == 0.3
     wide = nn.functional.pad(point, (0, 20, 0, 30))  # a dark sky says nothing of the object
-    assert TotalVariation().suited_to(wide).weight == pytest.approx(rate, rel=1e-12)
+    assert TotalVariation().suited_to(wide, 0.0).weight == pytest.approx(rate, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("rate", "light", "suits"),
+    [
+        (0.8, 39.0, 0.8),
+        (0.8, 41.0, 1.025),
+        (0.8, 60.0, 1.5),
+        (0.8, 80.0, 2.0),
+        (0.8, 1e4, 2.0),
+        (2.5, 1e4, 2.5),
+        (0.41, 60.0, 1.5),
+        (0.39, 60.0, 0.39),
+    ],
+)
+def test_gentle_slopes_suit_a_heavier_prior_the_more_light_has_bent_them(rate, light, suits):
+    """Up to twice the weight and never a lighter one; steep slopes are taken as they are."""
+    point = torch.zeros(8, 8, dtype=torch.float64)
+    point[3, 3] = 3 * (2 + 2**0.5) / (4 * rate)
+    assert TotalVariation(3.0).suited_to(point, light).weight == pytest.approx(3 * suits, rel=1e-12)
 
 
 def test_gradients_of_one_rate_are_known_by_it():
@@ -184,7 +204,7 @@ def test_gradients_of_one_rate_are_known_by_it():
         heights = lengths.sample().double()
     stripes = torch.zeros(1, 4 * n, dtype=torch.float64)
     stripes[0, ::4] = heights  # each has two slopes, and flat pixels beside it
-    found = TotalVariation().suited_to(stripes).weight
+    found = TotalVariation().suited_to(stripes, 0.0).weight
     assert abs(found / rate - 1) < 4 * (0.5 + (120 / 36 - 1)) ** 0.5 / n**0.5  # of E|g|, and of E|g|^2: 120 / mu^4
 
 
@@ -202,11 +222,11 @@ def test_a_search_in_faint_light_has_a_lighter_prior_for_an_object_of_steep_slop
 def test_priors_without_a_scale_stay_as_they_are():
     flat = torch.full((4, 4), 3.0)
     for prior in (EdgePreserving(), as_prior(squares), TotalVariation()):
-        assert prior.suited_to(flat) is prior
+        assert prior.suited_to(flat, 100.0) is prior
     for prior in (EdgePreserving(), as_prior(squares)):
         assert prior.in_search(0.3) is prior
     other = EdgePreserving()
-    assert other.suited_to(rough()) is other
+    assert other.suited_to(rough(), 100.0) is other
 
 
 def test_edge_preserving_is_quadratic_in_slopes_and_linear_in_edges():

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from torchmask.numbers import require
-from torchmask.restoration.slopes import divergence, gradient, rate_of_slopes
+from torchmask.restoration.slopes import divergence, gradient, rate_in_noise, rate_of_slopes
 
 _PROBES = 8  # random vectors that estimate the diagonal of a Hessian
 _SEED = 0
@@ -64,8 +64,11 @@ class ObjectPrior(nn.Module):
         """
         return self
 
-    def suited_to(self, image: Tensor) -> ObjectPrior:
-        """Return the prior at the scale of an object (H', W') that was restored: the same one where it knows none."""
+    def suited_to(self, image: Tensor, light: float) -> ObjectPrior:
+        """Return the prior at the scale of an object (H', W') that was restored: the same one where it knows none.
+
+        `light` is the change from frame to frame in noise variances, times the number of frames.
+        """
         return self
 
     def family(self, image: Tensor) -> tuple[ObjectPrior, ...]:
@@ -134,12 +137,12 @@ class TotalVariation(ObjectPrior):
         lighter.weight = self.weight * max(rate, _LIGHTEST)
         return lighter
 
-    def suited_to(self, image: Tensor) -> ObjectPrior:
+    def suited_to(self, image: Tensor, light: float) -> ObjectPrior:
         """Return a `SmoothVariation` whose weight suits the gradients of `image` (H', W'): `weight` times their rate.
 
-        See `rate_of_slopes`. An image without gradients leaves the prior as it is.
+        See `rate_in_noise`. An image without gradients leaves the prior as it is.
         """
-        rate = rate_of_slopes(image)
+        rate = rate_in_noise(image, light)
         return SmoothVariation(self.weight * rate, epsilon=self.epsilon) if rate > 0 else self
 
     def family(self, image: Tensor) -> tuple[ObjectPrior, ...]:

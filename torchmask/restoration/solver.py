@@ -101,6 +101,7 @@ class Solver:
         self.averages: bool = many_ends and schedule.averaged > 1
         retrievable = objective.model.pupil.n_rasters == 1 and len(objective.frames) > 1
         self.retrieves: bool = many_ends and schedule.retrievals > 0 and retrievable
+        self.light: float = stack.change * len(stack.frames)
         self.end: End = End.of(stack.change, traits, schedule, objective.free)
         self.given: ObjectPrior = objective.prior
         self.judge: Judge = Judge(self.setting, stack, traits, schedule, self.end)
@@ -124,7 +125,7 @@ class Solver:
         if self.end is not End.NONE and (ended.starts > 1 or not cut_short):
             how = (self.schedule, self.minimizer, self.callback, self.traits, save_nothing if cut_short else save)
             given = self.objective.with_changes(prior=self.given)
-            self.objective = Finisher(self.setting, *how).finish(given, ended, self.end)
+            self.objective = Finisher(self.setting, *how, self.light).finish(given, ended, self.end)
         return ended
 
     def begin(self, known: Known, start: RestorationResult | None) -> Progress:
