@@ -138,12 +138,13 @@ def test_every_segment_is_saved(explained):
 # --- when it starts again
 
 
-def test_noise_falls_from_a_share_of_the_change(explained):
+def test_noise_falls_from_a_share_of_the_change_which_adds_up_to_the_light_of_all_frames(explained):
     objective, _ = explained
     frames = objective.frames
     change = float(((frames - frames.mean((1, 2), keepdim=True) * frames.mean(0)) ** 2).mean() * objective.precision)
     assert solver_of(objective).first_inflation == pytest.approx(max(1, change / 30))
     assert solver_of(objective, schedule=Schedule(first_inflation=1e9)).first_inflation == 1
+    assert solver_of(objective).light == pytest.approx(change * len(frames))
 
 
 def test_the_truth_is_explained_as_far_as_the_schedule_asks(explained):
