@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-_GENTLE = 0.4  # rate above which slopes are gentle: faint frames find 0.08 to 0.3 for satellites, 0.46 on for balls
+_GENTLE = 0.4  # rate above which slopes are gentle: faint frames find 0.10 to 0.23 for satellites, 0.46 on for balls
 _LIGHT = 40.0  # change of all frames, in noise variances, from which on the rate of gentle slopes is at least 1
 _LEAST = 2.0  # the highest least rate: up to 8 tried
 
