@@ -8,6 +8,7 @@ import pickle
 import pkgutil
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import pytest
 import torch
@@ -36,6 +37,8 @@ from torchmask.spectra import NoisePSD, PowerLawPSD
 GRID = Grid.nyquist(1.0, 550e-9, 32)
 CENTERS = torch.tensor([[0.02, 0.31], [0.3, -0.21], [-0.29, -0.18]], dtype=torch.float64)
 DTYPES = (torch.float32, torch.float64)
+Kind = dict[str, Any]  # dtype and, if not the CPU, device
+FLOAT64: Kind = {"dtype": torch.float64}
 
 
 def mask(shape="disc", centers=CENTERS):
@@ -55,16 +58,16 @@ def turbulent_criterion(n_photons=1e7):
     return TurbulentMSE(GRID, PowerLawPSD(1.5, n_photons), NoisePSD(n_photons), n_frames=20, r0=0.2)
 
 
-def scored(module: AsymptoticMSE, dtype: torch.dtype) -> Tensor:
-    return module(mask().to(dtype))
+def scored(module: AsymptoticMSE, kind: Kind) -> Tensor:
+    return module(mask().to(**kind))
 
 
 def seeded():
     return torch.Generator("cpu").manual_seed(0)
 
 
-def random(*shape, dtype):
-    return torch.rand(*shape, generator=seeded(), dtype=torch.float64, device="cpu").to(dtype)
+def random(*shape, dtype, device="cpu"):
+    return torch.rand(*shape, generator=seeded(), dtype=torch.float64, device="cpu").to(dtype=dtype, device=device)
 
 
 def sampled(aperture: SparseAperture) -> SampledPupil:
@@ -77,12 +80,12 @@ def objective(aperture: SparseAperture) -> MyopicObjective:
     return MyopicObjective(ExposureModel(aperture, GRID, 4), frames, precision, TotalVariation())
 
 
-def costly(module: MyopicObjective, dtype: torch.dtype) -> Tensor:
-    return module(random(*module.model.window.field.shape, dtype=dtype), random(2, 12, dtype=dtype))
+def costly(module: MyopicObjective, kind: Kind) -> Tensor:
+    return module(random(*module.model.window.field.shape, **kind), random(2, 12, **kind))
 
 
-def penalised(module: ObjectPrior, dtype: torch.dtype) -> Tensor:
-    return module(random(8, 8, dtype=dtype))
+def penalised(module: ObjectPrior, kind: Kind) -> Tensor:
+    return module(random(8, 8, **kind))
 
 
 @dataclass(frozen=True)
@@ -90,28 +93,26 @@ class Entry:
     """How to make a module, the same with another state (or None: it has none), and how to call it."""
 
     make: Callable[[], nn.Module]
-    call: Callable[[nn.Module, torch.dtype], Tensor]
+    call: Callable[[nn.Module, Kind], Tensor]
     other: Callable[[], nn.Module] | None = None
     result: torch.dtype | None = None  # where it is not the dtype of the input
 
 
-def samples(module: nn.Module, dtype: torch.dtype) -> Tensor:
+def samples(module: nn.Module, kind: Kind) -> Tensor:
     return module.samples(GRID, 2).weights
 
 
-def blurred(module: PSF, dtype: torch.dtype) -> Tensor:
-    return module(random(2, *module.samples().weights.shape, dtype=dtype)).abs()
+def blurred(module: PSF, kind: Kind) -> Tensor:
+    return module(random(2, *module.samples().weights.shape, **kind)).abs()
 
 
-def turbulent(module: TurbulencePhase | LayeredPhase, dtype: torch.dtype) -> Tensor:
-    pupil = mask().to(dtype).samples(GRID)
+def turbulent(module: TurbulencePhase | LayeredPhase, kind: Kind) -> Tensor:
+    pupil = mask().to(**kind).samples(GRID)
     return module(pupil, 2, generator=seeded())
 
 
-def exposed(module: ExposureModel, dtype: torch.dtype) -> Tensor:
-    return module(
-        random(*module.window.field.shape, dtype=dtype), random(2, module.aberrations.n_parameters, dtype=dtype)
-    )
+def exposed(module: ExposureModel, kind: Kind) -> Tensor:
+    return module(random(*module.window.field.shape, **kind), random(2, module.aberrations.n_parameters, **kind))
 
 
 MODULES: dict[str, Entry] = {
@@ -120,7 +121,7 @@ MODULES: dict[str, Entry] = {
     "full pupil": Entry(lambda: FullAperture(0.9, 0.2), samples),
     "Zernike phase": Entry(
         lambda: ZernikePhase(mask(), GRID, 4),
-        lambda module, dtype: module(random(2, 3, 4, dtype=dtype)),
+        lambda module, kind: module(random(2, 3, 4, **kind)),
         lambda: ZernikePhase(moved(), GRID, 4),
     ),
     "turbulence": Entry(lambda: TurbulencePhase(0.15, 20.0), turbulent),
@@ -132,21 +133,21 @@ MODULES: dict[str, Entry] = {
     "criterion under turbulence": Entry(turbulent_criterion, scored, lambda: turbulent_criterion(1e6)),
     "detector": Entry(
         lambda: Detector(1.5),
-        lambda module, dtype: module(1e3 * random(8, 8, dtype=dtype), seeded()),
+        lambda module, kind: module(1e3 * random(8, 8, **kind), seeded()),
     ),
     "detector that differentiates": Entry(
         lambda: Detector(1.5, noise="gaussian"),
-        lambda module, dtype: module(1e3 * random(8, 8, dtype=dtype), seeded()),
+        lambda module, kind: module(1e3 * random(8, 8, **kind), seeded()),
     ),
     "exposure model": Entry(lambda: ExposureModel(mask(), GRID, 4), exposed, lambda: ExposureModel(moved(), GRID, 4)),
     "sampled pupil": Entry(
         lambda: sampled(mask()),
-        lambda module, dtype: module.samples().field(module.samples().phase(random(2, 12, dtype=dtype))).abs(),
+        lambda module, kind: module.samples().field(module.samples().phase(random(2, 12, **kind))).abs(),
         lambda: sampled(moved()),
     ),
     "aberration basis": Entry(
         lambda: AberrationBasis(random(6, 5, dtype=torch.float64), 3),
-        lambda module, dtype: module.coefficients(random(2, 5, dtype=dtype)),
+        lambda module, kind: module.coefficients(random(2, 5, **kind)),
         lambda: AberrationBasis(1 + random(6, 5, dtype=torch.float64), 3),
     ),
     "objective": Entry(lambda: objective(mask()), costly, lambda: objective(moved())),
@@ -178,25 +179,25 @@ def test_state_dict_round_trip(entry):
         target = entry.make()
     else:
         target = entry.other()
-        assert not torch.equal(entry.call(target, torch.float64), entry.call(source, torch.float64))
+        assert not torch.equal(entry.call(target, FLOAT64), entry.call(source, FLOAT64))
     file = io.BytesIO()
     torch.save(source.state_dict(), file)
     file.seek(0)
     target.load_state_dict(torch.load(file, weights_only=True))
-    assert torch.equal(entry.call(target, torch.float64), entry.call(source, torch.float64))
+    assert torch.equal(entry.call(target, FLOAT64), entry.call(source, FLOAT64))
 
 
 @each_module
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda m: pickle.loads(pickle.dumps(m))], ids=["deepcopy", "pickle"])
 def test_copies_do_the_same_and_share_nothing(entry, copied):
     source = entry.make()
-    expected = entry.call(source, torch.float64)
+    expected = entry.call(source, FLOAT64)
     twin = copied(source)
-    assert torch.equal(entry.call(twin, torch.float64), expected)
+    assert torch.equal(entry.call(twin, FLOAT64), expected)
     with torch.no_grad():
         for tensor in [*twin.parameters(), *twin.buffers()]:
             tensor.zero_()
-    assert torch.equal(entry.call(source, torch.float64), expected)
+    assert torch.equal(entry.call(source, FLOAT64), expected)
 
 
 @each_module
@@ -207,7 +208,7 @@ def test_the_dtype_follows_the_inputs(entry, dtype):
     default = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64 if dtype == torch.float32 else torch.float32)
     try:
-        result = entry.call(module, dtype)
+        result = entry.call(module, {"dtype": dtype})
     finally:
         torch.set_default_dtype(default)
     assert result.dtype == (entry.result or dtype)
@@ -218,17 +219,25 @@ def test_the_dtype_follows_the_inputs(entry, dtype):
 def test_the_device_follows_the_inputs(entry):
     """Every array made inside is made where the inputs are: on another default device nothing goes there."""
     module, untouched = entry.make(), entry.make()  # which has made nothing at a first call yet
-    expected = entry.call(module, torch.float64)
+    expected = entry.call(module, FLOAT64)
     with torch.device("meta"):
-        result = entry.call(untouched, torch.float64)
+        result = entry.call(untouched, FLOAT64)
     assert torch.equal(result, expected)
 
 
 @each_module
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_a_module_moves_to_a_gpu(entry):
-    module = entry.make().cuda()
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_a_gpu_does_what_the_processor_does(entry, dtype):
+    """From the same seed: results differ by rounding alone, and lie where the module and its inputs are."""
+    expected = entry.call(entry.make().to(dtype), {"dtype": dtype})
+    module = entry.make().to(dtype).cuda()
     assert all(tensor.is_cuda for tensor in [*module.parameters(), *module.buffers()])
+    result = entry.call(module, {"dtype": dtype, "device": "cuda"})
+    assert result.is_cuda
+    # a hundred roundings of the largest value: sums of up to some 4000 terms, those of FFTs in a tree
+    allowed = 100 * torch.finfo(dtype).eps * float(expected.abs().max())
+    torch.testing.assert_close(result.cpu(), expected, rtol=0, atol=allowed)
 
 
 @pytest.mark.parametrize(

@@ -1,13 +1,31 @@
-"""Memory of this machine: refuse what exceeds it before any work, and keep what an evaluation frees in the process."""
+"""Memory: refuse what exceeds that of this machine, keep what an evaluation frees, and size work by the device."""
 
 from __future__ import annotations
 
 import math
 import os
+from typing import NamedTuple
 
 import torch
 
 _LARGEST = 2**25 - 2**16  # bytes; glibc does not adapt to blocks of 32 MiB and more
+
+
+class AtATime(NamedTuple):
+    """How much to work on at a time: what the cache of a processor holds, or what makes up for the launches of a GPU.
+
+    Examples
+    --------
+    >>> AtATime(processor=2**18, gpu=2**24).on(torch.device("cpu")) == 2**18
+    True
+    """
+
+    processor: int
+    gpu: int
+
+    def on(self, device: torch.device) -> int:
+        """Return the number for a device."""
+        return self.processor if device.type == "cpu" else self.gpu
 
 
 def keep_freed_memory() -> None:

@@ -19,6 +19,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torchmask.design import overlap
 from torchmask.design.criterion import AsymptoticMSE, wiener_mse
 from torchmask.grid import Grid
+from torchmask.memory import AtATime
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.otf import analytic_otf
 from torchmask.optics.round import disc_constants, disc_patches
@@ -252,7 +253,7 @@ def test_float32_follows_within_rounding(shape: str) -> None:
 
 @pytest.mark.parametrize("chunk", [1, 4000, 2**18])
 def test_population_equals_its_masks(chunk: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(overlap._CHUNK, "cpu", chunk)
+    monkeypatch.setattr(overlap, "_CHUNK", AtATime(chunk, chunk))
     criterion = criterion_of(grid_of((32, 24)))
     centers = (uniform(2, 3, 5, 2) - 0.5).requires_grad_()
     values = criterion(mask_of(centers))
@@ -296,7 +297,7 @@ def test_memory_is_that_of_a_chunk_of_patches() -> None:
         return sizes.largest
 
     assert largest(1) < 4 * (n * (n - 1) / 2 + 1) * (math.sqrt(0.15 / n) * side + 1) ** 2  # four arrays of patches
-    assert largest(64) <= 4 * overlap._CHUNK["cpu"]
+    assert largest(64) <= 4 * overlap._CHUNK.processor
 
 
 def test_rotation_changes_little_on_the_reference_grid() -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.optimize import linear_sum_assignment
+from torch import nn
 
 from torchmask.design.constraint_base import project
 from torchmask.design.constraints import InsideDisc, KeepOutDisc, MinimumGap, NFoldSymmetry, NoOverlap, check_mask
@@ -74,6 +75,34 @@ def test_another_default_device_sees_nothing_of_it(method, constraints):
     assert torch.equal(again.aperture.centers, expected.aperture.centers)
     assert all(torch.equal(again.history[stage], rows) for stage, rows in expected.history.items())
     assert refined.aperture.centers.device.type == "cpu"
+
+
+class Elsewhere(nn.Module):
+    """A criterion on a device that is not the processor, for which the meta device stands: all masks are alike."""
+
+    def __init__(self):
+        super().__init__()
+        self.register_buffer("psd", torch.ones(2, device="meta"))
+        self.seen = set()
+
+    def forward(self, aperture):
+        self.seen.add(aperture.centers.device.type)
+        return torch.ones(aperture.centers.shape[:-2], dtype=torch.float64)
+
+    relative = forward
+
+
+@pytest.mark.parametrize("method", ["cma", "hybrid"])
+def test_a_criterion_on_another_device_is_given_masks_there(method):
+    criterion = Elsewhere()
+    found = search_mask(criterion, 3, 1.0, 0.1, method=method, budget=96)
+    assert criterion.seen == {"meta"}
+    assert found.aperture.centers.device.type == "meta"
+    criterion.seen.clear()
+    given = SparseAperture.from_catalog("golay3", 1.0, 0.1)
+    refined = refine_mask(criterion, given, budget=10)
+    assert criterion.seen == {"meta"}
+    assert (refined.aperture.centers.device.type, given.centers.device.type) == ("meta", "cpu")
 
 
 def test_gradient_stage_improves_on_cma_alone():

@@ -16,6 +16,7 @@ from torchmask.design.search import search_mask
 from torchmask.design.tolerance import machining_errors
 from torchmask.design.turbulent import TurbulentMSE
 from torchmask.grid import Grid
+from torchmask.memory import AtATime
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.band import Band
 from torchmask.optics.pixel import SquarePixel
@@ -363,7 +364,7 @@ def test_gradients_are_the_same_however_many_masks_are_in_work(monkeypatch):
     weight = torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64)
     found = []
     for pixels in (1, 2**20):
-        monkeypatch.setattr("torchmask.design.mask_transfer._CHUNK", pixels)
+        monkeypatch.setattr("torchmask.design.mask_transfer._CHUNK", AtATime(pixels, pixels))
         found.append(torch.autograd.grad(weight @ criterion.relative(SparseAperture(centers, 0.2, 1.0)), centers)[0])
     # sums over the same pixels in another order, at some thousand of them
     torch.testing.assert_close(*found, rtol=0, atol=1e-12 * float(found[0].abs().max()))

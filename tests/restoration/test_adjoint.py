@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from torchmask.grid import Grid
+from torchmask.memory import AtATime
 from torchmask.optics.band import Band
 from torchmask.restoration.adjoint import curvature, data_fidelity
 from torchmask.restoration.forward import ExposureModel
@@ -41,7 +42,8 @@ def test_gradients_at_zero_aberrations_and_zero_object(three_holes, random_expos
 def test_unwanted_gradients_are_not_computed_and_chunks_do_not_show(monkeypatch, three_holes, random_exposures):
     model, image, z, frames, precision = random_exposures(ExposureModel(three_holes, GRID, 4), n_frames=5)
     whole = data_fidelity(model, image, z, frames, precision)
-    monkeypatch.setattr("torchmask.restoration.forward._CHUNK", 2 * 16 * math.prod(model.window.field.shape))
+    chunk = 2 * 16 * math.prod(model.window.field.shape)
+    monkeypatch.setattr("torchmask.restoration.forward._CHUNK", AtATime(chunk, chunk))
     assert len(list(model.chunks(5))) == 3
     parts = data_fidelity(model, image, z, frames, precision)
     for one, other in zip(whole[:3], parts[:3], strict=True):

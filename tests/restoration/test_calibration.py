@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from torchmask.grid import Grid
+from torchmask.memory import AtATime
 from torchmask.optics.band import Band
 from torchmask.restoration.aberrations import turbulent_basis
 from torchmask.restoration.background import Background
@@ -86,7 +87,7 @@ def test_frames_that_are_the_model_have_their_transmission_and_no_residual(probl
 def test_many_frames_are_fitted_in_parts(problem, monkeypatch):
     objective, state = problem(random_precision())
     whole = fit_of_frames(objective, state)
-    monkeypatch.setattr("torchmask.restoration.forward._CHUNK", 1)
+    monkeypatch.setattr("torchmask.restoration.forward._CHUNK", AtATime(1, 1))
     for one, other in zip(whole, fit_of_frames(objective, state), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-13, atol=0)
 

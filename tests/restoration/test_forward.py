@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from torchmask.grid import Grid
+from torchmask.memory import AtATime
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.band import Band
 from torchmask.optics.psf import psf_from_samples
@@ -115,7 +116,8 @@ def test_a_star_is_drawn_out_along_the_radius_and_nowhere_else():
 
 def test_chunks_cover_the_frames_once_and_stay_small(monkeypatch):
     model = ExposureModel(MASK, GRID, 4, Band.of((550e-9, 560e-9)))
-    monkeypatch.setattr("torchmask.restoration.forward._CHUNK", 2 * 16 * 2 * math.prod(model.window.field.shape))
+    chunk = 2 * 16 * 2 * math.prod(model.window.field.shape)
+    monkeypatch.setattr("torchmask.restoration.forward._CHUNK", AtATime(chunk, chunk))
     assert [(part.start, part.stop) for part in model.chunks(5)] == [(0, 2), (2, 4), (4, 5)]
 
 

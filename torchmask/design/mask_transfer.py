@@ -25,9 +25,10 @@ from torchmask.design.lens_pairs import LensPairs
 from torchmask.design.lens_patches import LensPatches
 from torchmask.design.overlap import Geometry
 from torchmask.design.pair_coherence import PairCoherence
+from torchmask.memory import AtATime
 from torchmask.optics.band import Band
 
-_CHUNK = 2**20  # pixels of lenses in work at a time: few enough for memory, enough to amortise launches
+_CHUNK = AtATime(processor=2**20, gpu=2**24)  # pixels of lenses
 
 
 class MaskTransfer:
@@ -74,7 +75,7 @@ class MaskTransfer:
 
     def n_masks(self, n: int) -> int:
         """Return how many masks of `n` holes to work on at a time."""
-        return max(1, _CHUNK // ((1 + n * (n - 1) // 2) * self.patches.n_pixels))
+        return max(1, _CHUNK.on(self.pixel.device) // ((1 + n * (n - 1) // 2) * self.patches.n_pixels))
 
     def _transfer(self, centers: Tensor) -> Tensor:
         lenses = self.patches(centers)

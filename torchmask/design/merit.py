@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchmask.design.constraint_base import (
     Constraint,
@@ -29,6 +30,39 @@ class Criterion(Protocol):
     def __call__(self, aperture: SparseAperture, /) -> Tensor: ...
 
     def relative(self, aperture: SparseAperture, /) -> Tensor: ...
+
+
+@dataclass(frozen=True)
+class OnDevice:
+    """A criterion on another device for masks on the processor, where a search does its many small steps.
+
+    Masks go to `device`, values and gradients come back.
+    """
+
+    criterion: Criterion
+    device: torch.device
+
+    def __call__(self, aperture: SparseAperture) -> Tensor:
+        return self.criterion(self._sent(aperture)).to(aperture.centers.device)
+
+    def relative(self, aperture: SparseAperture) -> Tensor:
+        """Return the relative error of masks (...)."""
+        return self.criterion.relative(self._sent(aperture)).to(aperture.centers.device)
+
+    def _sent(self, aperture: SparseAperture) -> SparseAperture:
+        return aperture.replace(centers=aperture.centers.to(self.device))
+
+
+def device_of(criterion: Criterion) -> torch.device:
+    """Return the device of a criterion's buffers; the processor for one that has none."""
+    buffers = criterion.buffers() if isinstance(criterion, nn.Module) else iter(())
+    return next((buffer.device for buffer in buffers), torch.device("cpu"))
+
+
+def for_processor(criterion: Criterion) -> Criterion:
+    """Return a criterion that takes masks on the processor, wherever `criterion` itself is."""
+    device = device_of(criterion)
+    return criterion if device.type == "cpu" else OnDevice(criterion, device)
 
 
 class Holes:

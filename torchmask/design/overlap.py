@@ -19,10 +19,10 @@ import torch
 from torch import Tensor
 
 from torchmask.design.early_gradient import EarlyGradient, vmap_population
+from torchmask.memory import AtATime
 from torchmask.optics.shape_base import Patches, Shape
 
-# pixels of patches in work at a time: what a cache holds, and what amortises the launches of kernels
-_CHUNK = {"cpu": 2**18, "cuda": 2**24}
+_CHUNK = AtATime(processor=2**18, gpu=2**24)  # pixels of patches
 
 
 class Geometry(NamedTuple):
@@ -111,7 +111,7 @@ class _BaselineMSE(EarlyGradient):
         plan_of = make_plan if torch.compiler.is_compiling() else cached_plan
         plan = plan_of(geometry, centers.shape[-2], centers.dtype, centers.device)
         pixels = len(plan.first) * len(plan.row) * len(plan.column)
-        masks = max(1, _CHUNK.get(centers.device.type, 2**24) // pixels)
+        masks = max(1, _CHUNK.on(centers.device) // pixels)
         n_chunks = math.ceil(len(centers) / masks)
         chunks = centers.split(math.ceil(len(centers) / n_chunks)) if n_chunks > 1 else (centers,)
         parts = [_mse_and_gradient(chunk, weight, ratio, geometry, plan, differentiate) for chunk in chunks]

@@ -23,6 +23,7 @@ from torchmask.atmosphere.structure import StructureFunction
 from torchmask.design.early_gradient import by_chunks
 from torchmask.design.overlap import Geometry
 from torchmask.design.spline_table import SplineTable
+from torchmask.memory import AtATime
 
 _KURTOSIS = 2.5  # along one axis, of the separation of two points of two discs
 _PLACES = [
@@ -35,7 +36,7 @@ _ONE_COLOUR = [(1, 0.5), (-1, 0.5), (0, -1.0)]
 _TWO_COLOURS = [(1, 0, 0.5), (-1, 0, 0.5), (0, 1, -0.5), (0, -1, -0.5)]
 _LIGHT = 0.13  # mean square of a place in a lens's T, a Gaussian here, along either axis, over the hole's diameter^2
 _STEPS = 4  # of the spline to a hole
-_CHUNK = 2**12  # baselines in work at a time: few enough for a cache, enough to amortise launches
+_CHUNK = AtATime(processor=2**12, gpu=2**18)  # baselines
 
 
 class PairCoherence:
@@ -94,7 +95,7 @@ class PairCoherence:
         nodes = torch.stack(torch.meshgrid(nodes, nodes, indexing="xy"), -1)
         first, second, separation, step = (one[:, None, None] for one in (first, second, separation, step))
         parts = torch.broadcast_tensors((first + second) / 2 + step * nodes, first, second, separation)
-        found = by_chunks(self._over_far, torch.stack(parts, -2).flatten(0, 2), _CHUNK)
+        found = by_chunks(self._over_far, torch.stack(parts, -2).flatten(0, 2), _CHUNK.on(step.device))
         return found.view(-1, n, n)
 
     def _over_far(self, places: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchmask.design.constraint_base import Constraint, Infeasible, project, require_constraints
 from torchmask.design.constraints import InsideDisc, NoOverlap, check_mask
 from torchmask.design.descent import BatchedBFGS
-from torchmask.design.merit import Criterion, Holes, Merit
+from torchmask.design.merit import Criterion, Holes, Merit, device_of, for_processor
 from torchmask.optics.aperture import SparseAperture
 from torchmask.record import Callback, Record
 
@@ -141,7 +141,7 @@ def refine_mask(
     Returns
     -------
     SearchResult
-        Refined mask, feasible to 1e-9 of its diameter.
+        Refined mask, feasible to 1e-9 of its diameter, on the device of the criterion.
 
     Raises
     ------
@@ -169,12 +169,13 @@ def refine_mask(
     require_constraints(constraints)
     if not float(budget).is_integer() or budget < 1:
         raise ValueError(f"budget is {budget}: it must be a whole number of evaluations, at least 1")
-    still = aperture.still()
+    device, criterion = device_of(criterion), for_processor(criterion)
+    still = aperture.still().to("cpu")
     holes = Holes(still, (InsideDisc(), NoOverlap(), *constraints))
     start = holes.coordinates(still.centers)
     monitor = Monitor("design/refine", budget, holes, callback)
     best, evaluations = polish(criterion, holes, start[None], budget, monitor)
-    return conclude(criterion, best, constraints, evaluations, monitor.history(criterion))
+    return conclude(criterion, best, constraints, evaluations, monitor.history(criterion), device)
 
 
 def polish(
@@ -238,10 +239,11 @@ def conclude(
     constraints: Sequence[Constraint],
     evaluations: int,
     history: dict[str, Tensor],
+    device: torch.device,
 ) -> SearchResult:
-    """Check the mask, measure it and return the result."""
+    """Check the mask, measure it and return the result, with the mask on `device`."""
     tolerance = TOLERANCE if aperture.centers.dtype == torch.float64 else 1e-6
     check_mask(aperture, tolerance, constraints)
     with torch.no_grad():
         mse, relative = float(criterion(aperture)), float(criterion.relative(aperture))
-    return SearchResult(aperture, mse, relative, evaluations, history)
+    return SearchResult(aperture.to(device), mse, relative, evaluations, history)

@@ -11,7 +11,7 @@ import torch
 from torchmask.design.cma import evolve
 from torchmask.design.constraint_base import Constraint, Infeasible
 from torchmask.design.hybrid import basin_hopping, coarse_criterion
-from torchmask.design.merit import Criterion
+from torchmask.design.merit import Criterion, device_of, for_processor
 from torchmask.design.refine import Monitor, SearchResult, conclude, polish
 from torchmask.design.room import require_room
 from torchmask.optics.packing import hole_diameter
@@ -41,7 +41,7 @@ def search_mask(
     Parameters
     ----------
     criterion : AsymptoticMSE or similar
-        Differentiable error of masks.
+        Differentiable error of masks, which may be on a GPU; the search itself is made on the processor.
     n_subapertures : int
         Number of holes, N.
     mask_diameter : float
@@ -69,7 +69,7 @@ def search_mask(
     Returns
     -------
     SearchResult
-        Best mask, feasible to 1e-9 of its diameter, with its error on the grid of `criterion`.
+        Best mask, feasible to 1e-9 of its diameter, with its error on the grid of `criterion` and on its device.
 
     Raises
     ------
@@ -106,14 +106,16 @@ def search_mask(
     rng = np.random.default_rng(seed)
     monitor = Monitor(f"design/{method}", budget, holes, callback)
     explore = evolve if method == "cma" else basin_hopping
-    working = criterion if method == "cma" else coarse_criterion(criterion)
+    working = for_processor(criterion if method == "cma" else coarse_criterion(criterion))
     starts, used = explore(working, holes, budget, rng, monitor)
+    device, criterion = device_of(criterion), for_processor(criterion)
     history = monitor.history(criterion)
     # Without a gradient stage, one evaluation of each candidate is needed to compare them once they are feasible.
     allowance = (POLISH if refine else 1) * len(starts)
     monitor = Monitor("design/refine", allowance, holes, callback, before=used)
     aperture, polished = polish(criterion, holes, starts, allowance, monitor, fallback)
-    return conclude(criterion, aperture, constraints, used + polished, history | monitor.history(criterion))
+    history |= monitor.history(criterion)
+    return conclude(criterion, aperture, constraints, used + polished, history, device)
 
 
 def _require_sampling(criterion: Criterion, n_subapertures: int, mask_diameter: float, fill_factor: float) -> None:

@@ -231,9 +231,11 @@ class _Workshop:
         self.callback: Callback | None = callback
         self.evaluations: int = 0
         self.aperture: SparseAperture = aperture
-        like = {"dtype": aperture.centers.dtype, "device": aperture.centers.device, "generator": generator}
-        position = torch.randn(n_draws // 2, *aperture.centers.shape, **like)
-        diameter = torch.randn(n_draws // 2, **like)
+        centers = aperture.centers
+        source = centers.device if generator is None else generator.device  # the same draws on every device
+        like = {"dtype": centers.dtype, "device": source, "generator": generator}
+        position = torch.randn(n_draws // 2, *centers.shape, **like).to(centers.device)
+        diameter = torch.randn(n_draws // 2, **like).to(centers.device)
         self.position: Tensor = torch.cat([position, -position])
         self.diameter: Tensor = torch.cat([diameter, -diameter])
 

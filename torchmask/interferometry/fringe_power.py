@@ -53,16 +53,20 @@ class FringePower:
 
     @classmethod
     def of(cls, frames: Tensor, aperture: SparseAperture, grid: Grid) -> FringePower | None:
-        """Return the power of frames (T, H, W), weighted by a Hann window; None if too few frequencies are left."""
-        nu_y, nu_x = grid.frequencies(torch.float64, frames.device)
+        """Return the power of frames (T, H, W), weighted by a Hann window; None if too few frequencies are left.
+
+        Frames may be on any device; the power, and what is compared with it, is on that of the aperture.
+        """
+        nu_y, nu_x = grid.frequencies(torch.float64, aperture.centers.device)
         radius = torch.hypot(nu_y, nu_x)
         window = [
             torch.hann_window(side, periodic=False, dtype=torch.float64, device=frames.device) for side in grid.shape
         ]
-        power = torch.zeros_like(radius)
+        power = torch.zeros_like(radius, device=frames.device)
         for part in frames.double().split(_AT_A_TIME):
             still = (part - part.mean((1, 2), keepdim=True)) * window[0][:, None] * window[1]
             power += (torch.fft.fft2(still).abs() ** 2).sum(0) / len(frames)
+        power = power.to(radius.device)
         reach = grid.cutoff(aperture.extent)
         chosen = (radius > grid.cutoff(aperture.outer_diameter)) & (radius <= reach) & (power > 0)
         beyond = radius > max(reach, 0.5)  # the corners hold no light of a larger mask either

@@ -240,16 +240,17 @@ def whitening(aperture: Aperture, n_modes: int, r0: float, outer_scale: float, d
 
     Coefficients a = L z, sub-aperture by sub-aperture, follow von Karman statistics if z is white noise. The mean
     piston cannot be seen; without it K = N J - 1. r0 and outer_scale in m, L in rad. With a `drift` [m] it is the
-    covariance of the change while turbulence moves so far.
+    covariance of the change while turbulence moves so far. It is computed on the processor, so that the same noise is
+    the same aberrations on every device.
     """
-    covariance = modal_covariance(aperture, n_modes, r0, outer_scale, drift)
+    covariance = modal_covariance(aperture.still().to("cpu"), n_modes, r0, outer_scale, drift)
     n_sub = aperture.n_subapertures
     common = torch.zeros(n_sub, n_modes, dtype=covariance.dtype, device=covariance.device)
     common[:, 0] = n_sub**-0.5
     remove = torch.eye(n_sub * n_modes, dtype=covariance.dtype, device=covariance.device)
     remove = remove - torch.outer(common.flatten(), common.flatten())
     values, vectors = torch.linalg.eigh(remove @ covariance @ remove)
-    return (vectors[:, 1:] * values[1:].clamp(min=0).sqrt()).flip(1)
+    return (vectors[:, 1:] * values[1:].clamp(min=0).sqrt()).flip(1).to(aperture.centers.device)
 
 
 def root(covariance: Tensor) -> Tensor:

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from torchmask.grid import Grid
+from torchmask.memory import AtATime
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.band import Band
 from torchmask.optics.pixel import PixelResponse
@@ -23,8 +24,7 @@ from torchmask.restoration.background import Background
 from torchmask.restoration.pupil import OpenSamples, SampledPupil
 
 MARGIN = 0.25  # minimum by which the object's field is wider, as a fraction of the frames' width
-# bytes of one complex work array: what stays in a core's cache, and what amortises the launches of kernels elsewhere
-_CHUNK, _CHUNK_OF_DEVICE = 2**20, 2**28
+_CHUNK = AtATime(processor=2**20, gpu=2**28)  # bytes of one complex work array
 
 
 @dataclass(frozen=True)
@@ -171,8 +171,7 @@ class ExposureModel(nn.Module):
     def chunks(self, n_frames: int) -> Iterator[slice]:
         """Return slices of the frames whose work arrays fit into a core's cache, or large ones for other devices."""
         pixels = self.pupil.n_rasters * math.prod(self.window.field.shape)
-        most = _CHUNK if self.device.type == "cpu" else _CHUNK_OF_DEVICE
-        size = max(1, most // (2 * self.dtype.itemsize * pixels))
+        size = max(1, _CHUNK.on(self.device) // (2 * self.dtype.itemsize * pixels))
         return (slice(start, min(start + size, n_frames)) for start in range(0, n_frames, size))
 
     def amplitude(self, samples: OpenSamples, field: Tensor) -> Tensor:

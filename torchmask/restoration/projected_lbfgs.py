@@ -1,7 +1,7 @@
 """Limited-memory BFGS with lower bounds, on torch tensors.
 
-The iterates, the corrections and the products with them stay on the device of the start; only scalars are copied to the
-host.
+The iterates and the corrections stay on the device of the start. Their products with each other, a few dozen rows, are
+kept on the host, where small systems are solved fastest: one table is copied there in an iteration, and some scalars.
 """
 
 from __future__ import annotations
@@ -66,10 +66,10 @@ class Corrections:
     def __init__(self, size: int, like: Tensor) -> None:
         self._size = size
         self._pairs = like.new_zeros(2 * size, like.numel())  # the y, then the s
-        self._products = like.new_zeros(2 * size, 2 * size)  # of the pairs with each other
+        self._products = like.new_zeros(2 * size, 2 * size, device="cpu")  # of the pairs with each other
         # The same over the free variables only, updated by those that enter or leave a bound: few in a step.
         self._free = torch.ones_like(like, dtype=torch.bool)
-        self._free_products = like.new_zeros(2 * size, 2 * size)
+        self._free_products = torch.zeros_like(self._products)
         self._order: list[int] = []  # oldest first
         self._new: int | None = None  # pair whose products are not known yet
         self._theta = 1.0
@@ -79,7 +79,7 @@ class Corrections:
 
         The step must have followed from `solve`: it is 0 in the variables that were not free there.
         """
-        curvature, energy = float(step @ change), float(change @ change)
+        curvature, energy = torch.stack([step @ change, change @ change]).tolist()
         if not curvature > _CURVED * energy:
             return
         self._new = self._order.pop(0) if len(self._order) == self._size else len(self._order)
@@ -105,18 +105,18 @@ class Corrections:
             self._free = free
             return gradient
         products = self._update(gradient, free)
-        y = torch.tensor(self._order, device=gradient.device)
+        y = torch.tensor(self._order, device="cpu")
         w = torch.cat([y, y + self._size])
-        scale = gradient.new_ones(len(w))
+        scale = products.new_ones(len(w))
         scale[len(y) :] = theta
         sy = self._products[y[:, None] + self._size, y]
         older = sy.tril(-1)
         ss = self._products[y[:, None] + self._size, y + self._size]
         middle = torch.cat([torch.cat([-sy.diag().diag(), older.T], 1), torch.cat([older, theta * ss], 1)])
         middle = middle - self._free_products[w[:, None], w] * (scale[:, None] * scale) / theta
-        weights = torch.zeros_like(self._pairs[:, 0])
+        weights = torch.zeros_like(products)
         weights[w] = scale * torch.linalg.solve(middle, scale * products[w])
-        return (gradient + (weights @ self._pairs) * free / theta) / theta
+        return (gradient + (weights.to(gradient.device) @ self._pairs) * free / theta) / theta
 
     def _update(self, gradient: Tensor, free: Tensor) -> Tensor:
         """Update all products to the latest pair and to the variables now `free`, and return those with `gradient`.
@@ -126,9 +126,9 @@ class Corrections:
         vectors, row = [gradient], self._new
         if row is not None:
             rows = [row, self._size + row]
-            change, step = self._pairs[rows]
+            change, step = self._pairs[row], self._pairs[self._size + row]
             vectors += [change, step, change * self._free]
-        products, *new = (self._pairs @ torch.stack(vectors).T).T
+        products, *new = (self._pairs @ torch.stack(vectors).T).to("cpu").T
         if row is not None:
             change, step, free_change = new  # a step is 0 where variables were not free
             for table, found in ((self._products, change), (self._free_products, free_change)):
@@ -136,9 +136,10 @@ class Corrections:
                 table[rows], table[:, rows] = found, found.T
             self._new = None
         changed = (free != self._free).nonzero().flatten()
-        entered = self._pairs[:, changed]
-        sign = free[changed].to(gradient) * 2 - 1
-        self._free_products += (entered * sign) @ entered.T
+        if len(changed):
+            entered = self._pairs[:, changed]
+            sign = free[changed].to(gradient) * 2 - 1
+            self._free_products += ((entered * sign) @ entered.T).to("cpu")
         self._free = free
         return products
 
