@@ -77,6 +77,18 @@ def test_another_default_device_sees_nothing_of_it(method, constraints):
     assert refined.aperture.centers.device.type == "cpu"
 
 
+@pytest.mark.parametrize("constraints", [(), (MinimumGap(0.02), KeepOutDisc(0.1)), (NFoldSymmetry(3),)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_short_refinement_makes_no_mask_worse(constraints, dtype):
+    """Ten evaluations begin a little off the rim, and may end before they are back."""
+    criterion = reference(64)
+    given = search_mask(criterion, 6, 1.0, 0.1, method="cma", budget=96, constraints=constraints).aperture.to(dtype)
+    refined = refine_mask(criterion, given, budget=10, constraints=constraints)
+    assert refined.mse <= float(criterion(given))
+    last = float(refined.history["design/refine"][-1, 1])  # of the mask projected once more
+    assert last == pytest.approx(refined.relative_mse, rel=10 * torch.finfo(dtype).eps)
+
+
 class Elsewhere(nn.Module):
     """A criterion on a device that is not the processor, for which the meta device stands: all masks are alike."""
 

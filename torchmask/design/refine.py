@@ -141,7 +141,8 @@ def refine_mask(
     Returns
     -------
     SearchResult
-        Refined mask, feasible to 1e-9 of its diameter, on the device of the criterion.
+        Refined mask, feasible to 1e-9 of its diameter, on the device of the criterion; the given one if it is
+        feasible and the descent has found none better.
 
     Raises
     ------
@@ -174,8 +175,16 @@ def refine_mask(
     holes = Holes(still, (InsideDisc(), NoOverlap(), *constraints))
     start = holes.coordinates(still.centers)
     monitor = Monitor("design/refine", budget, holes, callback)
-    best, evaluations = polish(criterion, holes, start[None], budget, monitor)
+    best, evaluations = polish(criterion, holes, start[None], budget, monitor, _if_feasible(still, constraints))
     return conclude(criterion, best, constraints, evaluations, monitor.history(criterion), device)
+
+
+def _if_feasible(aperture: SparseAperture, constraints: Sequence[Constraint]) -> SparseAperture | None:
+    try:
+        check_mask(aperture, _tolerance(aperture), constraints)
+    except ValueError:
+        return None
+    return aperture
 
 
 def polish(
@@ -184,16 +193,17 @@ def polish(
     x: Tensor,
     budget: int,
     monitor: Monitor,
-    fallback: SparseAperture | None = None,
+    known: SparseAperture | None = None,
 ) -> tuple[SparseAperture, int]:
     """Return the best feasible mask reached from x (P, F), and the number of evaluations used, at most `budget`.
 
     With the multipliers of the augmented Lagrangian, descents converge onto the constraints and not beyond them; a
-    projection removes the remaining shortfall. If no projection succeeds the result is `fallback`; without one,
-    `Infeasible` is raised.
+    projection removes the remaining shortfall. The result is no worse than `known`, a feasible mask; if there is none
+    and no projection succeeds, `Infeasible` is raised.
     """
     merit = Merit(criterion, holes, PENALTY)
-    reserve = 2 * len(x)  # for one update of the multipliers and the comparison at the end
+    # for one update of the multipliers and the comparison at the end
+    reserve = 2 * len(x) + (known is not None)
     descent = BatchedBFGS(x, first_step=0.003, tolerance=1e-8)
     multipliers: Tensor | float = 0.0
     while merit.evaluations + len(x) + reserve <= budget:
@@ -209,10 +219,10 @@ def polish(
             multipliers = update
             descent.restart(slice(None), descent.points.clone())
     candidates, failure = _feasible(holes, descent.points, monitor)
+    if known is not None:
+        candidates.append(known)
     if not candidates:
-        if fallback is None:
-            raise failure
-        candidates = [fallback]
+        raise failure
     with torch.no_grad():
         values = torch.stack([criterion.relative(candidate) for candidate in candidates])
     best = int(values.argmin())
@@ -242,8 +252,11 @@ def conclude(
     device: torch.device,
 ) -> SearchResult:
     """Check the mask, measure it and return the result, with the mask on `device`."""
-    tolerance = TOLERANCE if aperture.centers.dtype == torch.float64 else 1e-6
-    check_mask(aperture, tolerance, constraints)
+    check_mask(aperture, _tolerance(aperture), constraints)
     with torch.no_grad():
         mse, relative = float(criterion(aperture)), float(criterion.relative(aperture))
     return SearchResult(aperture.to(device), mse, relative, evaluations, history)
+
+
+def _tolerance(aperture: SparseAperture) -> float:
+    return TOLERANCE if aperture.centers.dtype == torch.float64 else 1e-6

@@ -102,7 +102,7 @@ def search_mask(
     if not float(seed).is_integer() or seed < 0:
         raise ValueError(f"seed is {seed}: it must be a whole number that is not negative")
     _require_sampling(criterion, n_subapertures, mask_diameter, fill_factor)
-    holes, fallback = require_room(n_subapertures, mask_diameter, fill_factor, constraints, callback=callback)
+    holes, known = require_room(n_subapertures, mask_diameter, fill_factor, constraints, callback=callback)
     rng = np.random.default_rng(seed)
     monitor = Monitor(f"design/{method}", budget, holes, callback)
     explore = evolve if method == "cma" else basin_hopping
@@ -110,10 +110,11 @@ def search_mask(
     starts, used = explore(working, holes, budget, rng, monitor)
     device, criterion = device_of(criterion), for_processor(criterion)
     history = monitor.history(criterion)
-    # Without a gradient stage, one evaluation of each candidate is needed to compare them once they are feasible.
-    allowance = (POLISH if refine else 1) * len(starts)
+    # Without a gradient stage, one evaluation of each candidate is needed to compare them once they are feasible, and
+    # one of the mask that the room for them gave.
+    allowance = (POLISH if refine else 1) * len(starts) + 1
     monitor = Monitor("design/refine", allowance, holes, callback, before=used)
-    aperture, polished = polish(criterion, holes, starts, allowance, monitor, fallback)
+    aperture, polished = polish(criterion, holes, starts, allowance, monitor, known)
     history |= monitor.history(criterion)
     return conclude(criterion, aperture, constraints, used + polished, history, device)
 
