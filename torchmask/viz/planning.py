@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+_ROOM = 0.35  # above the curves, for the legend, over their own height
 _RING: dict[str, Any] = {"markersize": 13, "fillstyle": "none", "color": drawing.COLORS[1]}
 
 
@@ -99,4 +100,6 @@ def _draw_exposures(ax: Axes, plan: ObservationPlan) -> None:
     ax.minorticks_off()
     title = "" if is_full else f"holes of {best.hole_diameter:.3g} m"
     ax.set(xlabel="exposure [ms]", ylabel="relative MSE, blind", title=title)
-    ax.legend()
+    low, high = ax.get_ylim()
+    ax.set_ylim(low, high + _ROOM * (high - low))
+    ax.legend(loc="upper right", ncols=2)
