@@ -15,6 +15,7 @@ from torchmask.restoration.aberrations import moving_basis, turbulent_basis
 from torchmask.restoration.background import Background
 from torchmask.restoration.calibration import fit_of_frames
 from torchmask.restoration.candidates import Candidates
+from torchmask.restoration.change import Change
 from torchmask.restoration.checkpoint import Progress
 from torchmask.restoration.finish import Finisher
 from torchmask.restoration.forward import ExposureModel
@@ -92,7 +93,9 @@ def ended(
 ):
     progress = Progress(Candidates(state, 1), finer=finer)
     listen = None if records is None else records.append
-    finisher = Finisher(setting, schedule, minimizer or ProjectedLBFGS(), listen, traits, lambda progress: None, 1e3)
+    finisher = Finisher(
+        setting, schedule, minimizer or ProjectedLBFGS(), listen, traits, lambda progress: None, Change(100.0, 10)
+    )
     return finisher.finish(objective, progress, end), progress
 
 
@@ -206,18 +209,18 @@ def test_a_search_under_a_lighter_prior_descends_under_the_given_one_again(
     monkeypatch.setattr(finish, "recalibrate", recalibrate)
     monkeypatch.setattr(finish, "integrate_aberrations", integrate)
     schedule = Schedule(faint_segments=3, segment=4)
-    end_rate, light = 0.8, 60.0
+    end_rate, change = 0.8, Change(6.0, 10)
     state = replace(state, image=state.image * rate_of_slopes(state.image) / end_rate / 2**n_segments)
     progress = Progress(Candidates(state, 1), rate=rate)
     finisher = Finisher(
-        Setting.of(objective), schedule, ProjectedLBFGS(), records.append, TRAITS, lambda progress: None, light
+        Setting.of(objective), schedule, ProjectedLBFGS(), records.append, TRAITS, lambda progress: None, change
     )
     finisher.finish(objective.with_changes(prior=prior), progress, End.INTEGRATION)
     *segments, own, image = course
     assert segments == n_segments * ["recalibrated", (prior, 4)]
     assert torch.equal(image, 2**n_segments * state.image)
-    assert repr(own) == repr(prior.suited_to(image, light))
-    assert own.weight == prior.weight * (light / 40 if isinstance(prior, TotalVariation) else 1)
+    assert repr(own) == repr(prior.suited_to(image, change))
+    assert own.weight == prior.weight * (change.light / 40 if isinstance(prior, TotalVariation) else 1)
     assert progress.n_evaluations == 7 * n_segments
     assert [(record.stage, record.step) for record in records] == [
         ("before integration", number + 1) for number in range(n_segments)

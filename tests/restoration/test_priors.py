@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import nn
 
+from torchmask.restoration.change import Change
 from torchmask.restoration.given_prior import FunctionPrior, as_prior, check_prior
 from torchmask.restoration.priors import (
     EdgePreserving,
@@ -14,7 +15,7 @@ from torchmask.restoration.priors import (
     SmoothVariation,
     TotalVariation,
 )
-from torchmask.restoration.slopes import divergence, gradient
+from torchmask.restoration.slopes import divergence, gradient, rate_of_slopes
 
 
 def squares(image):
@@ -167,12 +168,12 @@ def test_a_variation_suited_to_an_object_has_the_scale_of_its_gradients():
     point = torch.zeros(8, 8, dtype=torch.float64)
     point[3, 3] = 5.0  # gradients of 5, 5 and 5 sqrt 2
     rate = 3 * (2 + 2**0.5) / (5 * 4)
-    suited = TotalVariation(2.0, 0.3).suited_to(point, 0.0)
+    suited = TotalVariation(2.0, 0.3).suited_to(point, None)
     assert isinstance(suited, SmoothVariation)
     assert suited.weight == pytest.approx(2 * rate, rel=1e-12)
     assert suited.epsilon == 0.3
     wide = nn.functional.pad(point, (0, 20, 0, 30))  # a dark sky says nothing of the object
-    assert TotalVariation().suited_to(wide, 0.0).weight == pytest.approx(rate, rel=1e-12)
+    assert TotalVariation().suited_to(wide, None).weight == pytest.approx(rate, rel=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -192,7 +193,26 @@ def test_gentle_slopes_suit_a_heavier_prior_the_more_light_has_bent_them(rate, l
     """Up to twice the weight and never a lighter one; steep slopes are taken as they are."""
     point = torch.zeros(8, 8, dtype=torch.float64)
     point[3, 3] = 3 * (2 + 2**0.5) / (4 * rate)
-    assert TotalVariation(3.0).suited_to(point, light).weight == pytest.approx(3 * suits, rel=1e-12)
+    suited = TotalVariation(3.0).suited_to(point, Change(light / 10, 10))
+    assert suited.weight == pytest.approx(3 * suits, rel=1e-12)
+
+
+@pytest.mark.parametrize("n_frames", [2, 10, 200])
+@pytest.mark.parametrize(
+    ("beyond_noise", "factor"), [(0.6, 1.0), (0.51, 1.0), (0.4, 0.8), (0.2, 0.4), (0.1, 0.25), (-0.1, 0.25)]
+)
+def test_slopes_in_frames_of_hardly_more_than_noise_suit_a_lighter_prior(beyond_noise, factor, n_frames):
+    """However many there are, and gentle or not: that a prior of 1.4 follows from the light is not believed there."""
+    for rate in (0.3, 1.6):
+        point = torch.zeros(8, 8, dtype=torch.float64)
+        point[3, 3] = 3 * (2 + 2**0.5) / (4 * rate)
+        change = Change(beyond_noise + 1 - 1 / n_frames, n_frames)
+        suits = max(rate, min(change.light / 40, 2.0)) if factor == 1 and rate > 0.4 else rate * factor
+        assert TotalVariation(3.0).suited_to(point, change).weight == pytest.approx(3 * suits, rel=1e-9)
+
+
+def test_a_single_frame_does_not_tell_how_much_frames_change():
+    assert TotalVariation().suited_to(rough(), Change(0.0, 1)).weight == pytest.approx(rate_of_slopes(rough()))
 
 
 def test_gradients_of_one_rate_are_known_by_it():
@@ -204,7 +224,7 @@ def test_gradients_of_one_rate_are_known_by_it():
         heights = lengths.sample().double()
     stripes = torch.zeros(1, 4 * n, dtype=torch.float64)
     stripes[0, ::4] = heights  # each has two slopes, and flat pixels beside it
-    found = TotalVariation().suited_to(stripes, 0.0).weight
+    found = TotalVariation().suited_to(stripes, None).weight
     assert abs(found / rate - 1) < 4 * (0.5 + (120 / 36 - 1)) ** 0.5 / n**0.5  # of E|g|, and of E|g|^2: 120 / mu^4
 
 
@@ -222,11 +242,11 @@ def test_a_search_in_faint_light_has_a_lighter_prior_for_an_object_of_steep_slop
 def test_priors_without_a_scale_stay_as_they_are():
     flat = torch.full((4, 4), 3.0)
     for prior in (EdgePreserving(), as_prior(squares), TotalVariation()):
-        assert prior.suited_to(flat, 100.0) is prior
+        assert prior.suited_to(flat, Change(10.0, 10)) is prior
     for prior in (EdgePreserving(), as_prior(squares)):
         assert prior.in_search(0.3) is prior
     other = EdgePreserving()
-    assert other.suited_to(rough(), 100.0) is other
+    assert other.suited_to(rough(), Change(10.0, 10)) is other
 
 
 def test_edge_preserving_is_quadratic_in_slopes_and_linear_in_edges():

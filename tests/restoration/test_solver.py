@@ -597,7 +597,7 @@ def test_any_later_start_in_faint_frames_may_be_given_up(starts, faint, explaine
 
 def test_frames_are_faint_by_how_they_change(explained):
     objective, _ = explained
-    change = FrameStack(objective.frames, torch.ones_like(objective.frames, dtype=torch.bool), 1.0, 0.03**2).change
+    change = FrameStack(objective.frames, torch.ones_like(objective.frames, dtype=torch.bool), 1.0, 0.03**2).change.each
     for faint, end in ((0.99 * change, End.BOTH), (1.01 * change, End.INTEGRATION)):
         assert solver_of(objective, schedule=Schedule(faint=faint, noisy=math.inf)).end is end
 

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 from torchmask.record import Callback
 from torchmask.restoration.calibration import calibrate, recalibrate
+from torchmask.restoration.change import Change
 from torchmask.restoration.checkpoint import Progress
 from torchmask.restoration.cross_validation import choose_prior
 from torchmask.restoration.descent import Variables, descend
@@ -37,8 +38,8 @@ from torchmask.restoration.traits import End, Traits
 class Finisher:
     """Finishes restorations whose search has ended.
 
-    `save` is called after every segment of the last descent, which goes on where an interrupted one was. `light` is the
-    change from frame to frame, in noise variances, times the number of frames.
+    `save` is called after every segment of the last descent, which goes on where an interrupted one was. `change` is
+    that of the frames.
     """
 
     setting: Setting
@@ -47,7 +48,7 @@ class Finisher:
     callback: Callback | None
     traits: Traits
     save: Callable[[Progress], None]
-    light: float
+    change: Change
 
     def finish(self, objective: MyopicObjective, ended: Progress, end: End) -> MyopicObjective:
         """Update `ended`, and return the objective of its state."""
@@ -60,8 +61,8 @@ class Finisher:
             rounds = self.schedule.fine_rounds if end.descends else self.schedule.rounds
             how = (self.schedule, self.minimizer, self.callback)
             known = {"seed": self.traits.seed, "follow_r0": self.traits.r0_is_open}
-            light = 0.0 if end.descends else self.light  # slopes are trusted where a last descent has found them
-            objective = objective.with_changes(prior=prior.suited_to(ended.state.image, light))
+            change = None if end.descends else self.change  # slopes are trusted where a last descent has found them
+            objective = objective.with_changes(prior=prior.suited_to(ended.state.image, change))
             ended.state, spent = integrate_aberrations(objective, ended.state, rounds, *how, **known)
             ended.n_evaluations += spent
             ended.integrated = True

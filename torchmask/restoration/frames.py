@@ -13,6 +13,7 @@ from torchmask.grid import Grid
 from torchmask.observation import check_frames
 from torchmask.optics.aperture import Aperture
 from torchmask.restoration.background import Background, check_known_level
+from torchmask.restoration.change import Change
 from torchmask.restoration.noise import FrameNoise, check_errors, even_photons, expected_variance, photon_slope
 
 Array = Tensor | np.ndarray
@@ -106,11 +107,11 @@ class FrameStack:
         return weight.to(self.frames) * (self.unit**2 / self.variance)
 
     @property
-    def change(self) -> float:
-        """Chi-square per valid pixel of the frames against their mean, scaled to the light of each frame."""
+    def change(self) -> Change:
+        """How much the frames change, against their mean scaled to the light of each."""
         light = self.frames - self.free.first_guess(self.frames)
         moved = light - light.mean((1, 2), keepdim=True) * light.mean(0)
-        return float((moved**2 * self.precision).sum() / self.valid.sum())
+        return Change(float((moved**2 * self.precision).sum() / self.valid.sum()), len(self))
 
     @property
     def contrast(self) -> float:

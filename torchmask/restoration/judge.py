@@ -36,7 +36,7 @@ class Judge:
     def __init__(
         self, setting: Setting, stack: FrameStack, traits: Traits, schedule: Schedule, end: End = End.NONE
     ) -> None:
-        least = schedule.missed * stack.change if traits.many_minima else 0.0  # allows for its usual minima
+        least = schedule.missed * stack.change.each if traits.many_minima else 0.0  # allows for its usual minima
         self.setting: Setting = setting
         self.traits: Traits = traits
         self.schedule: Schedule = schedule

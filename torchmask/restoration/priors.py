@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from torchmask.numbers import require
+from torchmask.restoration.change import Change
 from torchmask.restoration.slopes import divergence, gradient, rate_in_noise, rate_of_slopes
 
 _PROBES = 8  # random vectors that estimate the diagonal of a Hessian
@@ -64,10 +65,10 @@ class ObjectPrior(nn.Module):
         """
         return self
 
-    def suited_to(self, image: Tensor, light: float) -> ObjectPrior:
+    def suited_to(self, image: Tensor, change: Change | None) -> ObjectPrior:
         """Return the prior at the scale of an object (H', W') that was restored: the same one where it knows none.
 
-        `light` is the change from frame to frame in noise variances, times the number of frames.
+        Its slopes are judged by the `change` of faint frames, or trusted if that is None.
         """
         return self
 
@@ -137,12 +138,12 @@ class TotalVariation(ObjectPrior):
         lighter.weight = self.weight * max(rate, _LIGHTEST)
         return lighter
 
-    def suited_to(self, image: Tensor, light: float) -> ObjectPrior:
+    def suited_to(self, image: Tensor, change: Change | None) -> ObjectPrior:
         """Return a `SmoothVariation` whose weight suits the gradients of `image` (H', W'): `weight` times their rate.
 
         See `rate_in_noise`. An image without gradients leaves the prior as it is.
         """
-        rate = rate_in_noise(image, light)
+        rate = rate_of_slopes(image) if change is None else rate_in_noise(image, change)
         return SmoothVariation(self.weight * rate, epsilon=self.epsilon) if rate > 0 else self
 
     def family(self, image: Tensor) -> tuple[ObjectPrior, ...]:
@@ -150,8 +151,7 @@ class TotalVariation(ObjectPrior):
 
         The slopes have to suit more than 1 for those above it, as bright frames of a full pupil take long to tell.
         """
-        heaviest = _FACTORS[0] if rate_of_slopes(image) > 1 else 1.0
-        return tuple(self._smooth(factor) for factor in _FACTORS if factor <= heaviest)
+        return tuple(self._smooth(factor) for factor in _FACTORS if factor <= 1 or rate_of_slopes(image) > 1)
 
     def choices(self, image: Tensor | None) -> tuple[ObjectPrior, ...]:
         """Return `SmoothVariation` of several weights for bright frames of an object, so far `image` (H', W').

@@ -94,15 +94,15 @@ class Solver:
         self.callback: Callback | None = callback
         self._how: tuple[Traits, Schedule, Minimizer] = (traits, schedule, minimizer)
         self._limits: tuple[int, int] = (traits.max_iterations, schedule.start_iterations)
-        self.first_inflation: float = max(1.0, stack.change / schedule.first_inflation)
+        self.first_inflation: float = max(1.0, stack.change.each / schedule.first_inflation)
         turbulent = Free.ABERRATIONS in objective.free and traits.prior_on_aberrations and not traits.estimated
         self.prior_r0: float | None = traits.r0 if turbulent else None  # of the aberrations' prior, at first [m]
         many_ends = turbulent and Free.OBJECT in objective.free and traits.many_minima
         self.averages: bool = many_ends and schedule.averaged > 1
         retrievable = objective.model.pupil.n_rasters == 1 and len(objective.frames) > 1
         self.retrieves: bool = many_ends and schedule.retrievals > 0 and retrievable
-        self.light: float = stack.change * len(stack.frames)
-        self.end: End = End.of(stack.change, traits, schedule, objective.free)
+        self.stack: FrameStack = stack
+        self.end: End = End.of(stack.change.each, traits, schedule, objective.free)
         self.given: ObjectPrior = objective.prior
         self.judge: Judge = Judge(self.setting, stack, traits, schedule, self.end)
 
@@ -125,7 +125,7 @@ class Solver:
         if self.end is not End.NONE and (ended.starts > 1 or not cut_short):
             how = (self.schedule, self.minimizer, self.callback, self.traits, save_nothing if cut_short else save)
             given = self.objective.with_changes(prior=self.given)
-            self.objective = Finisher(self.setting, *how, self.light).finish(given, ended, self.end)
+            self.objective = Finisher(self.setting, *how, self.stack.change).finish(given, ended, self.end)
         return ended
 
     def begin(self, known: Known, start: RestorationResult | None) -> Progress:
