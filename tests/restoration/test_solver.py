@@ -138,13 +138,12 @@ def test_every_segment_is_saved(explained):
 # --- when it starts again
 
 
-def test_noise_falls_from_a_share_of_the_change_which_adds_up_to_the_light_of_all_frames(explained):
+def test_noise_falls_from_a_share_of_the_change(explained):
     objective, _ = explained
     frames = objective.frames
     change = float(((frames - frames.mean((1, 2), keepdim=True) * frames.mean(0)) ** 2).mean() * objective.precision)
     assert solver_of(objective).first_inflation == pytest.approx(max(1, change / 30))
     assert solver_of(objective, schedule=Schedule(first_inflation=1e9)).first_inflation == 1
-    assert solver_of(objective).light == pytest.approx(change * len(frames))
 
 
 def test_the_truth_is_explained_as_far_as_the_schedule_asks(explained):
@@ -593,6 +592,26 @@ def test_any_later_start_in_faint_frames_may_be_given_up(starts, faint, explaine
     begun = Progress(Candidates(poor, 1), [], starts=starts, rival=Ending(truth, Status.CONVERGED))
     progress = solver_of(objective, schedule=schedule, max_iterations=20).run(begun, True, lambda _: None)
     assert len(progress.costs) == (20 if faint == 0 and starts == 5 else 5)
+
+
+def test_the_end_is_told_how_much_how_many_frames_change(explained, monkeypatch):
+    objective, state = explained
+    told = []
+
+    class Finisher:
+        def __init__(self, *given):
+            told.append(given[-1])
+
+        def finish(self, objective, ended, end):
+            return objective
+
+    monkeypatch.setattr(solver, "Finisher", Finisher)
+    restoring = solver_of(objective, schedule=Schedule(faint=math.inf, starts=1, faint_starts=1, **BRISK))
+    monkeypatch.setattr(restoring, "run", lambda *given: Progress(Candidates(state, 1), starts=2))
+    restoring.solve(Known.of(None, None, None))
+    (change,) = told
+    assert change.n_frames == len(objective.frames)
+    assert change.each == pytest.approx(30 * restoring.first_inflation)
 
 
 def test_frames_are_faint_by_how_they_change(explained):
