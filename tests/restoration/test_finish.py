@@ -94,7 +94,7 @@ def ended(
     progress = Progress(Candidates(state, 1), finer=finer)
     listen = None if records is None else records.append
     finisher = Finisher(
-        setting, schedule, minimizer or ProjectedLBFGS(), listen, traits, lambda progress: None, Change(100.0, 10)
+        setting, schedule, minimizer or ProjectedLBFGS(), listen, traits, lambda progress: None, Change(100.0, 10, 4096)
     )
     return finisher.finish(objective, progress, end), progress
 
@@ -209,7 +209,7 @@ def test_a_search_under_a_lighter_prior_descends_under_the_given_one_again(
     monkeypatch.setattr(finish, "recalibrate", recalibrate)
     monkeypatch.setattr(finish, "integrate_aberrations", integrate)
     schedule = Schedule(faint_segments=3, segment=4)
-    end_rate, change = 0.8, Change(6.0, 10)
+    end_rate, change = 0.8, Change(6.0, 10, 4096)
     state = replace(state, image=state.image * rate_of_slopes(state.image) / end_rate / 2**n_segments)
     progress = Progress(Candidates(state, 1), rate=rate)
     finisher = Finisher(

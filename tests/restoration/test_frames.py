@@ -53,6 +53,7 @@ def test_change_is_the_chi_square_against_the_mean_frame():
     stack = FrameStack.of(exposures(n_frames=8), None, GRID, PUPIL, READOUT)
     degrees = stack.frames.numel() * (1 - 1 / 8)
     assert stack.change.n_frames == len(stack)
+    assert stack.change.n_pixels == pytest.approx(float(stack.valid.sum()) / len(stack))
     assert stack.change.each == pytest.approx(1 - 1 / 8, abs=4 * math.sqrt(2 / degrees))
     frames = exposures()[:1] * torch.tensor([0.5, 1.0, 1.5]).double()[:, None, None]
     scaled = FrameStack.of(frames, None, GRID, PUPIL, None)

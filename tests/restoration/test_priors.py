@@ -193,26 +193,27 @@ def test_gentle_slopes_suit_a_heavier_prior_the_more_light_has_bent_them(rate, l
     """Up to twice the weight and never a lighter one; steep slopes are taken as they are."""
     point = torch.zeros(8, 8, dtype=torch.float64)
     point[3, 3] = 3 * (2 + 2**0.5) / (4 * rate)
-    suited = TotalVariation(3.0).suited_to(point, Change(light / 10, 10))
+    suited = TotalVariation(3.0).suited_to(point, Change(light / 10, 10, 4096))
     assert suited.weight == pytest.approx(3 * suits, rel=1e-12)
 
 
+@pytest.mark.parametrize("n_pixels", [4096, 16384])
 @pytest.mark.parametrize("n_frames", [2, 10, 200])
 @pytest.mark.parametrize(
-    ("beyond_noise", "factor"), [(0.6, 1.0), (0.51, 1.0), (0.4, 0.8), (0.2, 0.4), (0.1, 0.25), (-0.1, 0.25)]
+    ("beyond_noise", "factor"), [(2400, 1.0), (2049, 1.0), (1638.4, 0.8), (819.2, 0.4), (400, 0.25), (-400, 0.25)]
 )
-def test_slopes_in_frames_of_hardly_more_than_noise_suit_a_lighter_prior(beyond_noise, factor, n_frames):
-    """However many there are, and gentle or not: that a prior of 1.4 follows from the light is not believed there."""
+def test_slopes_in_frames_of_hardly_more_than_noise_suit_a_lighter_prior(beyond_noise, factor, n_frames, n_pixels):
+    """However many there are, and gentle or not, and however fine their pixels; nothing is held by the light there."""
     for rate in (0.3, 1.6):
         point = torch.zeros(8, 8, dtype=torch.float64)
         point[3, 3] = 3 * (2 + 2**0.5) / (4 * rate)
-        change = Change(beyond_noise + 1 - 1 / n_frames, n_frames)
+        change = Change(beyond_noise / n_pixels + 1 - 1 / n_frames, n_frames, n_pixels)
         suits = max(rate, min(change.light / 40, 2.0)) if factor == 1 and rate > 0.4 else rate * factor
         assert TotalVariation(3.0).suited_to(point, change).weight == pytest.approx(3 * suits, rel=1e-9)
 
 
 def test_a_single_frame_does_not_tell_how_much_frames_change():
-    assert TotalVariation().suited_to(rough(), Change(0.0, 1)).weight == pytest.approx(rate_of_slopes(rough()))
+    assert TotalVariation().suited_to(rough(), Change(0.0, 1, 4096)).weight == pytest.approx(rate_of_slopes(rough()))
 
 
 def test_gradients_of_one_rate_are_known_by_it():
@@ -242,11 +243,11 @@ def test_a_search_in_faint_light_has_a_lighter_prior_for_an_object_of_steep_slop
 def test_priors_without_a_scale_stay_as_they_are():
     flat = torch.full((4, 4), 3.0)
     for prior in (EdgePreserving(), as_prior(squares), TotalVariation()):
-        assert prior.suited_to(flat, Change(10.0, 10)) is prior
+        assert prior.suited_to(flat, Change(10.0, 10, 4096)) is prior
     for prior in (EdgePreserving(), as_prior(squares)):
         assert prior.in_search(0.3) is prior
     other = EdgePreserving()
-    assert other.suited_to(rough(), Change(10.0, 10)) is other
+    assert other.suited_to(rough(), Change(10.0, 10, 4096)) is other
 
 
 def test_edge_preserving_is_quadratic_in_slopes_and_linear_in_edges():

@@ -10,22 +10,28 @@ class Change(NamedTuple):
 
     each : chi-square of the frames against their mean, per pixel
     n_frames : number of frames, T
+    n_pixels : number of valid pixels of a frame, on average
 
     Examples
     --------
-    >>> Change(each=1.4, n_frames=5).light, round(Change(each=1.4, n_frames=5).beyond_noise, 6)
-    (7.0, 0.6)
+    >>> change = Change(each=1.4, n_frames=5, n_pixels=100)
+    >>> change.light, round(change.beyond_noise, 6)
+    (7.0, 60.0)
     """
 
     each: float
     n_frames: int
+    n_pixels: float
 
     @property
     def light(self) -> float:
-        """Change of all frames together, in noise variances."""
+        """Change of a pixel in all frames together, in noise variances."""
         return self.each * self.n_frames
 
     @property
     def beyond_noise(self) -> float:
-        """Change of a frame without that of its noise, which leaves (T - 1) / T of its variance against the mean."""
-        return self.each - (1 - 1 / self.n_frames)
+        """Chi-square of a frame without that of its noise, which leaves (T - 1) / T of it against the mean.
+
+        However fine the pixels, it is what a frame shows of its aberrations.
+        """
+        return (self.each - (1 - 1 / self.n_frames)) * self.n_pixels

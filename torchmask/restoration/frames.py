@@ -111,7 +111,9 @@ class FrameStack:
         """How much the frames change, against their mean scaled to the light of each."""
         light = self.frames - self.free.first_guess(self.frames)
         moved = light - light.mean((1, 2), keepdim=True) * light.mean(0)
-        return Change(float((moved**2 * self.precision).sum() / self.valid.sum()), len(self))
+        n_valid = self.valid.sum()
+        each = (moved**2 * self.precision).sum() / n_valid
+        return Change(float(each), len(self), float(n_valid) / len(self))
 
     @property
     def contrast(self) -> float:
