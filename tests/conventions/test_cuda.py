@@ -114,7 +114,8 @@ def test_a_search_and_a_refinement(method, constraints):
     assert found.mse == pytest.approx(expected.mse, rel=0.2)
     refined = refine_mask(criterion, found.aperture, budget=40, constraints=constraints)
     assert refined.aperture.centers.is_cuda
-    assert refined.mse < 1.001 * found.mse
+    assert refined.mse <= found.mse
+    assert found.aperture.centers.is_cuda  # as before: the refinement has a copy of its own
 
 
 def test_errors_of_machining():
