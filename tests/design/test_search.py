@@ -85,6 +85,7 @@ def test_a_short_refinement_makes_no_mask_worse(constraints, dtype):
     given = search_mask(criterion, 6, 1.0, 0.1, method="cma", budget=96, constraints=constraints).aperture.to(dtype)
     refined = refine_mask(criterion, given, budget=10, constraints=constraints)
     assert refined.mse <= float(criterion(given))
+    assert refine_mask(criterion, given, budget=1, constraints=constraints).evaluations == 1
     last = float(refined.history["design/refine"][-1, 1])  # of the mask projected once more
     assert last == pytest.approx(refined.relative_mse, rel=10 * torch.finfo(dtype).eps)
 

@@ -220,7 +220,8 @@ def polish(
             descent.restart(slice(None), descent.points.clone())
     candidates, failure = _feasible(holes, descent.points, monitor)
     if known is not None:
-        candidates.append(known)
+        # where the budget ends before all are measured, the known one is
+        candidates = [*candidates, known][-max(1, budget - merit.evaluations) :]
     if not candidates:
         raise failure
     with torch.no_grad():
