@@ -17,6 +17,8 @@ from torchmask.restoration.priors import (
 )
 from torchmask.restoration.slopes import divergence, gradient, rate_of_slopes
 
+ONE_FRAME = Change(20.0, 1, 4096)  # which says nothing of how gentle slopes are
+
 
 def squares(image):
     """As a stranger writes one."""
@@ -72,6 +74,13 @@ each_prior = pytest.mark.parametrize("make", PRIORS.values(), ids=PRIORS.keys())
 
 def rough(rows=6, columns=7, seed=0, dtype=torch.float64):
     return torch.rand(rows, columns, dtype=dtype, generator=torch.Generator().manual_seed(seed))
+
+
+def point_of(rate):
+    """An object whose slopes have this rate."""
+    point = torch.zeros(8, 8, dtype=torch.float64)
+    point[3, 3] = 3 * (2 + 2**0.5) / (4 * rate)
+    return point
 
 
 def exact_gradient(prior, image):
@@ -168,12 +177,12 @@ def test_a_variation_suited_to_an_object_has_the_scale_of_its_gradients():
     point = torch.zeros(8, 8, dtype=torch.float64)
     point[3, 3] = 5.0  # gradients of 5, 5 and 5 sqrt 2
     rate = 3 * (2 + 2**0.5) / (5 * 4)
-    suited = TotalVariation(2.0, 0.3).suited_to(point, None)
+    suited = TotalVariation(2.0, 0.3).suited_to(point, ONE_FRAME)
     assert isinstance(suited, SmoothVariation)
     assert suited.weight == pytest.approx(2 * rate, rel=1e-12)
     assert suited.epsilon == 0.3
     wide = nn.functional.pad(point, (0, 20, 0, 30))  # a dark sky says nothing of the object
-    assert TotalVariation().suited_to(wide, None).weight == pytest.approx(rate, rel=1e-12)
+    assert TotalVariation().suited_to(wide, ONE_FRAME).weight == pytest.approx(rate, rel=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -191,9 +200,16 @@ def test_a_variation_suited_to_an_object_has_the_scale_of_its_gradients():
 )
 def test_gentle_slopes_suit_a_heavier_prior_the_more_light_has_bent_them(rate, light, suits):
     """Up to twice the weight and never a lighter one; steep slopes are taken as they are."""
-    point = torch.zeros(8, 8, dtype=torch.float64)
-    point[3, 3] = 3 * (2 + 2**0.5) / (4 * rate)
-    suited = TotalVariation(3.0).suited_to(point, Change(light / 10, 10, 4096))
+    suited = TotalVariation(3.0).suited_to(point_of(rate), Change(light / 20, 20, 4096))
+    assert suited.weight == pytest.approx(3 * suits, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("rate", "each", "suits"), [(0.45, 4.9, 2.0), (0.45, 5.1, 0.45), (0.51, 5.1, 2.0), (0.49, 29.0, 0.49)]
+)
+def test_slopes_of_a_last_descent_are_gentle_from_a_higher_rate_on(rate, each, suits):
+    """It follows a search where frames change by five noise variances and more."""
+    suited = TotalVariation(3.0).suited_to(point_of(rate), Change(each, 20, 4096))
     assert suited.weight == pytest.approx(3 * suits, rel=1e-12)
 
 
@@ -205,11 +221,9 @@ def test_gentle_slopes_suit_a_heavier_prior_the_more_light_has_bent_them(rate, l
 def test_slopes_in_frames_of_hardly_more_than_noise_suit_a_lighter_prior(beyond_noise, factor, n_frames, n_pixels):
     """However many there are, and gentle or not, and however fine their pixels; nothing is held by the light there."""
     for rate in (0.3, 1.6):
-        point = torch.zeros(8, 8, dtype=torch.float64)
-        point[3, 3] = 3 * (2 + 2**0.5) / (4 * rate)
         change = Change(beyond_noise / n_pixels + 1 - 1 / n_frames, n_frames, n_pixels)
         suits = max(rate, min(change.light / 40, 2.0)) if factor == 1 and rate > 0.4 else rate * factor
-        assert TotalVariation(3.0).suited_to(point, change).weight == pytest.approx(3 * suits, rel=1e-9)
+        assert TotalVariation(3.0).suited_to(point_of(rate), change).weight == pytest.approx(3 * suits, rel=1e-9)
 
 
 def test_a_single_frame_does_not_tell_how_much_frames_change():
@@ -225,7 +239,7 @@ def test_gradients_of_one_rate_are_known_by_it():
         heights = lengths.sample().double()
     stripes = torch.zeros(1, 4 * n, dtype=torch.float64)
     stripes[0, ::4] = heights  # each has two slopes, and flat pixels beside it
-    found = TotalVariation().suited_to(stripes, None).weight
+    found = TotalVariation().suited_to(stripes, ONE_FRAME).weight
     assert abs(found / rate - 1) < 4 * (0.5 + (120 / 36 - 1)) ** 0.5 / n**0.5  # of E|g|, and of E|g|^2: 120 / mu^4
 
 

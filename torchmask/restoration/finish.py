@@ -61,8 +61,7 @@ class Finisher:
             rounds = self.schedule.fine_rounds if end.descends else self.schedule.rounds
             how = (self.schedule, self.minimizer, self.callback)
             known = {"seed": self.traits.seed, "follow_r0": self.traits.r0_is_open}
-            change = None if end.descends else self.change  # slopes are trusted where a last descent has found them
-            objective = objective.with_changes(prior=prior.suited_to(ended.state.image, change))
+            objective = objective.with_changes(prior=prior.suited_to(ended.state.image, self.change))
             ended.state, spent = integrate_aberrations(objective, ended.state, rounds, *how, **known)
             ended.n_evaluations += spent
             ended.integrated = True

@@ -65,10 +65,10 @@ class ObjectPrior(nn.Module):
         """
         return self
 
-    def suited_to(self, image: Tensor, change: Change | None) -> ObjectPrior:
+    def suited_to(self, image: Tensor, change: Change) -> ObjectPrior:
         """Return the prior at the scale of an object (H', W') that was restored: the same one where it knows none.
 
-        Its slopes are judged by the `change` of faint frames, or trusted if that is None.
+        Its slopes are judged by the `change` of the noisy frames that show it.
         """
         return self
 
@@ -138,12 +138,12 @@ class TotalVariation(ObjectPrior):
         lighter.weight = self.weight * max(rate, _LIGHTEST)
         return lighter
 
-    def suited_to(self, image: Tensor, change: Change | None) -> ObjectPrior:
+    def suited_to(self, image: Tensor, change: Change) -> ObjectPrior:
         """Return a `SmoothVariation` whose weight suits the gradients of `image` (H', W'): `weight` times their rate.
 
         See `rate_in_noise`. An image without gradients leaves the prior as it is.
         """
-        rate = rate_of_slopes(image) if change is None else rate_in_noise(image, change)
+        rate = rate_in_noise(image, change)
         return SmoothVariation(self.weight * rate, epsilon=self.epsilon) if rate > 0 else self
 
     def family(self, image: Tensor) -> tuple[ObjectPrior, ...]:
