@@ -205,7 +205,7 @@ def test_gentle_slopes_suit_a_heavier_prior_the_more_light_has_bent_them(rate, l
 
 
 @pytest.mark.parametrize(
-    ("rate", "each", "suits"), [(0.45, 4.9, 2.0), (0.45, 5.1, 0.45), (0.51, 5.1, 2.0), (0.49, 29.0, 0.49)]
+    ("rate", "each", "suits"), [(0.45, 4.9, 2.0), (0.45, 5.1, 0.45), (0.54, 5.1, 2.0), (0.52, 29.0, 0.52)]
 )
 def test_slopes_of_a_last_descent_are_gentle_from_a_higher_rate_on(rate, each, suits):
     """It follows a search where frames change by five noise variances and more."""

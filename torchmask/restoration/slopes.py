@@ -7,7 +7,7 @@ from torch import Tensor
 from torchmask.restoration.change import Change
 
 _GENTLE = 0.4  # rate above which slopes are gentle: faint frames find 0.10 to 0.23 for satellites, 0.46 on for balls
-_GENTLE_AT_END = 0.5  # the same after a last descent, which leaves 0.43 of a satellite, 0.67 on of asteroids and balls
+_GENTLE_AT_END = 0.53  # after a last descent: it leaves up to 0.47 of satellites, 0.59 on of asteroids and balls
 _FAINT = 5.0  # change, in noise variances, from which on a last descent has gone before, see `Schedule.faint`
 _LIGHT = 40.0  # change of all frames, in noise variances, from which on the rate of gentle slopes is at least 1
 _LEAST = 2.0  # the highest least rate: up to 8 tried
@@ -32,7 +32,7 @@ def rate_in_noise(image: Tensor, change: Change) -> float:
 
     These bend to the noise of their frames, and an object that follows it has slopes that are steeper than the true
     ones. What the fit gains by that grows with the light, so from a light of 40 on gentle slopes have at least the rate
-    light / 40, up to 2: those of a rate above 0.4, or 0.5 where a last descent has found them. Where frames change by
+    light / 40, up to 2: those of a rate above 0.4, or 0.53 where a last descent has found them. Where frames change by
     hardly more than their noise, on the other hand, the prior has smoothed what it has found, and would smooth it the
     more: below a chi-square of 2048 beyond noise, in a frame, the rate falls in proportion, down to a quarter. A single
     frame does not tell. The limits are empirical.
