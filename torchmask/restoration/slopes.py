@@ -5,10 +5,10 @@ from __future__ import annotations
 from torch import Tensor
 
 from torchmask.restoration.change import Change
+from torchmask.restoration.schedule import Schedule
 
 _GENTLE = 0.4  # rate above which slopes are gentle: faint frames find 0.10 to 0.23 for satellites, 0.46 on for balls
 _GENTLE_AT_END = 0.53  # after a last descent: it leaves up to 0.47 of satellites, 0.59 on of asteroids and balls
-_FAINT = 5.0  # change, in noise variances, from which on a last descent has gone before, see `Schedule.faint`
 _LIGHT = 40.0  # change of all frames, in noise variances, from which on the rate of gentle slopes is at least 1
 _LEAST = 2.0  # the highest least rate: up to 8 tried
 _SHOWN = 2048.0  # chi-square of a frame beyond noise below which it is the prior that has made slopes gentle
@@ -38,7 +38,7 @@ def rate_in_noise(image: Tensor, change: Change) -> float:
     frame does not tell. The limits are empirical.
     """
     rate, least = rate_of_slopes(image), min(change.light / _LIGHT, _LEAST)
-    gentle = _GENTLE if change.each < _FAINT else _GENTLE_AT_END
+    gentle = _GENTLE if change.each < Schedule.faint else _GENTLE_AT_END  # from there on a last descent goes before
     shown = change.beyond_noise / _SHOWN if change.n_frames > 1 else 1.0
     if shown < 1:
         return rate * max(shown, _SMALLEST)
