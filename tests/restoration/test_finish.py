@@ -10,7 +10,7 @@ from torchmask.grid import Grid
 from torchmask.metrics import relative_error
 from torchmask.optics.aperture import FullAperture
 from torchmask.optics.band import Band
-from torchmask.restoration import finish, myopic
+from torchmask.restoration import finish, myopic, spectrum
 from torchmask.restoration.aberrations import moving_basis, turbulent_basis
 from torchmask.restoration.background import Background
 from torchmask.restoration.calibration import fit_of_frames
@@ -27,8 +27,9 @@ from torchmask.restoration.priors import EdgePreserving, SmoothVariation, TotalV
 from torchmask.restoration.projected_lbfgs import Minimum, ProjectedLBFGS
 from torchmask.restoration.recipe import ModelRecipe
 from torchmask.restoration.schedule import Schedule
-from torchmask.restoration.slopes import rate_of_slopes
+from torchmask.restoration.slopes import gradient, rate_of_slopes
 from torchmask.restoration.solver import Solver
+from torchmask.restoration.spectrum import Power
 from torchmask.restoration.traits import End, Refinement, Traits
 from torchmask.simulation.scene import SceneOptions, make_scene
 
@@ -190,7 +191,7 @@ def test_a_search_under_a_lighter_prior_descends_under_the_given_one_again(
 ):
     """With the noise estimated anew each time; the integration begins from there, under a prior of that scale."""
     objective, state = explained
-    course, records = [], []
+    course, records, asked = [], [], []
 
     def descend(objective, state, n_iterations, minimizer, listen):
         course.append((objective.prior, n_iterations))
@@ -208,6 +209,7 @@ def test_a_search_under_a_lighter_prior_descends_under_the_given_one_again(
     monkeypatch.setattr(finish, "descend", descend)
     monkeypatch.setattr(finish, "recalibrate", recalibrate)
     monkeypatch.setattr(finish, "integrate_aberrations", integrate)
+    monkeypatch.setattr(finish, "shows_gentle_slopes", lambda objective, state, change: asked.append(change) or True)
     schedule = Schedule(faint_segments=3, segment=4)
     end_rate, change = 0.8, Change(6.0, 10, 4096)
     state = replace(state, image=state.image * rate_of_slopes(state.image) / end_rate / 2**n_segments)
@@ -219,7 +221,8 @@ def test_a_search_under_a_lighter_prior_descends_under_the_given_one_again(
     *segments, own, image = course
     assert segments == n_segments * ["recalibrated", (prior, 4)]
     assert torch.equal(image, 2**n_segments * state.image)
-    assert repr(own) == repr(prior.suited_to(image, change))
+    assert asked == [change]  # whether slopes are gentle
+    assert repr(own) == repr(prior.suited_to(max(end_rate, change.light / 40)))
     assert own.weight == prior.weight * (change.light / 40 if isinstance(prior, TotalVariation) else 1)
     assert progress.n_evaluations == 7 * n_segments
     assert [(record.stage, record.step) for record in records] == [
@@ -346,16 +349,20 @@ def test_each_segment_of_the_last_descent_has_the_prior_of_its_object(end, expec
 
 
 @pytest.mark.parametrize("end", [End.INTEGRATION, End.BOTH])
-def test_gentle_slopes_are_held_in_an_integration(end, explained, monkeypatch):
-    """In as much light as `ended` says, whether a last descent has found them or not."""
+@pytest.mark.parametrize(("squares", "expected"), [(0.99, 2.0), (1.01, 0.8)])
+def test_gentle_slopes_are_held_in_an_integration(squares, expected, end, explained, monkeypatch):
+    """In as much light as `ended` says, if by the power of the frames their rate is above 0.4, whatever is found."""
     objective, state = explained
     monkeypatch.setattr(finish, "descend", lambda objective, state, *rest: state)
     monkeypatch.setattr(finish, "settle", lambda objective, state, n_iterations: state)
     monkeypatch.setattr(finish, "recalibrate", lambda objective, state, power, **more: state)
     monkeypatch.setattr(finish, "integrate_aberrations", lambda given, state, *rest, **more: (state, 0))
     begun = replace(state, image=state.image * rate_of_slopes(state.image) / 0.8)
+    total = float(torch.hypot(*gradient(begun.image)).sum())
+    power = Power(squares * 3 * total / 0.4 / math.exp(0.3), 0.3)
+    monkeypatch.setattr(spectrum, "power_of_slopes", lambda objective, state: power)
     found, _ = ended(objective, begun, Setting.of(objective), Schedule(lost=math.inf), end=end)
-    assert found.prior.weight == pytest.approx(2.0 * objective.prior.weight, rel=1e-9)
+    assert found.prior.weight == pytest.approx(expected * objective.prior.weight, rel=1e-9)
 
 
 def test_a_result_holds_the_modes_of_the_search(observe, five_holes):

@@ -474,8 +474,9 @@ def test_aberrations_of_faint_frames_are_integrated_out(faint, traits, integrate
 class Course:
     """Stands in for the descents of a restoration, at each of whose ends the object's slopes have a given rate."""
 
-    def __init__(self, monkeypatch, truth, rates):
+    def __init__(self, monkeypatch, truth, rates, gentle=False):
         self.truth, self.rates, self.weights, self.ends = truth, list(rates), [], []
+        monkeypatch.setattr(solver, "shows_gentle_slopes", lambda objective, state, change: gentle)
         monkeypatch.setattr(solver, "descend", self.descend)
         monkeypatch.setattr(solver, "recalibrate", lambda objective, state, power, **more: state)
         monkeypatch.setattr(solver.Finisher, "finish", self.finish)
@@ -497,6 +498,15 @@ class Course:
         schedule = Schedule(faint=faint, nearly_at_rest=-math.inf, **numbers, **ALL_MISSED)
         traits = {"max_iterations": max_iterations, "tolerance": -math.inf}
         return solver_of(objective, schedule=schedule, **traits).solve(Known(**known), file=file)
+
+
+def test_a_search_whose_frames_show_gentle_slopes_keeps_the_given_prior(explained, monkeypatch):
+    """Even if those of its first sharp object are steep, as it follows noise."""
+    objective, truth = explained
+    course = Course(monkeypatch, truth, [0.9, 0.3, 0.1, 2.0, 0.6, 0.5], gentle=True)
+    progress = course.solve(objective.with_changes(prior=TotalVariation(2.0)))
+    assert course.weights == 6 * [2.0]
+    assert progress.rate == 1
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 
@@ -14,9 +15,9 @@ class Change(NamedTuple):
 
     Examples
     --------
-    >>> change = Change(each=1.4, n_frames=5, n_pixels=100)
+    >>> change = Change(each=1.4, n_frames=5, n_pixels=32 * 32)
     >>> change.light, round(change.beyond_noise, 6)
-    (7.0, 60.0)
+    (3.5, 614.4)
     """
 
     each: float
@@ -25,8 +26,12 @@ class Change(NamedTuple):
 
     @property
     def light(self) -> float:
-        """Change of a pixel in all frames together, in noise variances."""
-        return self.each * self.n_frames
+        """Change of a pixel of 64 x 64 in all frames together, in noise variances.
+
+        Finer pixels share the light of one, but the slopes between them, which are as many, add up to more: a prior of
+        slopes balances a change that falls as the square root of the number of pixels.
+        """
+        return self.each * self.n_frames * math.sqrt(self.n_pixels) / 64
 
     @property
     def beyond_noise(self) -> float:

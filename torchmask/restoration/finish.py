@@ -30,6 +30,8 @@ from torchmask.restoration.priors import ObjectPrior
 from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.retrieval import retrieve_lost_frames
 from torchmask.restoration.schedule import Schedule
+from torchmask.restoration.slopes import rate_in_noise
+from torchmask.restoration.spectrum import shows_gentle_slopes
 from torchmask.restoration.state import State
 from torchmask.restoration.traits import End, Traits
 
@@ -61,7 +63,7 @@ class Finisher:
             rounds = self.schedule.fine_rounds if end.descends else self.schedule.rounds
             how = (self.schedule, self.minimizer, self.callback)
             known = {"seed": self.traits.seed, "follow_r0": self.traits.r0_is_open}
-            objective = objective.with_changes(prior=prior.suited_to(ended.state.image, self.change))
+            objective = objective.with_changes(prior=self._suited(prior, objective, ended.state))
             ended.state, spent = integrate_aberrations(objective, ended.state, rounds, *how, **known)
             ended.n_evaluations += spent
             ended.integrated = True
@@ -114,6 +116,12 @@ class Finisher:
             return first
         ended.state = state
         return objective
+
+    def _suited(self, prior: ObjectPrior, objective: MyopicObjective, state: State) -> ObjectPrior:
+        """Return the prior at the scale of the object, as far as it has slopes."""
+        gentle = shows_gentle_slopes(objective, state, self.change)
+        rate = rate_in_noise(state.image, self.change, gentle=gentle)
+        return prior.suited_to(rate) if rate > 0 else prior
 
     def _descend_again(self, objective: MyopicObjective, ended: Progress) -> None:
         """Descend under the given prior again: a lighter one finds more, but bends aberrations to noise."""

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from torchmask.numbers import require
-from torchmask.restoration.change import Change
-from torchmask.restoration.slopes import divergence, gradient, rate_in_noise, rate_of_slopes
+from torchmask.restoration.slopes import divergence, gradient, rate_of_slopes
 
 _PROBES = 8  # random vectors that estimate the diagonal of a Hessian
 _SEED = 0
@@ -65,10 +64,10 @@ class ObjectPrior(nn.Module):
         """
         return self
 
-    def suited_to(self, image: Tensor, change: Change) -> ObjectPrior:
-        """Return the prior at the scale of an object (H', W') that was restored: the same one where it knows none.
+    def suited_to(self, rate: float) -> ObjectPrior:
+        """Return the prior at the scale of an object whose slopes have this rate: the same one where it knows none.
 
-        Its slopes are judged by the `change` of the noisy frames that show it.
+        See `rate_of_slopes`; the rate is positive.
         """
         return self
 
@@ -138,13 +137,9 @@ class TotalVariation(ObjectPrior):
         lighter.weight = self.weight * max(rate, _LIGHTEST)
         return lighter
 
-    def suited_to(self, image: Tensor, change: Change) -> ObjectPrior:
-        """Return a `SmoothVariation` whose weight suits the gradients of `image` (H', W'): `weight` times their rate.
-
-        See `rate_in_noise`. An image without gradients leaves the prior as it is.
-        """
-        rate = rate_in_noise(image, change)
-        return SmoothVariation(self.weight * rate, epsilon=self.epsilon) if rate > 0 else self
+    def suited_to(self, rate: float) -> ObjectPrior:
+        """Return a `SmoothVariation` of `weight` times the rate."""
+        return SmoothVariation(self.weight * rate, epsilon=self.epsilon)
 
     def family(self, image: Tensor) -> tuple[ObjectPrior, ...]:
         """Return `SmoothVariation` of 2.5 to 0.025 times the weight, with less weight on bends from 1 down.

@@ -1,14 +1,13 @@
 """The algorithm of a restoration: start, tournament, descent with recalibration, escapes, and further starts.
 
 The first start is from zero aberrations for a mask, and a tournament of random candidates for a full pupil. The descent
-proceeds in segments. Between two of them, the scales of the variables, the transmissions, the strength of the
-turbulence and the noise are updated; the assumed noise falls from the residual of the mean frame to the true noise, or
-to that of the model, if that is larger. Once the object is sharp, frames and object escape from local minima, and in
-faint light the prior suits it; when nothing changes any more, each frame is weighted by how well it fits. A start ends
-when a segment gains nothing, or little if it explains the frames, or its iterations are used up. Then phases of a full
-pupil's bright frames are retrieved. Others start from random aberrations or, for a mask, from twins of the best object,
-as long as they may find a better one (`judge`); the best is kept, or the mean for a full pupil. What follows is told in
-`finish`.
+proceeds in segments. Between two of them, scales, transmissions, the strength of the turbulence and the noise are
+updated; the assumed noise falls from the residual of the mean frame to the true noise or, if larger, that of the model.
+Once the object is sharp, frames and object escape from local minima, and in faint light the prior suits it; when
+nothing changes any more, each frame is weighted by how well it fits. A start ends when a segment gains nothing, or
+little if it explains the frames, or its iterations are used up. Then phases of a full pupil's bright frames are
+retrieved. Others start from random aberrations or, for a mask, from twins of the best object, as long as they may find
+a better one (`judge`); the best is kept, or the mean for a full pupil. The rest is told in `finish`.
 """
 
 from __future__ import annotations
@@ -38,6 +37,7 @@ from torchmask.restoration.result import RestorationResult
 from torchmask.restoration.retrieval import retrieve_phases
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.slopes import rate_of_slopes
+from torchmask.restoration.spectrum import shows_gentle_slopes
 from torchmask.restoration.starts import (
     Known,
     expected_parameters,
@@ -87,7 +87,6 @@ class Solver:
     ) -> None:
         self.objective: MyopicObjective = objective
         self.setting: Setting = Setting.of(objective, moving, finer)
-        self.unit: float = stack.unit
         self.traits: Traits = traits
         self.schedule: Schedule = schedule
         self.minimizer: Minimizer = minimizer
@@ -136,7 +135,7 @@ class Solver:
             narrow = self.objective.model.pupil.n_rasters == 1  # in a band a lighter prior has lost stacks
             rate = math.inf if narrow and known.nothing and self.end is End.INTEGRATION else 1.0
             return Progress(first, refinement=self.traits.refinement, rate=rate)
-        warm, n_known = start_from_result(self.objective, state, start, self.unit)
+        warm, n_known = start_from_result(self.objective, state, start, self.stack.unit)
         warm = self.setting.in_motion(warm, self.traits.seed, start.motion)
         self._place(warm)
         progress = Progress(Candidates(warm, 1), escapes=self.schedule.escapes, refinement=self.traits.refinement)
@@ -174,7 +173,8 @@ class Solver:
         """Let all starts of a faint search have the prior that suits the object of the first, once it is sharp."""
         is_sharp = progress.starts == 1 and progress.iterations >= max(self.schedule.sharp_after, 1)
         if is_sharp and math.isinf(progress.rate):
-            progress.rate = rate_of_slopes(progress.state.image) or math.inf
+            gentle = shows_gentle_slopes(self.objective, progress.state, self.stack.change)
+            progress.rate = 1.0 if gentle else rate_of_slopes(progress.state.image) or math.inf
         if progress.rate < 1:
             self.objective = self.objective.with_changes(prior=self.given.in_search(progress.rate))
 
@@ -296,5 +296,5 @@ class Solver:
         if step == 1 or step % 10 == 0:
             image, z = variables()
             coefficients = self.objective.model.aberrations.coefficients(z[: len(self.objective.frames)])
-            arrays = {"object": self.objective.model.window.crop(image) * self.unit, "coefficients": coefficients}
+            arrays = {"object": self.objective.model.window.crop(image) * self.stack.unit, "coefficients": coefficients}
         self.callback(Record("restoration", step, last, {"cost": progress.costs[-1]}, arrays))

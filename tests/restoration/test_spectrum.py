@@ -1,0 +1,126 @@
+"""The power of an object's slopes, as the power of its frames tells it."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchmask.grid import Grid
+from torchmask.restoration.aberrations import turbulent_basis
+from torchmask.restoration.change import Change
+from torchmask.restoration.forward import ExposureModel
+from torchmask.restoration.objective import MyopicObjective
+from torchmask.restoration.priors import TotalVariation
+from torchmask.restoration.slopes import gradient, rate_of_slopes
+from torchmask.restoration.spectrum import Power, power_of_slopes, shows_gentle_slopes
+from torchmask.restoration.state import State
+
+N_OBJECTS = 40
+DARK = 5.0  # objects fall off as exp(-DARK r^2), with r = 1 in the middle of each side
+ALIKE = 4 * DARK / math.pi  # area (sum of w^4) / (sum of w^2)^2 of that: so many frequencies hold one number
+BRIGHT = Change(100.0, 8, 4096)
+
+
+def squares_of(image):
+    return float(sum((step**2).sum() for step in gradient(image)))
+
+
+@pytest.fixture(scope="module")
+def seen(five_holes):
+    """Makes the objective and the true state of a random object of a known spectrum, far from the border."""
+
+    def make(seed, side=64, noise=0.3, amplitude=50.0, n_frames=8, dtype=torch.float64):
+        grid = Grid.nyquist(1.0, 550e-9, side, oversampling=1.2)
+        basis = turbulent_basis(five_holes, 3, 0, 0.25, 20.0)
+        model = ExposureModel(five_holes, grid, basis, dtype=dtype)
+        generator = torch.Generator().manual_seed(seed)
+        field = model.window.field
+        nu_y, nu_x = field.frequencies(torch.float64)
+        spectrum = 1 / (1 + (torch.hypot(nu_y, nu_x) * 20) ** 3)
+        white = torch.fft.fft2(torch.randn(field.shape, dtype=torch.float64, generator=generator), norm="ortho")
+        image = amplitude * torch.fft.ifft2(white * spectrum.sqrt(), norm="ortho").real
+        y, x = (torch.linspace(-1, 1, n, dtype=torch.float64) for n in field.shape)
+        image = image * torch.exp(-DARK * (y[:, None] ** 2 + x**2))  # dark at the border
+        z = torch.randn(n_frames, basis.n_parameters, dtype=torch.float64, generator=generator)
+        blurred = model(image, z)
+        frames = blurred + noise * torch.randn(blurred.shape, dtype=torch.float64, generator=generator).to(dtype)
+        precision = torch.full((1, 1, 1), noise**-2, dtype=dtype)
+        objective = MyopicObjective(model, frames, precision, TotalVariation())
+        told = objective.neutral_calibration()
+        calibration = type(told)(torch.ones_like(told.transmission), told.noise_inflation, 1.0)
+        return objective, State(image, z, calibration)
+
+    return make
+
+
+def below_cutoff(objective, image):
+    nu_y, nu_x = objective.model.window.field.frequencies(torch.float64)
+    inside = torch.hypot(nu_y, nu_x) < min(objective.model.cutoff, 0.5)
+    return torch.fft.ifft2(torch.fft.fft2(image) * inside).real
+
+
+@pytest.fixture(scope="module")
+def estimates(seen):
+    """Estimates for random objects, as logarithms of what they are too large, and their errors."""
+
+    def make(side, noise):
+        away, errors = [], []
+        for seed in range(N_OBJECTS):
+            objective, state = seen(seed, side, noise=noise)
+            found = power_of_slopes(objective, state)
+            away.append(math.log(found.value / squares_of(below_cutoff(objective, state.image))))
+            errors.append(found.error)
+        return torch.tensor(away), torch.tensor(errors)
+
+    return make
+
+
+def test_the_frames_tell_the_power_of_slopes_the_better_the_more_they_show(estimates):
+    """The mean of random objects is right within four standard errors, and single ones scatter by the error told.
+
+    Their variance has the scatter of a chi-square of as many degrees of freedom, and up to as many times that as the
+    shape of the objects makes frequencies alike. Errors fall with the number of frequencies.
+    """
+    told, scatter = [], 4 * (2 / (N_OBJECTS - 1)) ** 0.5
+    for side, noise in ((64, 1.0), (64, 0.3), (96, 0.3)):
+        away, errors = estimates(side, noise)
+        told.append(float(errors.mean()))
+        assert abs(float(away.mean())) < 4 * told[-1] / N_OBJECTS**0.5, (side, noise)
+        assert 1 - scatter < float(away.var()) / told[-1] ** 2 < (1 + scatter) * ALIKE, (side, noise)
+    assert told[0] > told[1] > told[2]
+    assert told[2] / told[1] == pytest.approx(64 / 96, rel=0.2)
+
+
+def test_the_power_of_slopes_does_not_depend_on_phases_that_are_wrong(seen):
+    """Pistons that all frames have in common, which the object takes over; nor on the image itself, or the precision
+    of numbers."""
+    objective, state = seen(0)
+    right = power_of_slopes(objective, state)
+    pistons = objective.model.aberrations.parameters_of_pistons(torch.tensor([0.0, 2.0, -1.0, 3.0, 0.5]))
+    for other in (replace(state, z=state.z + pistons), replace(state, image=torch.ones_like(state.image))):
+        found = power_of_slopes(objective, other)
+        assert abs(math.log(found.value / right.value)) < right.error
+    single = power_of_slopes(*seen(0, dtype=torch.float32))
+    assert single.value == pytest.approx(right.value, rel=1e-3)
+
+
+def test_frames_of_noise_alone_tell_nothing(seen):
+    objective, state = seen(0, noise=1e3)
+    found = power_of_slopes(objective, state)
+    assert found.at_most > squares_of(state.image)
+    assert math.isfinite(found.at_most)
+    assert Power(2.0, 1e4).at_most > 1e40
+
+
+@pytest.mark.parametrize(("amplitude", "gentle"), [(50.0, True), (1000.0, False)])
+def test_an_object_that_follows_noise_is_known_by_its_frames(amplitude, gentle, seen):
+    """What it has found is steep either way; frames that show little, and one alone, do not tell."""
+    objective, state = seen(0, amplitude=amplitude)
+    rough = torch.randn(state.image.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    noisy = replace(state, image=state.image + 20 * rough * (state.image.abs() > 0.1 * state.image.max()))
+    assert rate_of_slopes(noisy.image) < 0.4
+    for found in (state, noisy):
+        assert shows_gentle_slopes(objective, found, BRIGHT) is gentle
+        for silent in (BRIGHT._replace(n_frames=1), Change(0.9, 8, 4096)):
+            assert not shows_gentle_slopes(objective, found, silent)

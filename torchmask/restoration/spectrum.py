@@ -1,0 +1,117 @@
+"""The power spectrum of the object as its frames tell it, whatever its phases and theirs.
+
+Turbulence drops out of the mean power of frames but for the mean power of their transfer functions, which aberrations
+of the right strength have even where each is wrong. So while an object may still follow noise, its frames know how much
+power it has, and with that how steep its slopes are.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchmask.restoration.change import Change
+from torchmask.restoration.objective import MyopicObjective
+from torchmask.restoration.projected_lbfgs import minimize_bounded
+from torchmask.restoration.slopes import gradient, shown
+from torchmask.restoration.state import State
+
+_ITERATIONS = 100
+_LOWEST = 3.5  # times the spacing of frequencies: below it lies the power that the fit begins with
+_STEEPEST = 10.0  # exponent, which frames of hardly more than noise do not tell
+_GENTLE = 0.4  # rate above which slopes are gentle: satellites have 0.05 to 0.2, balls and asteroids 0.65 on
+_VAGUE = 100.0  # error of a logarithm above which nothing is known
+
+
+class Power(NamedTuple):
+    """An estimate of a power, with the standard error of its logarithm."""
+
+    value: float
+    error: float
+
+    @property
+    def at_most(self) -> float:
+        """The value one standard error higher."""
+        return self.value * math.exp(min(self.error, _VAGUE))
+
+
+def shows_gentle_slopes(objective: MyopicObjective, state: State, change: Change) -> bool:
+    """Return whether the slopes of the object are gentle, as far as the power of its frames tells.
+
+    Their rate is above 0.4 then, even if those of the object in `state` are steep, as it may follow noise; only for the
+    sum of the slopes themselves it has to do. Frames that change by hardly more than noise do not tell, nor does a
+    single one.
+    """
+    if change.n_frames == 1 or shown(change) < 1:
+        return False
+    total = float(torch.hypot(*gradient(state.image)).sum())
+    return 3 * total > _GENTLE * power_of_slopes(objective, state).at_most
+
+
+def power_of_slopes(objective: MyopicObjective, state: State) -> Power:
+    """Return the sum of the squared slopes of the object that the frames show, below the cut-off frequency.
+
+    Its spectrum is S = k / (1 + (nu / nu_0)^p) (Conan, Mugnier, Fusco, Michau & Rousset, Appl. Opt. 37, 4614, 1998),
+    fitted to the frames' mean power P by Whittle's likelihood, the sum of ln m + P / m with m = S |h|^2 + noise. |h|^2
+    is the mean power of the transfer functions of `state`. The error is that of random phases: it counts the object's
+    own power once and that of noise in each frame.
+    """
+    frames, precision, _ = objective.scaled_data(state.with_noise_inflation(1.0).calibration)
+    noise = float((1 / precision[precision > 0].double()).mean())
+    power = torch.fft.fft2(frames.double(), norm="ortho").abs().square().mean(0)
+    passed = _mean_transfer(objective, state)
+    nu_y, nu_x = (torch.fft.fftfreq(n, dtype=power.dtype, device=power.device) for n in power.shape)
+    nu = torch.hypot(nu_y[:, None], nu_x)
+    seen = (nu > 0) & (nu < min(objective.model.cutoff, 0.5))
+    nu, passed, power = nu[seen], passed[seen], power[seen]
+    steps = (2 * torch.sin(math.pi * nu_y[:, None])).square() + (2 * torch.sin(math.pi * nu_x)).square()
+    fitted = _fit(nu, passed, power, noise)
+
+    def logarithm(x: Tensor) -> Tensor:
+        return (steps[seen] * _spectrum(x, nu)).sum().log()
+
+    def expected(x: Tensor) -> Tensor:
+        return _spectrum(x, nu) * passed + noise
+
+    by_x, slope = torch.func.jacfwd(expected)(fitted), torch.func.grad(logarithm)(fitted)
+    mean = expected(fitted)
+    signal = mean - noise
+    variance = signal**2 + (2 * signal + noise) * noise / len(frames)
+    relative = by_x / mean[:, None]
+    inverse = torch.linalg.pinv(relative.T @ relative, hermitian=True)
+    spread = 2 * inverse @ (relative.T * (variance / mean**2)) @ relative @ inverse  # two frequencies hold one number
+    return Power(float(logarithm(fitted).exp()), float((slope @ spread @ slope).clamp(min=0).sqrt()))
+
+
+@torch.no_grad()
+def _mean_transfer(objective: MyopicObjective, state: State) -> Tensor:
+    """Return the mean squared modulus (H, W) of all that lies between an object and its frames."""
+    point = torch.zeros_like(state.image)
+    point[point.shape[0] // 2, point.shape[1] // 2] = 1.0
+    return torch.fft.fft2(objective.model(point, state.z).double()).abs().square().mean(0)
+
+
+def _spectrum(x: Tensor, nu: Tensor) -> Tensor:
+    """Return k / (1 + (nu / nu_0)^p) for the logarithms (3,) of k, nu_0 and 1 / p."""
+    return torch.exp(x[0]) / (1 + (nu / torch.exp(x[1])) ** torch.exp(-x[2]))
+
+
+def _fit(nu: Tensor, passed: Tensor, power: Tensor, noise: float) -> Tensor:
+    """Return the logarithms (3,) of k, nu_0 and 1 / p that Whittle's likelihood prefers; nu_0 fits into a frame."""
+    lowest = float(nu.min())
+
+    def cost(x: Tensor) -> tuple[float, Tensor]:
+        with torch.enable_grad():
+            leaf = x.detach().requires_grad_()
+            expected = _spectrum(leaf, nu) * passed + noise
+            value = (expected.log() + power / expected).mean()
+            (slope,) = torch.autograd.grad(value, leaf)
+        return float(value.detach()), slope
+
+    first = (power / passed)[nu < _LOWEST * lowest].mean()
+    start = torch.stack([first.log(), first.new_tensor(2 * lowest).log(), -first.new_tensor(3.0).log()])
+    lower = start.new_tensor([-torch.inf, math.log(lowest), -math.log(_STEEPEST)])
+    return minimize_bounded(cost, start, lower, max_iterations=_ITERATIONS).x
