@@ -5,7 +5,7 @@ import torch
 from torch import nn
 
 from torchmask.restoration.change import Change
-from torchmask.restoration.slopes import rate_in_noise, rate_of_slopes, shown
+from torchmask.restoration.slopes import rate_in_light, rate_in_noise, rate_of_slopes, shown
 
 
 def point_of(rate):
@@ -74,6 +74,11 @@ def test_slopes_in_frames_of_hardly_more_than_noise_are_steeper(beyond_noise, fa
 
 def test_a_single_frame_does_not_tell_how_much_frames_change():
     assert rate_in_noise(point_of(0.7), Change(0.0, 1, 4096), gentle=False) == pytest.approx(0.7, rel=1e-12)
+
+
+@pytest.mark.parametrize(("light", "rate"), [(10.0, 1.0), (60.0, 1.5), (1e4, 2.0)])
+def test_gentle_slopes_suit_the_given_prior_of_a_search_or_a_heavier_one(light, rate):
+    assert rate_in_light(Change(light / 20, 20, 4096)) == pytest.approx(rate, rel=1e-12)
 
 
 def test_the_light_balances_slopes_however_fine_the_pixels():

@@ -12,7 +12,7 @@ from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture
 from torchmask.optics.band import Band
 from torchmask.record import Record
-from torchmask.restoration import solver
+from torchmask.restoration import solver, spectrum
 from torchmask.restoration.calibration import calibrate, fit_of_frames, recalibrate, sharpen_noise_inflation
 from torchmask.restoration.candidates import Candidates, play_stage, with_candidates
 from torchmask.restoration.checkpoint import Ending, Progress, Status
@@ -476,7 +476,7 @@ class Course:
 
     def __init__(self, monkeypatch, truth, rates, gentle=False):
         self.truth, self.rates, self.weights, self.ends = truth, list(rates), [], []
-        monkeypatch.setattr(solver, "shows_gentle_slopes", lambda objective, state, change: gentle)
+        monkeypatch.setattr(spectrum, "shows_gentle_slopes", lambda objective, state, change: gentle)
         monkeypatch.setattr(solver, "descend", self.descend)
         monkeypatch.setattr(solver, "recalibrate", lambda objective, state, power, **more: state)
         monkeypatch.setattr(solver.Finisher, "finish", self.finish)
@@ -500,13 +500,15 @@ class Course:
         return solver_of(objective, schedule=schedule, **traits).solve(Known(**known), file=file)
 
 
-def test_a_search_whose_frames_show_gentle_slopes_keeps_the_given_prior(explained, monkeypatch):
+@pytest.mark.parametrize("rate", [1.0, 1.5])
+def test_a_search_whose_frames_show_gentle_slopes_has_the_prior_that_suits_its_light(rate, explained, monkeypatch):
     """Even if those of its first sharp object are steep, as it follows noise."""
     objective, truth = explained
     course = Course(monkeypatch, truth, [0.9, 0.3, 0.1, 2.0, 0.6, 0.5], gentle=True)
+    monkeypatch.setattr(spectrum, "rate_in_light", lambda change: rate)
     progress = course.solve(objective.with_changes(prior=TotalVariation(2.0)))
-    assert course.weights == 6 * [2.0]
-    assert progress.rate == 1
+    assert course.weights == 2 * [2.0] + 4 * [2.0 * rate]
+    assert progress.rate == rate
 
 
 @pytest.mark.parametrize(

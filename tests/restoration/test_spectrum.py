@@ -7,13 +7,14 @@ import pytest
 import torch
 
 from torchmask.grid import Grid
+from torchmask.restoration import spectrum
 from torchmask.restoration.aberrations import turbulent_basis
 from torchmask.restoration.change import Change
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.priors import TotalVariation
 from torchmask.restoration.slopes import gradient, rate_of_slopes
-from torchmask.restoration.spectrum import Power, power_of_slopes, shows_gentle_slopes
+from torchmask.restoration.spectrum import Power, power_of_slopes, rate_in_search, shows_gentle_slopes
 from torchmask.restoration.state import State
 
 N_OBJECTS = 40
@@ -37,9 +38,9 @@ def seen(five_holes):
         generator = torch.Generator().manual_seed(seed)
         field = model.window.field
         nu_y, nu_x = field.frequencies(torch.float64)
-        spectrum = 1 / (1 + (torch.hypot(nu_y, nu_x) * 20) ** 3)
+        power = 1 / (1 + (torch.hypot(nu_y, nu_x) * 20) ** 3)
         white = torch.fft.fft2(torch.randn(field.shape, dtype=torch.float64, generator=generator), norm="ortho")
-        image = amplitude * torch.fft.ifft2(white * spectrum.sqrt(), norm="ortho").real
+        image = amplitude * torch.fft.ifft2(white * power.sqrt(), norm="ortho").real
         y, x = (torch.linspace(-1, 1, n, dtype=torch.float64) for n in field.shape)
         image = image * torch.exp(-DARK * (y[:, None] ** 2 + x**2))  # dark at the border
         z = torch.randn(n_frames, basis.n_parameters, dtype=torch.float64, generator=generator)
@@ -92,6 +93,15 @@ def test_the_frames_tell_the_power_of_slopes_the_better_the_more_they_show(estim
     assert told[2] / told[1] == pytest.approx(64 / 96, rel=0.2)
 
 
+def test_more_frames_tell_the_power_of_slopes_better_as_far_as_noise_hides_it(seen):
+    """Four times as many halve the error of noise, but not that of the one object that they all show."""
+    ratios = []
+    for noise in (1.5, 0.05):
+        few, many = (sum(power_of_slopes(*seen(n, noise=noise, n_frames=t)).error for n in range(5)) for t in (8, 32))
+        ratios.append(many / few)
+    assert 0.5 < ratios[0] < 0.75 < ratios[1] < 1.0
+
+
 def test_the_power_of_slopes_does_not_depend_on_phases_that_are_wrong(seen):
     """Pistons that all frames have in common, which the object takes over; nor on the image itself, or the precision
     of numbers."""
@@ -124,3 +134,14 @@ def test_an_object_that_follows_noise_is_known_by_its_frames(amplitude, gentle, 
         assert shows_gentle_slopes(objective, found, BRIGHT) is gentle
         for silent in (BRIGHT._replace(n_frames=1), Change(0.9, 8, 4096)):
             assert not shows_gentle_slopes(objective, found, silent)
+
+
+def test_the_rate_of_a_search_is_that_of_its_object_unless_slopes_are_gentle(seen, monkeypatch):
+    """At most 1 then; gentle slopes have that of the light, whatever the object is like."""
+    objective, state = seen(0)
+    change = Change(6.0, 10, 4096)
+    for own in (0.3, 1.7):
+        found = replace(state, image=state.image * rate_of_slopes(state.image) / own)
+        for gentle, expected in ((False, min(own, 1.0)), (True, 1.5)):
+            monkeypatch.setattr(spectrum, "shows_gentle_slopes", lambda *given, answer=gentle: answer)
+            assert rate_in_search(objective, found, change) == pytest.approx(expected, rel=1e-9)

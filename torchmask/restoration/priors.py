@@ -58,7 +58,7 @@ class ObjectPrior(nn.Module):
         return diagonal.clamp(min=0)
 
     def in_search(self, rate: float) -> ObjectPrior:
-        """Return the prior of a search in faint light for an object whose slopes have a rate between 0 and 1.
+        """Return the prior of a search in faint light for an object whose slopes have a rate between 0 and 2.
 
         See `rate_of_slopes`. It is `self` where it knows no scale.
         """

@@ -7,7 +7,7 @@ from torch import Tensor
 from torchmask.restoration.change import Change
 
 _LIGHT = 40.0  # light from which on the rate of gentle slopes is at least 1
-_LEAST = 2.0  # the highest least rate: up to 8 tried
+_MOST = 2.0  # the highest least rate: up to 8 tried
 _SHOWN = 2048.0  # chi-square of a frame beyond noise below which it is the prior that has made slopes gentle
 _SMALLEST = 0.25  # the smallest factor by which they are taken to be steeper then: down to 0.125 tried
 
@@ -33,10 +33,15 @@ def rate_in_noise(image: Tensor, change: Change, *, gentle: bool) -> float:
     prior has smoothed what it has found, and would smooth it the more: below a chi-square of 2048 beyond noise, in a
     frame, the rate falls in proportion, down to a quarter. A single frame does not tell. The limits are empirical.
     """
-    rate, least = rate_of_slopes(image), min(change.light / _LIGHT, _LEAST)
+    rate = rate_of_slopes(image)
     if change.n_frames > 1 and (part := shown(change)) < 1:
         return rate * max(part, _SMALLEST)
-    return max(rate, least) if gentle and least > 1 else rate
+    return max(rate, rate_in_light(change)) if gentle and change.light > _LIGHT else rate
+
+
+def rate_in_light(change: Change) -> float:
+    """Return the least rate of gentle slopes in this much light: light / 40, from 1 to 2."""
+    return min(max(change.light / _LIGHT, 1.0), _MOST)
 
 
 def shown(change: Change) -> float:

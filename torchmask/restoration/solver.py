@@ -36,8 +36,7 @@ from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.result import RestorationResult
 from torchmask.restoration.retrieval import retrieve_phases
 from torchmask.restoration.schedule import Schedule
-from torchmask.restoration.slopes import rate_of_slopes
-from torchmask.restoration.spectrum import shows_gentle_slopes
+from torchmask.restoration.spectrum import rate_in_search
 from torchmask.restoration.starts import (
     Known,
     expected_parameters,
@@ -173,9 +172,8 @@ class Solver:
         """Let all starts of a faint search have the prior that suits the object of the first, once it is sharp."""
         is_sharp = progress.starts == 1 and progress.iterations >= max(self.schedule.sharp_after, 1)
         if is_sharp and math.isinf(progress.rate):
-            gentle = shows_gentle_slopes(self.objective, progress.state, self.stack.change)
-            progress.rate = 1.0 if gentle else rate_of_slopes(progress.state.image) or math.inf
-        if progress.rate < 1:
+            progress.rate = rate_in_search(self.objective, progress.state, self.stack.change) or math.inf
+        if math.isfinite(progress.rate) and progress.rate != 1:
             self.objective = self.objective.with_changes(prior=self.given.in_search(progress.rate))
 
     def _look_at_place(self, progress: Progress) -> None:

@@ -16,7 +16,7 @@ from torch import Tensor
 from torchmask.restoration.change import Change
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.projected_lbfgs import minimize_bounded
-from torchmask.restoration.slopes import gradient, shown
+from torchmask.restoration.slopes import gradient, rate_in_light, rate_of_slopes, shown
 from torchmask.restoration.state import State
 
 _ITERATIONS = 100
@@ -49,6 +49,16 @@ def shows_gentle_slopes(objective: MyopicObjective, state: State, change: Change
         return False
     total = float(torch.hypot(*gradient(state.image)).sum())
     return 3 * total > _GENTLE * power_of_slopes(objective, state).at_most
+
+
+def rate_in_search(objective: MyopicObjective, state: State, change: Change) -> float:
+    """Return the rate of slopes that the prior of a faint search suits, once its object is sharp; 0 if it has none.
+
+    If slopes are gentle it is that of `rate_in_light`, else that of the object, 1 at most.
+    """
+    if shows_gentle_slopes(objective, state, change):
+        return rate_in_light(change)
+    return min(rate_of_slopes(state.image), 1.0)
 
 
 def power_of_slopes(objective: MyopicObjective, state: State) -> Power:
