@@ -136,12 +136,12 @@ def test_an_object_that_follows_noise_is_known_by_its_frames(amplitude, gentle, 
             assert not shows_gentle_slopes(objective, found, silent)
 
 
-def test_the_rate_of_a_search_is_that_of_its_object_unless_slopes_are_gentle(seen, monkeypatch):
-    """At most 1 then; gentle slopes have that of the light, whatever the object is like."""
+def test_the_rate_of_a_search_is_that_of_its_object_unless_it_follows_noise(seen, monkeypatch):
+    """At most 1 then; slopes that are gentle but found to be steep have that of the light."""
     objective, state = seen(0)
     change = Change(6.0, 10, 4096)
-    for own in (0.3, 1.7):
+    for own in (0.3, 0.69, 0.71, 1.7):
         found = replace(state, image=state.image * rate_of_slopes(state.image) / own)
-        for gentle, expected in ((False, min(own, 1.0)), (True, 1.5)):
+        for gentle, expected in ((False, min(own, 1.0)), (True, 1.5 if own < 0.7 else min(own, 1.0))):
             monkeypatch.setattr(spectrum, "shows_gentle_slopes", lambda *given, answer=gentle: answer)
             assert rate_in_search(objective, found, change) == pytest.approx(expected, rel=1e-9)

@@ -22,7 +22,8 @@ from torchmask.restoration.state import State
 _ITERATIONS = 100
 _LOWEST = 3.5  # times the spacing of frequencies: below it lies the power that the fit begins with
 _STEEPEST = 10.0  # exponent, which frames of hardly more than noise do not tell
-_GENTLE = 0.4  # rate above which slopes are gentle: satellites have 0.05 to 0.2, balls and asteroids 0.65 on
+_GENTLE = 0.22  # rate by the frames above which slopes are gentle: 0.03 to 0.17 for satellites, 0.28 on for balls
+_OF_NOISE = 0.7  # rate found of gentle slopes below which an object follows noise in a search: 0.3 to 2 seen
 _VAGUE = 100.0  # error of a logarithm above which nothing is known
 
 
@@ -41,9 +42,8 @@ class Power(NamedTuple):
 def shows_gentle_slopes(objective: MyopicObjective, state: State, change: Change) -> bool:
     """Return whether the slopes of the object are gentle, as far as the power of its frames tells.
 
-    Their rate is above 0.4 then, even if those of the object in `state` are steep, as it may follow noise; only for the
-    sum of the slopes themselves it has to do. Frames that change by hardly more than noise do not tell, nor does a
-    single one.
+    Their rate is above 0.22 then, even if those of the object in `state` are steep, as it may follow noise; only the
+    sum of its slopes is taken from it. Frames that change by hardly more than noise do not tell, nor does a single one.
     """
     if change.n_frames == 1 or shown(change) < 1:
         return False
@@ -54,11 +54,12 @@ def shows_gentle_slopes(objective: MyopicObjective, state: State, change: Change
 def rate_in_search(objective: MyopicObjective, state: State, change: Change) -> float:
     """Return the rate of slopes that the prior of a faint search suits, once its object is sharp; 0 if it has none.
 
-    If slopes are gentle it is that of `rate_in_light`, else that of the object, 1 at most.
+    It is that of the object, 1 at most. Where that is below 0.7, although slopes are gentle, the object follows noise,
+    and it is that of `rate_in_light`.
     """
-    if shows_gentle_slopes(objective, state, change):
-        return rate_in_light(change)
-    return min(rate_of_slopes(state.image), 1.0)
+    rate = rate_of_slopes(state.image)
+    follows_noise = 0 < rate < _OF_NOISE and shows_gentle_slopes(objective, state, change)
+    return rate_in_light(change) if follows_noise else min(rate, 1.0)
 
 
 def power_of_slopes(objective: MyopicObjective, state: State) -> Power:
