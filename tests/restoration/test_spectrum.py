@@ -140,8 +140,8 @@ def test_the_rate_of_a_search_is_that_of_its_object_unless_it_follows_noise(seen
     """At most 1 then; slopes that are gentle but found to be steep have that of the light."""
     objective, state = seen(0)
     change = Change(6.0, 10, 4096)
-    for own in (0.3, 0.69, 0.71, 1.7):
+    for own in (0.3, 0.81, 0.83, 1.7):
         found = replace(state, image=state.image * rate_of_slopes(state.image) / own)
-        for gentle, expected in ((False, min(own, 1.0)), (True, 1.5 if own < 0.7 else min(own, 1.0))):
+        for gentle, expected in ((False, min(own, 1.0)), (True, 1.5 if own < 0.82 else min(own, 1.0))):
             monkeypatch.setattr(spectrum, "shows_gentle_slopes", lambda *given, answer=gentle: answer)
             assert rate_in_search(objective, found, change) == pytest.approx(expected, rel=1e-9)

@@ -23,7 +23,7 @@ _ITERATIONS = 100
 _LOWEST = 3.5  # times the spacing of frequencies: below it lies the power that the fit begins with
 _STEEPEST = 10.0  # exponent, which frames of hardly more than noise do not tell
 _GENTLE = 0.22  # rate by the frames above which slopes are gentle: 0.03 to 0.17 for satellites, 0.28 on for balls
-_OF_NOISE = 0.7  # rate found of gentle slopes below which an object follows noise in a search: 0.3 to 2 seen
+_OF_NOISE = 0.82  # rate found of gentle slopes below which an object follows noise: 0.3 to 0.78 of asteroids that do
 _VAGUE = 100.0  # error of a logarithm above which nothing is known
 
 
@@ -54,7 +54,7 @@ def shows_gentle_slopes(objective: MyopicObjective, state: State, change: Change
 def rate_in_search(objective: MyopicObjective, state: State, change: Change) -> float:
     """Return the rate of slopes that the prior of a faint search suits, once its object is sharp; 0 if it has none.
 
-    It is that of the object, 1 at most. Where that is below 0.7, although slopes are gentle, the object follows noise,
+    It is that of the object, 1 at most. Where that is below 0.82 although slopes are gentle, the object follows noise,
     and it is that of `rate_in_light`.
     """
     rate = rate_of_slopes(state.image)
