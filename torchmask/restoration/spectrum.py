@@ -72,8 +72,7 @@ def power_of_slopes(objective: MyopicObjective, state: State) -> Power:
     """
     frames, precision, _ = objective.scaled_data(state.with_noise_inflation(1.0).calibration)
     noise = float((1 / precision[precision > 0].double()).mean())
-    power = torch.fft.fft2(frames.double(), norm="ortho").abs().square().mean(0)
-    passed = _mean_transfer(objective, state)
+    power, passed = _mean_powers(objective, state, frames)
     nu_y, nu_x = (torch.fft.fftfreq(n, dtype=power.dtype, device=power.device) for n in power.shape)
     nu = torch.hypot(nu_y[:, None], nu_x)
     seen = (nu > 0) & (nu < min(objective.model.cutoff, 0.5))
@@ -98,11 +97,15 @@ def power_of_slopes(objective: MyopicObjective, state: State) -> Power:
 
 
 @torch.no_grad()
-def _mean_transfer(objective: MyopicObjective, state: State) -> Tensor:
-    """Return the mean squared modulus (H, W) of all that lies between an object and its frames."""
+def _mean_powers(objective: MyopicObjective, state: State, frames: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the mean power (H, W) of the frames, and that of all that lies between an object and its frames."""
     point = torch.zeros_like(state.image)
     point[point.shape[0] // 2, point.shape[1] // 2] = 1.0
-    return torch.fft.fft2(objective.model(point, state.z).double()).abs().square().mean(0)
+    power = passed = torch.zeros_like(frames[0], dtype=torch.float64)
+    for part in objective.model.chunks(len(frames)):
+        power = power + torch.fft.fft2(frames[part].double(), norm="ortho").abs().square().sum(0)
+        passed = passed + torch.fft.fft2(objective.model(point, state.z[part]).double()).abs().square().sum(0)
+    return power / len(frames), passed / len(frames)
 
 
 def _spectrum(x: Tensor, nu: Tensor) -> Tensor:
