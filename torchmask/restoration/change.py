@@ -28,8 +28,8 @@ class Change(NamedTuple):
     def light(self) -> float:
         """Change of a pixel of 64 x 64 in all frames together, in noise variances.
 
-        Finer pixels share the light of one, but the slopes between them, which are as many, add up to more: a prior of
-        slopes balances a change that falls as the square root of the number of pixels.
+        Each of twice as fine pixels has a quarter of the change, while the slopes between them, which a prior weighs
+        against it, add up to twice as much. So a pixel's change counts with the square root of the number of pixels.
         """
         return self.each * self.n_frames * math.sqrt(self.n_pixels) / 64
 

@@ -73,11 +73,11 @@ def power_of_slopes(objective: MyopicObjective, state: State) -> Power:
     frames, precision, _ = objective.scaled_data(state.with_noise_inflation(1.0).calibration)
     noise = float((1 / precision[precision > 0].double()).mean())
     power, passed = _mean_powers(objective, state, frames)
-    nu_y, nu_x = (torch.fft.fftfreq(n, dtype=power.dtype, device=power.device) for n in power.shape)
-    nu = torch.hypot(nu_y[:, None], nu_x)
+    nu_y, nu_x = objective.model.window.grid.frequencies(power.dtype, power.device)
+    nu = torch.hypot(nu_y, nu_x)
     seen = (nu > 0) & (nu < min(objective.model.cutoff, 0.5))
     nu, passed, power = nu[seen], passed[seen], power[seen]
-    steps = (2 * torch.sin(math.pi * nu_y[:, None])).square() + (2 * torch.sin(math.pi * nu_x)).square()
+    steps = (2 * torch.sin(math.pi * nu_y)).square() + (2 * torch.sin(math.pi * nu_x)).square()
     fitted = _fit(nu, passed, power, noise)
 
     def logarithm(x: Tensor) -> Tensor:
