@@ -58,6 +58,7 @@ def progress_with(**changes):
         "retrieved": True,
         "seeks_no_more": True,
         "in_vain": 1,
+        "tempered": True,
         "rate": 0.4,
     }
     return Progress(several(random_state(0), 4), **given | changes)

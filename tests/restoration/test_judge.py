@@ -174,8 +174,11 @@ def test_a_start_in_faint_frames_is_given_up_where_it_costs_much_more(explain):
 
 
 @pytest.mark.parametrize("end", [End.LAST_DESCENT, End.BOTH, End.NONE])
-def test_a_twin_of_an_explained_mask_has_to_be_near_and_then_clearly_better(end, explain):
-    """By fractions of what the best so far costs beyond noise, which is half of the number of pixels."""
+def test_a_twin_of_an_explained_mask_has_to_be_near_and_is_kept_if_it_costs_less(end, explain):
+    """Others are looked for if that is clear: near and clear are fractions of what the best so far costs beyond noise.
+
+    Noise is half of the number of pixels.
+    """
     objective, state = explain(noise=0.003)
 
     def beyond_noise(state):
@@ -197,27 +200,36 @@ def test_a_twin_of_an_explained_mask_has_to_be_near_and_then_clearly_better(end,
         assert judge.verdict(objective, rival).explained is explained
         return judge.gives_up(objective, Progress(now, 300 * [1.0], starts=5, rival=rival))
 
-    def replaces(better, now, rival, **numbers):
+    def compare(better, now, rival, **numbers):
         now, rival = (Ending(ending, Status.CONVERGED) for ending in (now, rival))
-        return judge_of(better=better, **numbers).compare(objective, now, rival).best is now
+        return judge_of(better=better, **numbers).compare(objective, now, rival)
+
+    def replaces(better, now, rival, **numbers):
+        return compare(better, now, rival, **numbers).best.state is now
+
+    def advances(better, now, rival, **numbers):
+        return compare(better, now, rival, **numbers).advances
 
     assert given_up(0.99 * above)
     assert not given_up(1.01 * above)
-    assert replaces(0.99 * part, low, high)
-    assert not replaces(1.01 * part, low, high)
+    assert replaces(math.inf, low, high)
     assert not replaces(0.0, high, low)
+    assert advances(0.99 * part, low, high)
+    assert not advances(1.01 * part, low, high)
+    assert not advances(0.0, high, low)
     # starts may end before they are at rest, by three times so much of the whole cost
     costs = [beyond_noise(ending) + 0.5 * objective.frames.numel() for ending in (low, high)]
     third = (costs[1] - costs[0]) / 3
     assert given_up(0.0, nearly_at_rest=0.99 * third / costs[0])
     assert not given_up(0.0, nearly_at_rest=1.01 * third / costs[0])
-    assert replaces(0.0, low, high, nearly_at_rest=0.99 * third / costs[1])
-    assert not replaces(0.0, low, high, nearly_at_rest=1.01 * third / costs[1])
+    assert advances(0.0, low, high, nearly_at_rest=0.99 * third / costs[1])
+    assert not advances(0.0, low, high, nearly_at_rest=1.01 * third / costs[1])
     # where the frames are not explained, the residual tells, and the fifth start is from random aberrations
     missed = {"chance": -1e9}
     assert not given_up(0.0, explained=False, **missed)
     left = [judge_of().verdict(objective, Ending(ending, Status.CONVERGED)).excess for ending in (low, high)]
-    assert replaces(math.inf, low, high, **missed) is (left[0] <= left[1])
+    for tell in (replaces, advances):
+        assert tell(math.inf, low, high, **missed) is (left[0] <= left[1])
 
 
 def test_a_start_that_explains_a_masks_frames_is_replaced_by_none_that_does_not(explain):
@@ -237,6 +249,29 @@ def test_a_start_that_explains_a_masks_frames_is_replaced_by_none_that_does_not(
 
     assert best() is explains
     assert best(many_minima=True) is cheap
+
+
+def test_the_best_start_is_heated_once_if_twins_may_improve_it(explain):
+    """And as many iterations are left as a twin has before it may be given up."""
+    objective, state = explain(noise=0.003)
+
+    def may(end=End.LAST_DESCENT, spent=0, tempered=False, many_minima=False, **numbers):
+        traits = replace(TRAITS, max_iterations=1000, many_minima=many_minima)
+        schedule = Schedule(**{"chance": math.inf, "glance": 300} | numbers)
+        judge = Judge(Setting.of(objective), stack_of(objective), traits, schedule, end)
+        verdict = judge.verdict(objective, Ending(state, Status.CONVERGED))
+        return judge.may_temper(verdict, Progress(Candidates(state, 1), spent * [1.0], tempered=tempered))
+
+    assert may()
+    assert may(End.BOTH)
+    assert may(spent=699)
+    assert not may(spent=700)
+    assert not may(tempered=True)
+    assert not may(cooling=0)
+    assert not may(in_vain=0)
+    assert not may(chance=-1e9)
+    assert not may(End.INTEGRATION)
+    assert not may(End.FULL_PUPIL, many_minima=True)
 
 
 def test_a_mask_of_three_holes_has_no_twins(explain, three_holes):

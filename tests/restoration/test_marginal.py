@@ -7,18 +7,15 @@ import torch
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import SparseAperture
-from torchmask.restoration import marginal
+from torchmask.restoration import sampler
 from torchmask.restoration.aberrations import turbulent_basis
 from torchmask.restoration.descent import descend
 from torchmask.restoration.forward import ExposureModel
-from torchmask.restoration.marginal import (
-    AberrationSampler,
-    integrate_aberrations,
-    laplace_precision,
-)
+from torchmask.restoration.marginal import integrate_aberrations
 from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.priors import TotalVariation
 from torchmask.restoration.projected_lbfgs import ProjectedLBFGS, minimize_bounded
+from torchmask.restoration.sampler import AberrationSampler, laplace_precision
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.state import Calibration, State
 
@@ -78,13 +75,33 @@ def test_samples_follow_the_posterior_of_a_piston(size):
     grid = torch.linspace(-6, 6, 241, dtype=torch.float64)
     weights = (-energies(*one_frame(objective, state), grid)[:, 0]).softmax(0)
     generator = torch.Generator().manual_seed(1)
-    sampler = AberrationSampler(objective, replace(state, z=torch.zeros_like(state.z)), generator)
-    z, accepted = sampler.sample(state, 40, size)
+    chains = AberrationSampler(objective, replace(state, z=torch.zeros_like(state.z)), generator)
+    z, accepted = chains.sample(state, 40, size)
     assert 0.3 < accepted < 1
     for moment in (lambda x: x, lambda x: x**2, lambda x: (3 * x).cos()):
         expected = float((weights * moment(grid)).sum())
         error = float((weights * moment(grid) ** 2).sum() - expected**2) ** 0.5 / n_frames**0.5
         assert abs(float(moment(z).mean()) - expected) < 4 * error
+
+
+@pytest.mark.parametrize("heat", [1.0, 4.0])
+def test_heated_samples_follow_the_posterior_in_more_noise(heat, monkeypatch):
+    """Of one piston, with the object held: moments by quadrature, within four standard errors of independent chains."""
+    n_frames = 200
+    objective, state = one_piston(8.0, n_frames, identical=True)
+    for name in ("settle", "unwrap_pistons"):
+        monkeypatch.setattr(sampler, name, lambda objective, state, *rest: state)
+    grid = torch.linspace(-6, 6, 241, dtype=torch.float64)
+    cost = energies(*one_frame(objective, state), grid)[:, 0]
+    weights = (-(cost - grid**2 / 2) / heat - grid**2 / 2).softmax(0)
+    generator = torch.Generator().manual_seed(1)
+    schedule, how = Schedule(moves=40, move_size=0.5), {"follow_r0": False}
+    ((found, _),) = sampler.sample_rounds(objective, state, [heat], schedule, generator, **how)
+    assert torch.allclose(found.calibration.noise_inflation, heat * state.calibration.noise_inflation)
+    for moment in (lambda x: x, lambda x: x**2):
+        expected = float((weights * moment(grid)).sum())
+        error = float((weights * moment(grid) ** 2).sum() - expected**2) ** 0.5 / n_frames**0.5
+        assert abs(float(moment(found.z).mean()) - expected) < 4 * error
 
 
 def one_frame(objective, state):
@@ -165,13 +182,13 @@ def test_one_seed_one_result_and_a_record_of_every_round(explain):
 
 def test_the_object_is_the_mean_of_the_later_rounds(monkeypatch):
     objective, state = one_piston(10.0, 10)
-    settled, fit = [], marginal.settle
+    settled, fit = [], sampler.settle
 
     def settle(*arguments):
         settled.append(fit(*arguments))
         return settled[-1]
 
-    monkeypatch.setattr(marginal, "settle", settle)
+    monkeypatch.setattr(sampler, "settle", settle)
     found, _ = integrate_aberrations(objective, state, 5, BRIEF, ProjectedLBFGS(), seed=0, follow_r0=False)
     assert len(settled) == 5
     torch.testing.assert_close(found.image, sum(one.image for one in settled[2:]) / 3)

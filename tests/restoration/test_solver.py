@@ -12,7 +12,7 @@ from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture
 from torchmask.optics.band import Band
 from torchmask.record import Record
-from torchmask.restoration import solver, spectrum
+from torchmask.restoration import restarts, solver, spectrum
 from torchmask.restoration.calibration import calibrate, fit_of_frames, recalibrate, sharpen_noise_inflation
 from torchmask.restoration.candidates import Candidates, play_stage, with_candidates
 from torchmask.restoration.checkpoint import Ending, Progress, Status
@@ -224,7 +224,7 @@ def test_every_fourth_further_start_of_a_mask_is_from_random_aberrations(explain
         twins.append(seed)
         return replace(truth, z=0 * truth.z)
 
-    monkeypatch.setattr("torchmask.restoration.solver.twin_of", twin)
+    monkeypatch.setattr("torchmask.restoration.restarts.twin_of", twin)
     progress = solver.run(solver.begin(Known(), None), True, lambda _: None)
     assert progress.starts == 9
     assert twins == [1, 2, 3, 5, 6, 7]
@@ -268,9 +268,9 @@ def test_a_fit_is_improved_until_that_is_in_vain_and_a_doubted_one_as_long_as_it
 
 
 def test_twins_of_an_explained_mask_follow_until_two_are_in_vain(explained, monkeypatch):
-    """Each that is better by some percent begins the count anew, and is what the next twins are of."""
+    """Each that is better is what the next twins are of, and begins the count anew if it is by some percent."""
     objective, truth = explained
-    scales = iter([0.9, 0.5, 0.95, 0.9, 1.0, 1.0, 1.01])  # of the true object's brightness
+    scales = iter([0.9, 0.5, 0.95, 0.9502, 1.0, 1.0, 1.01])  # of the true object's brightness
     begun, ends = [], []
 
     def twin(objective, state, inflation, seed):
@@ -282,15 +282,50 @@ def test_twins_of_an_explained_mask_follow_until_two_are_in_vain(explained, monk
         progress.status = Status.GIVEN_UP if len(ends) == 7 else Status.CONVERGED
         ends.append(progress.state)
 
-    monkeypatch.setattr(solver, "twin_of", twin)
+    monkeypatch.setattr(restarts, "twin_of", twin)
     monkeypatch.setattr(Solver, "_advance", stay)
-    schedule = Schedule(sharp_after=0, in_vain=2, better=0.04, doubtful=math.inf, chance=math.inf, starts=9)
+    explains = {"doubtful": math.inf, "chance": math.inf}
+    schedule = Schedule(sharp_after=0, in_vain=2, better=0.04, starts=9, cooling=0, **explains)
     first = Progress(Candidates(replace(truth, image=0.8 * truth.image), 1))
     progress = solver_of(objective, schedule=schedule).run(first, True, lambda _: None)
-    # 0.8; 0.9 is better; 0.5 is worse; 0.95 is better; 0.9 is worse; 1.0 is better; one is no better, one is given up
+    # 0.8; 0.9 is better; 0.5 is worse; 0.95 is better; 0.9502 is, but in vain; 1.0 is better; then none, one given up
     assert progress.starts == 8
     assert progress.state is ends[5]
-    assert [next(n for n, end in enumerate(ends) if end is state) for state in begun] == [0, 1, 1, 3, 3, 5, 5]
+    assert [next(n for n, end in enumerate(ends) if end is state) for state in begun] == [0, 1, 1, 3, 4, 5, 5]
+
+
+@pytest.mark.parametrize(("gentle", "cooling", "kinds"), [(True, 30, "ht"), (False, 30, "tt"), (True, 0, "tt")])
+def test_an_explained_object_of_gentle_slopes_is_heated_once(gentle, cooling, kinds, explained, monkeypatch):
+    """The first one, before twins. It counts as in vain as they do; its evaluations count, and it has its own seed."""
+    objective, truth = explained
+    begun, ends = [], []
+
+    def heat(objective, state, schedule, seed):
+        begun.append(("h", state, seed))
+        return replace(truth, image=0.99 * truth.image), 17
+
+    def twin(objective, state, inflation, seed):
+        begun.append(("t", state, seed))
+        return replace(truth, image=0.98 * truth.image)
+
+    def stay(self, progress):
+        progress.costs.append(1.0)
+        progress.status = Status.CONVERGED
+        ends.append(progress.state)
+
+    monkeypatch.setattr(restarts, "shows_gentle_slopes", lambda objective, state, change: gentle)
+    monkeypatch.setattr(restarts, "temper", heat)
+    monkeypatch.setattr(restarts, "twin_of", twin)
+    monkeypatch.setattr(Solver, "_advance", stay)
+    schedule = Schedule(sharp_after=0, in_vain=2, better=10.0, doubtful=math.inf, chance=math.inf, cooling=cooling)
+    first = Progress(Candidates(replace(truth, image=0.8 * truth.image), 1))
+    progress = solver_of(objective, schedule=schedule, seed=5).run(first, True, lambda _: None)
+    assert "".join(kind for kind, _, _ in begun) == kinds[: len(begun)] == kinds
+    assert [seed for _, _, seed in begun] == list(range(6, 6 + len(begun)))
+    assert begun[0][1] is ends[0]
+    assert begun[1][1] is ends[1]  # as it costs less
+    assert progress.n_evaluations == (17 if kinds[0] == "h" else 0)
+    assert progress.tempered is (kinds[0] == "h")
 
 
 def test_a_start_too_short_to_tell_is_not_judged(explained):

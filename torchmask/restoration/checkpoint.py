@@ -63,7 +63,8 @@ class Progress:
     began : number of iterations before the present start
     rival : final state of the best earlier start
     explained : final states of the starts that explain the frames, if the mean of several objects is wanted
-    in_vain : number of starts since the best one
+    in_vain : number of starts since the last that was clearly better than those before it
+    tempered : whether a start, the present one or an earlier one, was from the best object heated
     alike : whether the last two starts ended in the same result
     refinement : whether the position of the mask is fitted too, or will be if the frames require it
     finer : state of the last descent, which may have more modes; None before it
@@ -87,6 +88,7 @@ class Progress:
     rival: Ending | None = None
     explained: tuple[Ending, ...] = ()
     in_vain: int = 0
+    tempered: bool = False
     alike: bool = False
     refinement: Refinement = Refinement.OFF
     finer: State | None = None
@@ -153,6 +155,7 @@ _NUMBERS = (
     "starts",
     "began",
     "in_vain",
+    "tempered",
     "alike",
     "last_segments",
     "averaged",

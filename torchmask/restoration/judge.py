@@ -22,11 +22,19 @@ _LACKS = 3  # times the last decrease: by 2 to 4 times that two starts fell when
 
 
 class Comparison(NamedTuple):
-    """The better of two endings, the verdict on it and on the later one, and whether both leave the same residual."""
+    """The better of two endings.
+
+    best : that ending
+    verdict : the verdict on it
+    now : the verdict on the later one
+    advances : whether the later one is so much better that others are worth looking for
+    alike : whether both leave the same residual
+    """
 
     best: Ending
     verdict: Verdict
     now: Verdict
+    advances: bool
     alike: bool
 
 
@@ -72,23 +80,28 @@ class Judge:
         """Compare the present ending with the best of the earlier ones, if there is one.
 
         The better one has the smaller residual. Where the earlier one explains a mask's frames, or these are faint, it
-        is that, unless the later one alone explains them, or costs clearly less and is no less explained.
+        is the cheaper of two of which not only one explains them; in faint frames, if it is clearly cheaper.
         """
         after = self.verdict(objective, now)
         if rival is None:
-            return Comparison(now, after, after, alike=False)
+            return Comparison(now, after, after, advances=True, alike=False)
         before = self.verdict(objective, rival)
         if now.status is Status.GIVEN_UP:
-            return Comparison(rival, before, after, alike=False)
+            return Comparison(rival, before, after, advances=False, alike=False)
         stays = before.excess < after.excess
+        advances = not stays
         if self.end is End.INTEGRATION or self._twins_may_improve(before):
-            alone = before.explained is not after.explained
-            stays = before.explained if alone else not self._costs_less(objective, now, rival)
+            saves = self._saves(objective, now, rival)
+            # in faint frames the residual is more than noise, and costs differ more by chance
+            least = self.schedule.likelier if self.end is End.INTEGRATION else 0.0
+            only_one = before.explained is not after.explained
+            stays = before.explained if only_one else saves <= least
+            advances = not stays and (only_one or saves > self._part(objective, rival, self.schedule.better))
         best, verdict = (rival, before) if stays else (now, after)
         near = self.schedule.alike * max(verdict.excess, verdict.limit - 1)
         # Starts of a mask end alike at a wrong twin too, which is no reason to stop.
         alike = self.traits.many_minima and abs(before.excess - after.excess) < near
-        return Comparison(best, verdict, after, alike)
+        return Comparison(best, verdict, after, advances, alike)
 
     def most_starts(self, verdict: Verdict) -> int:
         """Return the maximum number of starts if this is the verdict on the best."""
@@ -110,6 +123,12 @@ class Judge:
             return False
         # one that could be spared is not begun to be cut short before most are given up
         return left > (self.schedule.glance if verdict.explained else 0)
+
+    def may_temper(self, verdict: Verdict, progress: Progress) -> bool:
+        """Return whether the next start may be from the best one heated, if this is the verdict on that: only once."""
+        left = self.traits.max_iterations - len(progress.costs)
+        is_asked = self.schedule.cooling > 0 and self.schedule.in_vain > 0 and not progress.tempered
+        return is_asked and left > self.schedule.glance and self._twins_may_improve(verdict)
 
     def _twins_may_improve(self, verdict: Verdict) -> bool:
         """Return whether a start that explains a mask's frames may have a better twin, unless the frames are faint."""
@@ -158,13 +177,6 @@ class Judge:
         if verdict.explained:
             return self._saves(objective, best, now) > self._part(objective, best, self.schedule.near)
         return self.verdict(objective, now).excess >= self.schedule.promising * verdict.excess
-
-    def _costs_less(self, objective: MyopicObjective, now: Ending, rival: Ending) -> bool:
-        """Return whether a later ending costs clearly less than an earlier one."""
-        least = self.schedule.likelier
-        if self.end is not End.INTEGRATION:  # there the residual is more than noise, and costs differ more by chance
-            least = self._part(objective, rival, self.schedule.better)
-        return self._saves(objective, now, rival) > least
 
     def _saves(self, objective: MyopicObjective, one: Ending, other: Ending) -> float:
         """Return by how much one ending costs less than the other."""

@@ -27,6 +27,7 @@ _RANGES = {
     **dict.fromkeys(("nearly_at_rest", "chance", "alike"), (-math.inf, math.inf)),  # negative ones never apply
     **dict.fromkeys(("start_rms", "start_rms_unwhitened", "move_size"), (0, sys.float_info.max)),
     "farthest": (0, 1),
+    "heat": (1, sys.float_info.max),
     "first_inflation": (sys.float_info.min, math.inf),  # as it divides
 }
 
@@ -56,15 +57,18 @@ class Schedule:
     chance : allowance for chance that is added to this limit, in standard deviations of the stack's chi-square
     missed : for a full pupil, minimum of the allowed excess, as a fraction of the change from frame to frame
     starts : maximum number of starts, but for `averaged` and `faint_starts`
-    in_vain : a mask whose frames are explained beyond doubt, and not faint, starts until so many starts in succession,
-        from twins of the best object, have brought nothing better; 0: it starts once
+    in_vain : a mask whose frames are explained beyond doubt, and not faint, starts from twins of the best object until
+        so many starts in succession have brought nothing clearly better; 0: it starts once
     doubtful : an explained fit of a mask is doubted if the excess is larger than this number times that expected, and
         others are started as if it were not explained
-    better : where the best start so far explains the frames of a mask, a later one replaces it if it costs less by this
-        fraction of what the best costs beyond noise
+    better : where the best start so far explains the frames of a mask, a later one that costs less is clearly better if
+        it costs less by this fraction of what the best costs beyond noise
     near : there a twin is given up if it costs more than the best by more than this fraction of the same
     twins : where a mask's frames are faint or not explained, number of further starts from twins of its object before
         one from random aberrations
+    cooling : a mask whose frames are explained and show gentle slopes, and are not faint, starts once from the best
+        object heated, after so many rounds in which the noise falls; 0: it does not
+    heat : factor of the variance of the noise from which it falls then
     faint_starts : maximum number of starts of a mask whose faint frames are explained, of which the likeliest is kept
     likelier : cost by which a later start in faint frames has to be lower to replace an earlier one
     glance : number of iterations after which a start from a twin, or any later start in faint frames, may be given up
@@ -136,6 +140,8 @@ class Schedule:
     better: float = 0.04
     near: float = 0.1
     twins: int = 3
+    cooling: int = 30
+    heat: float = 10.0
     faint_starts: int = 6
     likelier: float = 50.0
     glance: int = 300

@@ -14,14 +14,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 
 from torchmask.optics.geometry import MaskGeometry
 from torchmask.record import Callback, Record
 from torchmask.restoration.aberrations import AberrationBasis, MakesBasis
 from torchmask.restoration.calibration import recalibrate
 from torchmask.restoration.candidates import Candidates, play_stage
-from torchmask.restoration.checkpoint import Checkpoint, Ending, Progress, Status, save_nothing
+from torchmask.restoration.checkpoint import Checkpoint, Progress, Status, save_nothing
 from torchmask.restoration.consensus import average_starts
 from torchmask.restoration.descent import Variables, descend
 from torchmask.restoration.escapes import escape
@@ -33,6 +32,7 @@ from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.placement import distance, is_misplaced
 from torchmask.restoration.priors import ObjectPrior
 from torchmask.restoration.projected_lbfgs import Minimizer
+from torchmask.restoration.restarts import Restarts
 from torchmask.restoration.result import RestorationResult
 from torchmask.restoration.retrieval import retrieve_phases
 from torchmask.restoration.schedule import Schedule
@@ -47,9 +47,8 @@ from torchmask.restoration.starts import (
     start_from_result,
     start_rms,
 )
-from torchmask.restoration.state import Modes, State
+from torchmask.restoration.state import State
 from torchmask.restoration.traits import End, Refinement, Traits
-from torchmask.restoration.twins import twin_of
 
 
 class Solver:
@@ -96,13 +95,15 @@ class Solver:
         turbulent = Free.ABERRATIONS in objective.free and traits.prior_on_aberrations and not traits.estimated
         self.prior_r0: float | None = traits.r0 if turbulent else None  # of the aberrations' prior, at first [m]
         many_ends = turbulent and Free.OBJECT in objective.free and traits.many_minima
-        self.averages: bool = many_ends and schedule.averaged > 1
+        averages = many_ends and schedule.averaged > 1
         retrievable = objective.model.pupil.n_rasters == 1 and len(objective.frames) > 1
         self.retrieves: bool = many_ends and schedule.retrievals > 0 and retrievable
         self.stack: FrameStack = stack
         self.end: End = End.of(stack.change.each, traits, schedule, objective.free)
         self.given: ObjectPrior = objective.prior
         self.judge: Judge = Judge(self.setting, stack, traits, schedule, self.end)
+        known = (self.setting, stack, self.judge, traits, schedule)
+        self.restarts: Restarts = Restarts(*known, self.first_inflation, averages)
 
     def solve(self, known: Known, start: RestorationResult | None = None, file: Checkpoint | None = None) -> Progress:
         """Run a restoration to its end, from scratch, from an earlier result or from a checkpoint."""
@@ -156,7 +157,7 @@ class Solver:
                 if self.retrieves and among_first and progress.status is not Status.ITERATION_LIMIT:
                     retrieve_phases(self.objective, progress, *self._how, self.callback)
                 if may_start_again and not progress.retrieved:
-                    self._judge_start(progress)
+                    self.restarts.judge_start(self.objective, progress)
             save(progress)
         if progress.status is Status.ITERATION_LIMIT and progress.rival is not None:  # the last start was cut short
             progress.state = self.judge.compare(self.objective, progress.ending, progress.rival).best.state
@@ -259,33 +260,6 @@ class Solver:
         if state is progress.state:  # nothing has changed: no further attempt
             progress.escapes = self.schedule.escapes
         progress.state = state
-
-    def _judge_start(self, progress: Progress) -> None:
-        """At the end of a start, keep the best so far, and begin another one if that may have missed the object.
-
-        For a full pupil others begin until enough explain the frames, unless two agree.
-        """
-        may_be_blurred = progress.rival is None or progress.status is Status.ITERATION_LIMIT
-        if may_be_blurred and progress.iterations <= self.schedule.sharp_after:
-            return  # its object is not sharp enough to be judged
-        best, verdict, now, progress.alike = self.judge.compare(self.objective, progress.ending, progress.rival)
-        if self.averages and now.explained:
-            progress.explained += (progress.ending,)
-        progress.in_vain = 0 if best.state is progress.state else progress.in_vain + 1
-        if self.judge.wants_another(verdict, progress):
-            self._start_again(progress, best)
-        else:
-            progress.state, progress.status, progress.decrease = best.state, best.status, best.decrease
-
-    def _start_again(self, progress: Progress, best: Ending) -> None:
-        progress.start_again(best)
-        seed, state = self.traits.seed + progress.starts - 1, best.state
-        if self.judge.is_twin(progress.starts, self.judge.verdict(self.objective, best)):
-            progress.candidates = Candidates(twin_of(self._place(state), state, self.first_inflation, seed), 1)
-        else:
-            objective = self._place(replace(state, modes=Modes.STILL))
-            first = replace(self._first_state(Known()), geometry=state.geometry)
-            progress.candidates = first_candidates(objective, first, self.traits, self.schedule, seed)
 
     def _report(self, progress: Progress, variables: Variables) -> None:
         if self.callback is None:

@@ -1,0 +1,85 @@
+"""What follows a start of a restoration when it has ended: another one, or the end of the search."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from torchmask.restoration.candidates import Candidates
+from torchmask.restoration.checkpoint import Ending, Progress, Status
+from torchmask.restoration.frames import FrameStack
+from torchmask.restoration.judge import Judge
+from torchmask.restoration.motion import Setting
+from torchmask.restoration.objective import MyopicObjective
+from torchmask.restoration.schedule import Schedule
+from torchmask.restoration.spectrum import shows_gentle_slopes
+from torchmask.restoration.starts import expected_parameters, first_candidates, first_state
+from torchmask.restoration.state import Modes, State
+from torchmask.restoration.tempering import temper
+from torchmask.restoration.traits import Traits
+from torchmask.restoration.twins import twin_of
+
+
+@dataclass(frozen=True)
+class Restarts:
+    """Starts a restoration again as long as that may find a better object than the best so far.
+
+    `averages` is whether the mean of the starts that explain the frames is wanted, as for a full pupil.
+    `first_inflation` is the noise inflation with which a start begins.
+    """
+
+    setting: Setting
+    stack: FrameStack
+    judge: Judge
+    traits: Traits
+    schedule: Schedule
+    first_inflation: float
+    averages: bool
+
+    def judge_start(self, objective: MyopicObjective, progress: Progress) -> None:
+        """At the end of a start, keep the best so far, and begin another one if that may have missed the object.
+
+        For a full pupil others begin until enough explain the frames, unless two agree.
+        """
+        may_be_blurred = progress.rival is None or progress.status is Status.ITERATION_LIMIT
+        if may_be_blurred and progress.iterations <= self.schedule.sharp_after:
+            return  # its object is not sharp enough to be judged
+        found = self.judge.compare(objective, progress.ending, progress.rival)
+        best, progress.alike = found.best, found.alike
+        if self.averages and found.now.explained:
+            progress.explained += (progress.ending,)
+        progress.in_vain = 0 if found.advances else progress.in_vain + 1
+        if self.judge.may_temper(found.verdict, progress) and self._is_gentle(objective, best.state):
+            self._temper(objective, progress, best)
+        elif self.judge.wants_another(found.verdict, progress):
+            self._start_again(objective, progress, best)
+        else:
+            progress.state, progress.status, progress.decrease = best.state, best.status, best.decrease
+
+    def _start_again(self, objective: MyopicObjective, progress: Progress, best: Ending) -> None:
+        """Begin from a twin of the best object, or from random aberrations."""
+        is_twin = self.judge.is_twin(progress.starts + 1, self.judge.verdict(objective, best))
+        seed, state = self._begin(progress, best), best.state
+        if is_twin:
+            placed = self.setting.objective_at(objective, state)
+            progress.candidates = Candidates(twin_of(placed, state, self.first_inflation, seed), 1)
+            return
+        placed = self.setting.objective_at(objective, replace(state, modes=Modes.STILL))
+        z, weight = expected_parameters(placed, None), self.traits.aberration_weight
+        first = replace(first_state(placed, z, None, self.first_inflation, weight), geometry=state.geometry)
+        progress.candidates = first_candidates(placed, first, self.traits, self.schedule, seed)
+
+    def _temper(self, objective: MyopicObjective, progress: Progress, best: Ending) -> None:
+        """Begin from the best object, heated."""
+        seed, progress.tempered = self._begin(progress, best), True
+        placed = self.setting.objective_at(objective, best.state)
+        state, evaluations = temper(placed, best.state, self.schedule, seed)
+        progress.candidates = Candidates(state, 1)
+        progress.n_evaluations += evaluations
+
+    def _begin(self, progress: Progress, best: Ending) -> int:
+        """Begin another start, and return its seed."""
+        progress.start_again(best)
+        return self.traits.seed + progress.starts - 1
+
+    def _is_gentle(self, objective: MyopicObjective, state: State) -> bool:
+        return shows_gentle_slopes(self.setting.objective_at(objective, state), state, self.stack.change)
