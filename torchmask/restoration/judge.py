@@ -96,7 +96,7 @@ class Judge:
             least = self.schedule.likelier if self.end is End.INTEGRATION else 0.0
             only_one = before.explained is not after.explained
             stays = before.explained if only_one else saves <= least
-            advances = not stays and (only_one or saves > self._part(objective, rival, self.schedule.better))
+            advances = not stays and saves > self._part(objective, rival, self.schedule.better)
         best, verdict = (rival, before) if stays else (now, after)
         near = self.schedule.alike * max(verdict.excess, verdict.limit - 1)
         # Starts of a mask end alike at a wrong twin too, which is no reason to stop.

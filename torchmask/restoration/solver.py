@@ -6,8 +6,9 @@ updated; the assumed noise falls from the residual of the mean frame to the true
 Once the object is sharp, frames and object escape from local minima, and in faint light the prior suits it; when
 nothing changes any more, each frame is weighted by how well it fits. A start ends when a segment gains nothing, or
 little if it explains the frames, or its iterations are used up. Then phases of a full pupil's bright frames are
-retrieved. Others start from random aberrations or, for a mask, from twins of the best object, as long as they may find
-a better one (`judge`); the best is kept, or the mean for a full pupil. The rest is told in `finish`.
+retrieved. Others start from random aberrations or, for a mask, from twins of the best object or from that heated, as
+long as they may find a better one (`restarts`); the best is kept, or the mean for a full pupil. The rest is told in
+`finish`.
 """
 
 from __future__ import annotations
