@@ -104,6 +104,16 @@ def test_heated_samples_follow_the_posterior_in_more_noise(heat, monkeypatch):
         assert abs(float(moment(found.z).mean()) - expected) < 4 * error
 
 
+def test_each_round_has_its_own_heat(explain):
+    """Of the noise that the state came with, frame by frame."""
+    objective, state = explain(n_frames=2)
+    noise = torch.tensor([1.0, 1.5], dtype=torch.float64)
+    state = replace(state, calibration=replace(state.calibration, noise_inflation=noise))
+    generator = torch.Generator().manual_seed(0)
+    rounds = sampler.sample_rounds(objective, state, [4.0, 2.0, 1.0], BRIEF, generator, follow_r0=False)
+    assert [found.calibration.noise_inflation.tolist() for found, _ in rounds] == [[4.0, 6.0], [2.0, 3.0], [1.0, 1.5]]
+
+
 def one_frame(objective, state):
     return objective.of_frames(slice(0, 1)), state.of_frames(slice(0, 1))
 

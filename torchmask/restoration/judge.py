@@ -80,7 +80,8 @@ class Judge:
         """Compare the present ending with the best of the earlier ones, if there is one.
 
         The better one has the smaller residual. Where the earlier one explains a mask's frames, or these are faint, it
-        is the cheaper of two of which not only one explains them; in faint frames, if it is clearly cheaper.
+        is the only one that explains them, or the cheaper one if both do or none; in faint frames the later one has to
+        cost clearly less.
         """
         after = self.verdict(objective, now)
         if rival is None:
