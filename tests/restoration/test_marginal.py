@@ -114,6 +114,24 @@ def test_each_round_has_its_own_heat(explain):
     assert [found.calibration.noise_inflation.tolist() for found, _ in rounds] == [[4.0, 6.0], [2.0, 3.0], [1.0, 1.5]]
 
 
+def test_the_metric_of_moves_is_renewed_now_and_then(explain, monkeypatch):
+    objective, state = explain(n_frames=2)
+    made = []
+
+    class Counted(AberrationSampler):
+        def __init__(self, objective, state, generator):
+            super().__init__(objective, state, generator)
+            made.append(state)
+
+    monkeypatch.setattr(sampler, "AberrationSampler", Counted)
+    rounds = sampler.sample_rounds(
+        objective, state, 5 * [1.0], BRIEF, torch.Generator().manual_seed(0), follow_r0=False
+    )
+    found = [now for now, _ in rounds]
+    assert len(made) == 3  # before rounds 0, 2 and 4
+    assert torch.equal(made[2].z, found[3].z)
+
+
 def one_frame(objective, state):
     return objective.of_frames(slice(0, 1)), state.of_frames(slice(0, 1))
 
