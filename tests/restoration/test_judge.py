@@ -255,17 +255,19 @@ def test_the_best_start_is_heated_once_if_twins_may_improve_it(explain):
     """And as many iterations are left as a twin has before it may be given up."""
     objective, state = explain(noise=0.003)
 
-    def may(end=End.LAST_DESCENT, spent=0, tempered=False, many_minima=False, **numbers):
+    def may(end=End.LAST_DESCENT, spent=0, n=1, tempered=False, many_minima=False, **numbers):
         traits = replace(TRAITS, max_iterations=1000, many_minima=many_minima)
         schedule = Schedule(**{"chance": math.inf, "glance": 300} | numbers)
         judge = Judge(Setting.of(objective), stack_of(objective), traits, schedule, end)
         verdict = judge.verdict(objective, Ending(state, Status.CONVERGED))
-        return judge.may_temper(verdict, Progress(Candidates(state, 1), spent * [1.0], tempered=tempered))
+        return judge.may_temper(verdict, Progress(Candidates(state, 1), spent * [1.0], starts=n, tempered=tempered))
 
     assert may()
     assert may(End.BOTH)
     assert may(spent=699)
     assert not may(spent=700)
+    assert may(n=8)
+    assert not may(n=9)
     assert not may(tempered=True)
     assert not may(cooling=0)
     assert not may(in_vain=0)

@@ -300,7 +300,7 @@ def test_an_explained_object_of_gentle_slopes_is_heated_once(gentle, cooling, ki
     objective, truth = explained
     begun, ends = [], []
 
-    def heat(objective, state, schedule, seed):
+    def heat(objective, state, schedule, seed, callback):
         begun.append(("h", state, seed))
         return replace(truth, image=0.99 * truth.image), 17
 

@@ -22,7 +22,9 @@ def test_the_noise_falls_by_equal_factors_to_what_it_is(cooling, heats, explaine
         yield replace(state, z=state.z + 1).with_noise_inflation(7.0), 0.5
 
     monkeypatch.setattr(tempering, "sample_rounds", sample_rounds)
-    found, evaluations = temper(objective, state, replace(BRIEF, cooling=cooling), 0)
+    records = []
+    found, evaluations = temper(objective, state, replace(BRIEF, cooling=cooling), 0, records.append)
+    assert [(record.stage, record.step, record.n_steps) for record in records] == [("heated start", 1, cooling)]
     assert given == pytest.approx(heats)
     assert evaluations == cooling * (2 + 2)
     assert torch.equal(found.z, state.z + 1)

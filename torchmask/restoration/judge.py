@@ -129,7 +129,8 @@ class Judge:
         """Return whether the next start may be from the best one heated, if this is the verdict on that: only once."""
         left = self.traits.max_iterations - len(progress.costs)
         is_asked = self.schedule.cooling > 0 and self.schedule.in_vain > 0 and not progress.tempered
-        return is_asked and left > self.schedule.glance and self._twins_may_improve(verdict)
+        may_start = progress.starts < self.schedule.starts and left > self.schedule.glance
+        return is_asked and may_start and self._twins_may_improve(verdict)
 
     def _twins_may_improve(self, verdict: Verdict) -> bool:
         """Return whether a start that explains a mask's frames may have a better twin, unless the frames are faint."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from torchmask.record import Callback
 from torchmask.restoration.candidates import Candidates
 from torchmask.restoration.checkpoint import Ending, Progress, Status
 from torchmask.restoration.frames import FrameStack
@@ -24,7 +25,7 @@ class Restarts:
     """Starts a restoration again as long as that may find a better object than the best so far.
 
     `averages` is whether the mean of the starts that explain the frames is wanted, as for a full pupil.
-    `first_inflation` is the noise inflation with which a start begins.
+    `first_inflation` is the noise inflation with which a start begins. `callback` is told of heated rounds.
     """
 
     setting: Setting
@@ -34,6 +35,7 @@ class Restarts:
     schedule: Schedule
     first_inflation: float
     averages: bool
+    callback: Callback | None
 
     def judge_start(self, objective: MyopicObjective, progress: Progress) -> None:
         """At the end of a start, keep the best so far, and begin another one if that may have missed the object.
@@ -72,7 +74,7 @@ class Restarts:
         """Begin from the best object, heated."""
         seed, progress.tempered = self._begin(progress, best), True
         placed = self.setting.objective_at(objective, best.state)
-        state, evaluations = temper(placed, best.state, self.schedule, seed)
+        state, evaluations = temper(placed, best.state, self.schedule, seed, self.callback)
         progress.candidates = Candidates(state, 1)
         progress.n_evaluations += evaluations
 

@@ -104,7 +104,7 @@ class Solver:
         self.given: ObjectPrior = objective.prior
         self.judge: Judge = Judge(self.setting, stack, traits, schedule, self.end)
         known = (self.setting, stack, self.judge, traits, schedule)
-        self.restarts: Restarts = Restarts(*known, self.first_inflation, averages)
+        self.restarts: Restarts = Restarts(*known, self.first_inflation, averages, callback)
 
     def solve(self, known: Known, start: RestorationResult | None = None, file: Checkpoint | None = None) -> Progress:
         """Run a restoration to its end, from scratch, from an earlier result or from a checkpoint."""

@@ -13,17 +13,25 @@ from dataclasses import replace
 
 import torch
 
+from torchmask.record import Callback, Record
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.sampler import sample_rounds
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.state import State
 
 
-def temper(objective: MyopicObjective, state: State, schedule: Schedule, seed: int) -> tuple[State, int]:
-    """Return the state after the noise has fallen from `schedule.heat` times its variance, and the evaluations."""
-    last, rounds = state, schedule.cooling
+def temper(
+    objective: MyopicObjective, state: State, schedule: Schedule, seed: int, callback: Callback | None = None
+) -> tuple[State, int]:
+    """Return the state after the noise has fallen from `schedule.heat` times its variance, and the evaluations.
+
+    The callback is called with a `Record` after every round.
+    """
+    rounds, base = schedule.cooling, state.calibration
     heats = (schedule.heat ** (1 - number / max(rounds - 1, 1)) for number in range(rounds))
-    generator = torch.Generator().manual_seed(seed)
-    for sampled, _ in sample_rounds(objective, state, heats, schedule, generator, follow_r0=False):
-        last = sampled
-    return replace(last, calibration=state.calibration), rounds * (schedule.moves + 2)
+    sampled = sample_rounds(objective, state, heats, schedule, torch.Generator().manual_seed(seed), follow_r0=False)
+    for number, (heated, accepted) in enumerate(sampled):
+        state = heated
+        if callback is not None:
+            callback(Record("heated start", number + 1, rounds, {"accepted": accepted}, {}))
+    return replace(state, calibration=base), rounds * (schedule.moves + 2)
