@@ -126,7 +126,7 @@ class Judge:
         return left > (self.schedule.glance if verdict.explained else 0)
 
     def may_temper(self, verdict: Verdict, progress: Progress) -> bool:
-        """Return whether the next start may be from the best one heated, if this is the verdict on that: only once."""
+        """Return whether the best start, on which this is the verdict, may be heated, which is done once."""
         left = self.traits.max_iterations - len(progress.costs)
         is_asked = self.schedule.cooling > 0 and self.schedule.in_vain > 0 and not progress.tempered
         may_start = progress.starts < self.schedule.starts and left > self.schedule.glance

@@ -50,10 +50,10 @@ class Restarts:
         if self.averages and found.now.explained:
             progress.explained += (progress.ending,)
         progress.in_vain = 0 if found.advances else progress.in_vain + 1
-        if self.judge.may_temper(found.verdict, progress) and self._is_gentle(objective, best.state):
-            self._temper(objective, progress, best)
-        elif self.judge.wants_another(found.verdict, progress):
+        if self.judge.wants_another(found.verdict, progress):
             self._start_again(objective, progress, best)
+        elif self.judge.may_temper(found.verdict, progress) and self._is_gentle(objective, best.state):
+            self._temper(objective, progress, best)
         else:
             progress.state, progress.status, progress.decrease = best.state, best.status, best.decrease
 
