@@ -16,13 +16,18 @@ from torch import Tensor
 from torchmask.restoration.change import Change
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.projected_lbfgs import minimize_bounded
+from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.slopes import gradient, rate_in_light, rate_of_slopes, shown
 from torchmask.restoration.state import State
 
 _ITERATIONS = 100
 _LOWEST = 3.5  # times the spacing of frequencies: below it lies the power that the fit begins with
 _STEEPEST = 10.0  # exponent, which frames of hardly more than noise do not tell
-_GENTLE = 0.22  # rate by the frames above which slopes are gentle: 0.03 to 0.17 for satellites, 0.28 on for balls
+_GENTLE = (
+    0.5  # rate by bright frames above which slopes are gentle: 0.12 to 0.36 of planets, 0.8 on of balls, asteroids
+)
+_DOUBT = 2.0  # standard errors of which slopes have the benefit there: a ball of 0.36 in faint light has 0.57 with it
+_GENTLE_FAINT = 0.22  # limit by faint frames, one error less: 0.03 to 0.17 of satellites, 0.28 on of balls
 _OF_NOISE = 0.82  # rate found of gentle slopes below which an object follows noise: 0.3 to 0.78 of asteroids that do
 _VAGUE = 100.0  # error of a logarithm above which nothing is known
 
@@ -33,22 +38,25 @@ class Power(NamedTuple):
     value: float
     error: float
 
-    @property
-    def at_most(self) -> float:
-        """The value one standard error higher."""
-        return self.value * math.exp(min(self.error, _VAGUE))
+    def off_by(self, errors: float) -> float:
+        """Return the value so many standard errors higher."""
+        return self.value * math.exp(max(-_VAGUE, min(errors * self.error, _VAGUE)))
 
 
 def shows_gentle_slopes(objective: MyopicObjective, state: State, change: Change) -> bool:
     """Return whether the slopes of the object are gentle, as far as the power of its frames tells.
 
-    Their rate is above 0.22 then, even if those of the object in `state` are steep, as it may follow noise; only the
-    sum of its slopes is taken from it. Frames that change by hardly more than noise do not tell, nor does a single one.
+    Their rate is not below 0.5 by more than two standard errors then; by faint frames it is above 0.22 by one, even if
+    those of the object in `state` are steep, as it may follow noise. Only the sum of its slopes is taken from it.
+    Frames that change by hardly more than noise do not tell, nor does a single one.
     """
     if change.n_frames == 1 or shown(change) < 1:
         return False
     total = float(torch.hypot(*gradient(state.image)).sum())
-    return 3 * total > _GENTLE * power_of_slopes(objective, state).at_most
+    power = power_of_slopes(objective, state)
+    if change.each < Schedule.faint:
+        return 3 * total > _GENTLE_FAINT * power.off_by(1)
+    return 3 * total > _GENTLE * power.off_by(-_DOUBT)
 
 
 def rate_in_search(objective: MyopicObjective, state: State, change: Change) -> float:
