@@ -136,14 +136,15 @@ def test_an_object_that_follows_noise_is_known_by_its_frames(amplitude, gentle, 
             assert not shows_gentle_slopes(objective, found, silent)
 
 
-def test_faint_frames_call_steeper_slopes_gentle(seen):
-    """Of a rate of 0.33, as a planet may have in bright light, and one standard error less."""
+@pytest.mark.parametrize(("errors", "gentle"), [(1.5, True), (2.5, False)])
+def test_bright_frames_tell_gentle_slopes_more_sharply(errors, gentle, seen):
+    """Those of a rate of so many standard errors below a half; by faint frames they are gentle anyway."""
     objective, state = seen(0)
-    total = float(torch.hypot(*gradient(state.image)).sum())
-    scale = 3 * total / power_of_slopes(objective, state).off_by(1) / 0.33
+    total, power = float(torch.hypot(*gradient(state.image)).sum()), power_of_slopes(objective, state)
+    scale = 3 * total / power.value / (0.5 * math.exp(-errors * power.error))
     objective, state = seen(0, amplitude=50 * scale, noise=0.3 * scale)
+    assert shows_gentle_slopes(objective, state, Change(5.1, 8, 4096)) is gentle
     assert shows_gentle_slopes(objective, state, Change(4.9, 8, 4096))
-    assert not shows_gentle_slopes(objective, state, Change(5.1, 8, 4096))
 
 
 def test_the_rate_of_a_search_is_that_of_its_object_unless_it_follows_noise(seen, monkeypatch):
