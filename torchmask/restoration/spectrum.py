@@ -23,9 +23,7 @@ from torchmask.restoration.state import State
 _ITERATIONS = 100
 _LOWEST = 3.5  # times the spacing of frequencies: below it lies the power that the fit begins with
 _STEEPEST = 10.0  # exponent, which frames of hardly more than noise do not tell
-_GENTLE = (
-    0.5  # rate by bright frames above which slopes are gentle: 0.12 to 0.36 of planets, 0.8 on of balls, asteroids
-)
+_GENTLE = 0.5  # rate by bright frames from which slopes are gentle: 0.12 to 0.36 of planets, 0.79 on of asteroids
 _DOUBT = 2.0  # standard errors of which slopes have the benefit there: a ball of 0.36 in faint light has 0.57 with it
 _GENTLE_FAINT = 0.22  # limit by faint frames, one error less: 0.03 to 0.17 of satellites, 0.28 on of balls
 _OF_NOISE = 0.82  # rate found of gentle slopes below which an object follows noise: 0.3 to 0.78 of asteroids that do
