@@ -42,9 +42,12 @@ def test_one_seed_moves_the_aberrations_one_way_and_the_object_follows(explained
 
 
 def test_more_heat_moves_them_farther(explained):
-    """By the root of it, in a single round whose moves are a fixed part of Laplace's standard deviations."""
+    """In a single move of a fixed part of their standard deviations, which grow by less than the root of the heat.
+
+    The prior holds them beside the frames, which are so noisy here that it counts.
+    """
     objective, state = explained
-    state = state.with_noise_inflation(1e4)  # where noise outweighs the prior less, neither bends the moves
+    state = state.with_noise_inflation(1e4)
     once = replace(BRIEF, cooling=1, moves=1)
 
     def distance(heat):

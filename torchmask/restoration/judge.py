@@ -114,7 +114,7 @@ class Judge:
 
     def wants_another(self, verdict: Verdict, progress: Progress) -> bool:
         """Return whether to start again if this is the verdict on the best start, and iterations are left for it."""
-        left = self.traits.max_iterations - len(progress.costs)
+        left = self._left(progress)
         if progress.explained:
             return len(progress.explained) < self.schedule.averaged and left >= self.schedule.start_iterations
         if progress.alike or progress.starts >= self.most_starts(verdict):
@@ -127,10 +127,13 @@ class Judge:
 
     def may_temper(self, verdict: Verdict, progress: Progress) -> bool:
         """Return whether the best start, on which this is the verdict, may be heated, which is done once."""
-        left = self.traits.max_iterations - len(progress.costs)
         is_asked = self.schedule.cooling > 0 and self.schedule.in_vain > 0 and not progress.tempered
-        may_start = progress.starts < self.schedule.starts and left > self.schedule.glance
+        may_start = progress.starts < self.schedule.starts and self._left(progress) > self.schedule.glance
         return is_asked and may_start and self._twins_may_improve(verdict)
+
+    def _left(self, progress: Progress) -> int:
+        """Return how many iterations are left for all further starts."""
+        return self.traits.max_iterations - len(progress.costs)
 
     def _twins_may_improve(self, verdict: Verdict) -> bool:
         """Return whether a start that explains a mask's frames may have a better twin, unless the frames are faint."""
