@@ -16,7 +16,7 @@ from torchmask.restoration.adjoint import data_fidelity
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.objective import Free
-from torchmask.restoration.placed import PlacedSamples, moved_centers
+from torchmask.restoration.placed import PlacedSamples, centers_of, moved_centers
 from torchmask.restoration.placement import (
     distance,
     information,
@@ -36,7 +36,7 @@ GRID = Grid.nyquist(1.05, 550e-9, (24, 30))
 
 def gradient_in_step(model, exposures, step):
     image, z, frames, precision = exposures
-    placed = PlacedSamples(model.pupil, step)
+    placed = PlacedSamples(model.pupil, centers_of(model.pupil), step)
     found = data_fidelity(model, image, z, frames, precision, samples=placed.samples, want_samples=True)
     return float(found.value.sum()), placed.pull_back(found.weight_gradient, found.basis_gradient)
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.optimize import Bounds, minimize
 
 from torchmask.restoration.priors import TotalVariation
-from torchmask.restoration.projected_lbfgs import Corrections, ProjectedLBFGS, minimize_bounded
+from torchmask.restoration.projected_lbfgs import ProjectedLBFGS, minimize_bounded
 
 
 def bowl(seed, n, dtype=torch.float64):
@@ -99,41 +99,6 @@ def test_as_few_evaluations_as_scipy_where_the_valley_bends():
     assert found.converged
     torch.testing.assert_close(found.x, torch.ones_like(start), rtol=0, atol=1e-6)
     assert found.n_evaluations < 2 * theirs.nfev
-
-
-@pytest.mark.parametrize("n_pairs", [0, 1, 3, 5, 9])
-def test_inverse_hessian_is_that_of_the_bfgs_matrix(n_pairs):
-    """B by its recursion (Nocedal & Wright 2006, eq. 6.19), restricted and inverted directly."""
-    n, size = 12, 5
-    generator = torch.Generator().manual_seed(n_pairs)
-    _, hessian, _ = bowl(1, n)
-    memory = Corrections(size, hessian[0])
-    pairs = []
-    for _ in range(n_pairs):  # as in a descent: steps move what was free at the last solve
-        free = torch.rand(n, generator=generator) < 0.7
-        memory.solve(torch.randn(n, generator=generator, dtype=torch.float64), free)
-        step = torch.randn(n, generator=generator, dtype=torch.float64) * free
-        memory.add(step, hessian @ step)
-        pairs.append((step, hessian @ step))
-    kept = pairs[-size:]
-    b = torch.eye(n, dtype=torch.float64)
-    if kept:
-        b = b * (kept[-1][1] @ kept[-1][1]) / (kept[-1][0] @ kept[-1][1])
-    for s, y in kept:
-        b = b - torch.outer(b @ s, b @ s) / (s @ b @ s) + torch.outer(y, y) / (y @ s)
-    gradient = torch.randn(n, generator=generator, dtype=torch.float64)
-    # twice: the second time only what has changed sides is brought up to date
-    for seed in (1, 2):
-        free = torch.rand(n, generator=torch.Generator().manual_seed(seed)) < 0.6
-        expected = torch.zeros(n, dtype=torch.float64)
-        expected[free] = torch.linalg.solve(b[free][:, free], gradient[free])
-        torch.testing.assert_close(memory.solve(gradient, free), expected, rtol=1e-8, atol=1e-10)
-
-
-def test_pairs_without_curvature_are_not_kept():
-    memory = Corrections(3, torch.zeros(2, dtype=torch.float64))
-    memory.add(torch.tensor([1.0, 0.0]).double(), torch.tensor([-1.0, 0.0]).double())
-    assert len(memory) == 0
 
 
 def test_float32_and_a_start_outside_the_bounds():

@@ -10,6 +10,7 @@ from torchmask.grid import Grid
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.band import Band
 from torchmask.restoration.aberrations import plain_basis
+from torchmask.restoration.adjoint import data_fidelity
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.pupil import SampledPupil
 
@@ -107,6 +108,37 @@ def test_samples_with_a_gradient_are_those_without():
     with torch.no_grad():
         for one, other in zip(training, model.pupil.samples(), strict=True):
             assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize("band", BANDS)
+def test_closed_samples_change_nothing_and_are_as_many_everywhere(band):
+    model = ExposureModel(mask(), GRID, 3, band)
+    places = (torch.tensor(centers, dtype=torch.float64) for centers in (HERE, THERE))
+    here, there = (model.pupil.samples_at(centers, with_closed=True) for centers in places)
+    assert len(here.weights) == len(there.weights) > len(model.pupil.weights)
+    open_samples, z = model.pupil.samples(), aberrations()
+    is_open = here.weights > 0
+    for of_all, of_open in zip(here, open_samples, strict=True):
+        torch.testing.assert_close(of_all[is_open], of_open, rtol=1e-14, atol=0)
+    torch.testing.assert_close(model.psf(z, here), model.psf(z), rtol=0, atol=1e-14 * float(model.psf(z).max()))
+
+
+def test_closed_samples_add_nothing_to_a_gradient():
+    """Nor does the weight of 0 by which it has to be divided spoil it."""
+    model, z = ExposureModel(mask(), GRID, 3), aberrations()
+    image = torch.rand(model.window.field.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    frames, precision = torch.zeros(2, *GRID.shape, dtype=torch.float64), torch.ones(1, 1, 1, dtype=torch.float64)
+
+    def slope(with_closed):
+        centers = model.pupil.aperture.centers.clone().requires_grad_()
+        samples = model.pupil.samples_at(centers, with_closed=with_closed)
+        still = type(samples)(*(values.detach() for values in samples))
+        found = data_fidelity(model, image, z, frames, precision, samples=still, want_samples=True)
+        given = (found.weight_gradient, found.basis_gradient)
+        return torch.autograd.grad((samples.weights, samples.basis), centers, given)[0]
+
+    expected = slope(with_closed=False)
+    torch.testing.assert_close(slope(with_closed=True), expected, rtol=0, atol=1e-12 * float(expected.abs().max()))
 
 
 @pytest.mark.parametrize("trains", [False, True])

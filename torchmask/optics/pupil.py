@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from torchmask.grid import Grid
-from torchmask.optics.shape_base import Shape
+from torchmask.optics.shape_base import Shape, vector
 
 
 class PupilSamples(NamedTuple):
@@ -134,7 +134,7 @@ def sample_holes(
             f"{max(step):.4g} m: at least 2 are needed, so take an image at least {math.ceil(100 * wider) / 100:g} "
             f"times as wide{or_finer}"
         )
-    cell = centers.new_tensor([step[1], step[0]])
+    cell = vector(centers, step[1], step[0])
     half = [math.ceil(shape.outer_diameter(diameter) / (2 * s)) + 1 for s in (step[1], step[0])]
     patch = torch.cartesian_prod(
         *(torch.arange(-h, h + 1, device=centers.device) for h in half)

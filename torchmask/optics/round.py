@@ -22,6 +22,7 @@ from torchmask.optics.shape_base import (
     Shape,
     half_plane_coverage,
     safe_length,
+    vector,
 )
 
 
@@ -64,7 +65,7 @@ class Disc(Shape):
         # A sample at the centre, or so near that its squared distance underflows, has no direction. Any will do; this
         # one keeps the gradient finite.
         central = (offsets.abs() < math.sqrt(torch.finfo(offsets.dtype).tiny)).all(-1, keepdim=True)
-        direction = torch.where(central, offsets.new_tensor([1.0, 0.0]), offsets)
+        direction = torch.where(central, vector(offsets, 1.0, 0.0), offsets)
         length = torch.linalg.vector_norm(direction, dim=-1, keepdim=True)
         r = torch.where(central, 0, length)[..., 0]
         return half_plane_coverage(diameter / 2 - r, direction / length, cell)

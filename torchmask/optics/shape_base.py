@@ -204,6 +204,11 @@ def no_pullback(grad: Tensor) -> Tensor:
     raise RuntimeError("the patches were made without derivatives: call with differentiate=True")
 
 
+def vector(like: Tensor, *numbers: float) -> Tensor:
+    """Return numbers as a vector (n,) like a tensor, made where that lies: nothing waits for a copy from the host."""
+    return torch.stack([torch.full((), number, dtype=like.dtype, device=like.device) for number in numbers])
+
+
 def safe_length(vector: Tensor) -> Tensor:
     """Return the length along the last axis, with a gradient along the first component at zero length."""
     zero = (vector == 0).all(-1)

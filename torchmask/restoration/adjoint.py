@@ -106,7 +106,7 @@ def data_fidelity(
             return value, by_object, None, None
         by_psf = torch.fft.irfft2(back.mul_(conjugate), s=shape)
         back = pull_back_field(samples, amplitude.mul_(by_psf[:, None]))
-        weights = along(field, back).sum(0) / samples.weights if want_samples else None
+        weights = _by_weights(samples, field, back) if want_samples else None
         return value, by_object, across(field, back), weights
 
     values, by_object, slopes, weights = zip(*parallel(compare, model.chunks(len(z))), strict=True)
@@ -141,6 +141,12 @@ def across(field: Tensor, back: Tensor) -> Tensor:
 def along(field: Tensor, back: Tensor) -> Tensor:
     """Return the gradient (T, P) with respect to the logarithm of the field's modulus."""
     return 2 * (back.real * field.real + back.imag * field.imag)
+
+
+def _by_weights(samples: OpenSamples, field: Tensor, back: Tensor) -> Tensor:
+    """Return the gradient (P,) with respect to the weights, summed over the frames; 0 where a cell is closed."""
+    slope = along(field, back).sum(0) / samples.weights
+    return slope.where(samples.weights > 0, 0.0)
 
 
 @torch.no_grad()

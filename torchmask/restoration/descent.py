@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchmask.restoration.adjoint import curvature
+from torchmask.restoration.cuda_graphs import graphed
 from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.placement import information, largest_magnification, moved, slopes_of_frames
 from torchmask.restoration.projected_lbfgs import Minimizer
@@ -45,10 +46,16 @@ def descend(
         image = x[:n].view_as(state.image) * image_scale if n else state.image
         return image, x[n:place].view_as(state.z) * z_scale if place > n else state.z
 
-    def cost(x: Tensor) -> tuple[float, Tensor]:
+    def of_vector(x: Tensor) -> tuple[Tensor, Tensor]:
         value, by_image, by_z, by_step = evaluate(*split(x), x[place:] * step_scale if moves else None)
         slope = step_scale if by_step is None else by_step * step_scale
-        return float(value), joined(by_image * image_scale, by_z * z_scale, slope)
+        return value, joined(by_image * image_scale, by_z * z_scale, slope)
+
+    there = graphed(of_vector, state.image.device)
+
+    def cost(x: Tensor) -> tuple[float, Tensor]:
+        value, gradient = there(x)
+        return float(value), gradient
 
     def joined(image: Tensor, z: Tensor, step: Tensor) -> Tensor:
         return torch.cat([image.flatten()[:n], z.flatten()[: place - n], step])

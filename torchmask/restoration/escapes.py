@@ -17,6 +17,7 @@ from torch import Tensor
 
 from torchmask.metrics import shift
 from torchmask.restoration.calibration import calibrate
+from torchmask.restoration.cuda_graphs import graphed
 from torchmask.restoration.descent import Variables, descend
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.fringes import change_fringes
@@ -130,13 +131,19 @@ def settle_object(
     start = centre.clamp(min=0)
     scale = (power.mean() + prior.curvature(start)).rsqrt()
 
-    def cost(x: Tensor) -> tuple[float, Tensor]:
+    def of_vector(x: Tensor) -> tuple[Tensor, Tensor]:
         image = x.view_as(centre) * scale
         change = image - centre
         curved = torch.fft.irfft2(torch.fft.rfft2(change) * power, s=change.shape)
         penalty, slope = prior.value_and_gradient(image)
         value = (change * (gradient + 0.5 * curved)).sum() + penalty
-        return float(value), ((gradient + curved + slope) * scale).flatten()
+        return value, ((gradient + curved + slope) * scale).flatten()
+
+    there = graphed(of_vector, centre.device)
+
+    def cost(x: Tensor) -> tuple[float, Tensor]:
+        value, by_x = there(x)
+        return float(value), by_x
 
     x = (start / scale).flatten()
     found = minimize_bounded(cost, x, torch.zeros_like(x), max_iterations=max_iterations)

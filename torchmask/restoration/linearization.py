@@ -7,10 +7,13 @@ from functools import reduce
 import torch
 from torch import Tensor
 
+from torchmask.memory import AtATime
 from torchmask.restoration.adjoint import pull_back
 from torchmask.restoration.forward import ExposureModel, intensity
 from torchmask.restoration.parallel import Map
 from torchmask.restoration.pupil import OpenSamples
+
+_AT_A_TIME = AtATime(processor=1, gpu=2**28)  # bytes of the amplitudes of several changes: on a processor, of one
 
 
 class Linearization:
@@ -33,18 +36,20 @@ class Linearization:
     def forward(self, image: Tensor, z: Tensor) -> Tensor:
         """Return J times changes of the object (S, H', W') and the aberrations (S, T, K), as frames (S, T, H, W)."""
         model, samples, shape = self.model, self.samples, self.model.window.field.shape
-        spectra = model.spectrum(image)
+        spectra = model.spectrum(image)[:, None]
 
         @torch.no_grad()
         def part_of(number: int) -> Tensor:
             field, amplitude, transfer = self.fields[number], self.amplitudes[number], self.transfers[number]
-            frames = []
-            for spectrum, change in zip(spectra, z[:, self.parts[number]], strict=True):
-                moved = model.amplitude(samples, 1j * field * samples.phase(change))
-                psf = 2 * (amplitude.real * moved.real + amplitude.imag * moved.imag).sum(1)
+            frames, changes = [], z[:, self.parts[number]]
+            size = max(1, _AT_A_TIME.on(z.device) // (amplitude.numel() * amplitude.itemsize))
+            for spectrum, change in zip(spectra.split(size), changes.split(size), strict=True):
+                moved = model.amplitude(samples, (1j * field * samples.phase(change)).flatten(0, 1))
+                moved = moved.unflatten(0, change.shape[:2])
+                psf = 2 * (amplitude.real * moved.real + amplitude.imag * moved.imag).sum(2)
                 frame = torch.fft.irfft2(torch.fft.rfft2(psf) * self.spectrum + transfer * spectrum, s=shape)
                 frames.append(model.window.crop(frame))
-            return torch.stack(frames)
+            return torch.cat(frames)
 
         return torch.cat(list(self.parallel(part_of, range(len(self.parts)))), dim=1)
 

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchmask.restoration.adjoint import data_fidelity
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.parallel import Map
-from torchmask.restoration.placed import PlacedSamples
+from torchmask.restoration.placed import PlacedSamples, centers_of
 from torchmask.restoration.priors import ObjectPrior
 from torchmask.restoration.state import LEAST_TRANSMISSION, Calibration
 
@@ -198,12 +198,13 @@ class MyopicObjective(nn.Module):
         frames, precision, unit = self.scaled_data(calibration)
         with torch.no_grad():
             samples = self.model.pupil.samples()  # once: whether they are up to date is asked of the device
+        centers = centers_of(self.model.pupil)
         by_object = Free.OBJECT in self.free
         by_aberrations = bool(self.free & (Free.ABERRATIONS | Free.COMMON))
 
         @torch.no_grad()
         def evaluate(image: Tensor, z: Tensor, step: Tensor | None = None) -> CostAndGradients:
-            placed = None if step is None else PlacedSamples(self.model.pupil, step)
+            placed = None if step is None else PlacedSamples(self.model.pupil, centers, step)
             misfit = data_fidelity(
                 self.model,
                 image,

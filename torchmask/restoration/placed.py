@@ -16,16 +16,25 @@ def moved_centers(centers: Tensor, step: Tensor) -> Tensor:
     return torch.stack([cosine * x - sine * y, sine * x + cosine * y], -1)
 
 
+def centers_of(pupil: SampledPupil) -> Tensor:
+    """Return the centres (N, 2) [m] of a pupil's sub-apertures, where its samples lie."""
+    return pupil.aperture.centers.detach().to(pupil.weights.device)
+
+
 class PlacedSamples:
     """The open samples of a pupil whose sub-aperture centres are rotated and shrunk about the origin by `step` (2,).
+
+    `centers` (N, 2) [m] are `centers_of` the pupil, taken once for all steps, and the step lies where they do.
 
     samples : the samples, detached from the graph
     """
 
-    def __init__(self, pupil: SampledPupil, step: Tensor) -> None:
+    def __init__(self, pupil: SampledPupil, centers: Tensor, step: Tensor) -> None:
         self._step: Tensor = step.detach().clone().requires_grad_()
         with torch.enable_grad():
-            self._moved = pupil.samples_at(moved_centers(pupil.aperture.centers.detach(), self._step))
+            # As many for every step on a GPU: a CUDA graph cannot hold a number that depends on values.
+            with_closed = step.device.type == "cuda"
+            self._moved = pupil.samples_at(moved_centers(centers, self._step), with_closed=with_closed)
         self.samples: OpenSamples = OpenSamples(*(values.detach() for values in self._moved))
 
     def pull_back(self, weights: Tensor, basis: Tensor) -> Tensor:

@@ -19,7 +19,7 @@ from torchmask.optics.aperture import Aperture, SparseAperture
 from torchmask.optics.geometry import MaskGeometry
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.objective import MyopicObjective
-from torchmask.restoration.placed import PlacedSamples
+from torchmask.restoration.placed import PlacedSamples, centers_of
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.state import State
 
@@ -46,8 +46,10 @@ class Misplacement(NamedTuple):
 def slopes_of_frames(model: ExposureModel, image: Tensor, z: Tensor) -> Tensor:
     """Return the derivatives (2, T, H, W) of the frames with respect to the step, at zero, by central differences."""
 
+    centers = centers_of(model.pupil)
+
     def made(step: Tensor) -> Tensor:
-        samples = PlacedSamples(model.pupil, step).samples
+        samples = PlacedSamples(model.pupil, centers, step).samples
         return torch.cat([model(image, z[part], samples) for part in model.chunks(len(z))])
 
     steps = _STEP * torch.eye(2, dtype=torch.float64, device=z.device)

@@ -1,8 +1,4 @@
-"""Limited-memory BFGS with lower bounds, on torch tensors.
-
-The iterates and the corrections stay on the device of the start. Their products with each other, a few dozen rows, are
-kept on the host, where small systems are solved fastest: one table is copied there in an iteration, and some scalars.
-"""
+"""Limited-memory BFGS with lower bounds, on torch tensors, which stay on the device of the start."""
 
 from __future__ import annotations
 
@@ -13,8 +9,9 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from torchmask.restoration.corrections import make_corrections
+
 _SUFFICIENT = 1e-4  # required fraction of the decrease that the slope predicts (Armijo)
-_CURVED = 2.2e-16  # a correction is kept if s . y exceeds this times y . y
 _BACKTRACKS = 20
 
 Cost = Callable[[Tensor], tuple[float, Tensor]]
@@ -55,93 +52,6 @@ class ProjectedLBFGS:
         return minimize_bounded(
             cost, start, lower, max_iterations=max_iterations, n_corrections=self.n_corrections, callback=callback
         )
-
-
-class Corrections:
-    """The last `size` pairs of steps s and gradient changes y, and the approximate Hessian B = theta - W M W^T.
-
-    This is the compact form of Byrd, Nocedal & Schnabel, Math. Program. 63, 129 (1994), with W = [Y, theta S].
-    """
-
-    def __init__(self, size: int, like: Tensor) -> None:
-        self._size = size
-        self._pairs = like.new_zeros(2 * size, like.numel())  # the y, then the s
-        self._products = like.new_zeros(2 * size, 2 * size, device="cpu")  # of the pairs with each other
-        # The same over the free variables only, updated by those that enter or leave a bound: few in a step.
-        self._free = torch.ones_like(like, dtype=torch.bool)
-        self._free_products = torch.zeros_like(self._products)
-        self._order: list[int] = []  # oldest first
-        self._new: int | None = None  # pair whose products are not known yet
-        self._theta = 1.0
-
-    def add(self, step: Tensor, change: Tensor) -> None:
-        """Add a pair, if its curvature is positive, and drop the oldest when there are too many.
-
-        The step must have followed from `solve`: it is 0 in the variables that were not free there.
-        """
-        curvature, energy = torch.stack([step @ change, change @ change]).tolist()
-        if not curvature > _CURVED * energy:
-            return
-        self._new = self._order.pop(0) if len(self._order) == self._size else len(self._order)
-        self._order.append(self._new)
-        self._theta = energy / curvature
-        self._pairs[self._new], self._pairs[self._size + self._new] = change, step
-
-    def forget(self) -> None:
-        """Drop all pairs, so that the approximate Hessian is the identity."""
-        self._order.clear()
-        self._theta = 1.0
-
-    def __len__(self) -> int:
-        return len(self._order)
-
-    def solve(self, gradient: Tensor, free: Tensor) -> Tensor:
-        """Solve B d = gradient over the free variables, with d = 0 elsewhere (Byrd et al. 1995, eq. 5.11).
-
-        `gradient` and the boolean `free` have shape (n,), and so has the result d.
-        """
-        gradient, theta = gradient * free, self._theta
-        if not self._order:
-            self._free = free
-            return gradient
-        products = self._update(gradient, free)
-        y = torch.tensor(self._order, device="cpu")
-        w = torch.cat([y, y + self._size])
-        scale = products.new_ones(len(w))
-        scale[len(y) :] = theta
-        sy = self._products[y[:, None] + self._size, y]
-        older = sy.tril(-1)
-        ss = self._products[y[:, None] + self._size, y + self._size]
-        middle = torch.cat([torch.cat([-sy.diag().diag(), older.T], 1), torch.cat([older, theta * ss], 1)])
-        middle = middle - self._free_products[w[:, None], w] * (scale[:, None] * scale) / theta
-        weights = torch.zeros_like(products)
-        weights[w] = scale * torch.linalg.solve(middle, scale * products[w])
-        return (gradient + (weights.to(gradient.device) @ self._pairs) * free / theta) / theta
-
-    def _update(self, gradient: Tensor, free: Tensor) -> Tensor:
-        """Update all products to the latest pair and to the variables now `free`, and return those with `gradient`.
-
-        Reading all pairs takes most of the time, so they are read once for all products.
-        """
-        vectors, row = [gradient], self._new
-        if row is not None:
-            rows = [row, self._size + row]
-            change, step = self._pairs[row], self._pairs[self._size + row]
-            vectors += [change, step, change * self._free]
-        products, *new = (self._pairs @ torch.stack(vectors).T).to("cpu").T
-        if row is not None:
-            change, step, free_change = new  # a step is 0 where variables were not free
-            for table, found in ((self._products, change), (self._free_products, free_change)):
-                found = torch.stack([found, step])
-                table[rows], table[:, rows] = found, found.T
-            self._new = None
-        changed = (free != self._free).nonzero().flatten()
-        if len(changed):
-            entered = self._pairs[:, changed]
-            sign = free[changed].to(gradient) * 2 - 1
-            self._free_products += ((entered * sign) @ entered.T).to("cpu")
-        self._free = free
-        return products
 
 
 def minimize_bounded(
@@ -203,7 +113,7 @@ def minimize_bounded(
     x = torch.maximum(start, lower)
     value, gradient = cost(x)
     require_finite(value)
-    memory = Corrections(n_corrections, x)
+    memory = make_corrections(n_corrections, x)
     evaluations, iteration = 1, 0
 
     def end(message: str, converged: bool = False) -> Minimum:

@@ -114,12 +114,13 @@ class SampledPupil(nn.Module):
             self.centers = centers.detach().clone()
         return OpenSamples(self.weights, self.index, self.basis, self.positions, self.chromaticity)
 
-    def samples_at(self, centers: Tensor) -> OpenSamples:
+    def samples_at(self, centers: Tensor, *, with_closed: bool = False) -> OpenSamples:
         """Return the open samples of the same sub-apertures at other `centers` (N, 2) [m], differentiable in them.
 
-        It does not check for undersampling of the image.
+        `with_closed` adds samples of weight 0 around each hole, so that there are as many wherever it stands. It does
+        not check for undersampling of the image.
         """
-        sampled = self._sample(centers)
+        sampled = self._sample(centers, with_closed)
         return OpenSamples(
             *(v.to(self.index if name == "index" else self.basis) for name, v in sampled._asdict().items())
         )
@@ -131,31 +132,35 @@ class SampledPupil(nn.Module):
     def _require_sampling(self) -> None:
         self.aperture.require_sampling(replace(self.grid, wavelength=self.band.shortest))
 
-    def _sample(self, centers: Tensor) -> OpenSamples:
+    def _sample(self, centers: Tensor, with_closed: bool = False) -> OpenSamples:
         pixels = math.prod(self.grid.shape)
         parts = []
         instants = self.aberrations.instants
         bands = zip(self.band.wavelengths, self.band.shares, strict=True)
         for number, ((wavelength, share), instant) in enumerate(itertools.product(bands, instants)):
-            part = self._sample_at(centers, wavelength, instant)
+            part = self._sample_at(centers, wavelength, instant, with_closed)
             weights = math.sqrt(share / len(instants)) * part.weights
             parts.append(part._replace(weights=weights, index=part.index + number * pixels))
         return OpenSamples(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
-    def _sample_at(self, centers: Tensor, wavelength: float, instant: float) -> OpenSamples:
+    def _sample_at(self, centers: Tensor, wavelength: float, instant: float, with_closed: bool) -> OpenSamples:
         aperture, grid = self.aperture, replace(self.grid, wavelength=wavelength)
         samples = sample_holes(centers, aperture.shape, aperture.subaperture_diameter, grid)
         modes = zernike_basis(samples, aperture, self.aberrations.n_modes)  # (N, P, J)
         is_open = samples.weights > 0
+
+        def kept(values: Tensor) -> Tensor:  # (N, P, ...), as one list of samples
+            return values.flatten(0, 1) if with_closed else values[is_open]
+
         mixing = self.aberrations.mixing_at(instant).to(modes).unflatten(0, (len(modes), self.aberrations.n_modes))
-        mixed = torch.einsum("npj,njk->npk", modes, mixing)[is_open]
-        weights = samples.weights[is_open]
+        mixed = kept(torch.einsum("npj,njk->npk", modes, mixing))
+        weights = kept(samples.weights)
         # By Parseval's theorem this gives every PSF unit sum for any phase, unless holes share a cell.
         scale = weights.norm() * math.prod(grid.shape) ** 0.5
-        positions = (samples.offsets + centers[:, None])[is_open] / grid.period
+        positions = kept(samples.offsets + centers[:, None]) / grid.period
         ratio = self.grid.wavelength / wavelength
         chromaticity = weights.new_full((len(weights),), ratio)
-        return OpenSamples(weights / scale, samples.index[is_open], mixed * ratio, positions, chromaticity)
+        return OpenSamples(weights / scale, kept(samples.index), mixed * ratio, positions, chromaticity)
 
 
 def _forget(pupil: SampledPupil, keys: object) -> None:

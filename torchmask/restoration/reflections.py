@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torchmask.optics.conjugate import conjugate_gradients
 from torchmask.restoration.candidates import with_candidates
+from torchmask.restoration.cuda_graphs import graphed
 from torchmask.restoration.forward import ExposureModel, intensity
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.pupil import OpenSamples
@@ -60,15 +61,16 @@ class _Frames:
 
     def reflect(self, field: Tensor, n_reflections: int) -> Tensor:
         """Return the field (t, P) to which reflections lead from `field` (t, P)."""
+        fit_frames = graphed(self._fit_frames, field.device)
         now = self.model.raster(self.samples, field)
         pull = torch.zeros_like(now[:, 0].real)
         for _ in range(n_reflections):
-            fitted, pull = self._fit_frames(now, pull)
+            fitted, pull = fit_frames(now, pull)
             mirrored = 2 * fitted - now
             reflected = 2 * self._fit_pupil(mirrored) - mirrored
             now = _RELAXATION * (reflected + now) / 2 + (1 - _RELAXATION) * fitted
         for _ in range(LAST):
-            now, pull = self._fit_frames(self._fit_pupil(now), pull)
+            now, pull = fit_frames(self._fit_pupil(now), pull)
         return now.flatten(1)[:, self.samples.index]
 
     def _fit_pupil(self, raster: Tensor) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -11,6 +12,7 @@ from torch.nn.functional import pad
 
 from torchmask.restoration.adjoint import data_fidelity
 from torchmask.restoration.calibration import follow_turbulence, unwrap_pistons
+from torchmask.restoration.cuda_graphs import graphed
 from torchmask.restoration.escapes import settle
 from torchmask.restoration.linearization import Linearization
 from torchmask.restoration.objective import MyopicObjective
@@ -36,17 +38,20 @@ class AberrationSampler:
         self.generator: torch.Generator = generator
         self.factor: Tensor = torch.linalg.cholesky(laplace_precision(objective, state))
         self.momentum: Tensor = self._normal(state.z)
+        self._energy = graphed(partial(_energy, objective), state.z.device)
 
     def sample(self, state: State, n_moves: int, size: float) -> tuple[Tensor, float]:
         """Return the aberrations (T, K) after `n_moves` of `size` standard deviations, and the share accepted."""
         z, momentum = state.z, self.momentum
-        energy, slope = self._energy(state, z)
+        weight = torch.zeros_like(z[0]) + self.objective.aberration_weight(state.calibration, z)
+        given = (state.image, *self.objective.scaled_data(state.calibration), weight)
+        energy, slope = self._energy(z, *given)
         accepted = 0.0
         for _ in range(n_moves):
             momentum = _KEPT * momentum + (1 - _KEPT**2) ** 0.5 * self._normal(z)
             push = momentum - size / 2 * self._whiten(slope)
             there = z + self._unwhiten(size * push)
-            energy_there, slope_there = self._energy(state, there)
+            energy_there, slope_there = self._energy(there, *given)
             push = push - size / 2 * self._whiten(slope_there)
             rise = energy_there - energy + 0.5 * (push.square() - momentum.square()).sum(1)
             goes = torch.rand(len(z), dtype=z.dtype, device="cpu", generator=self.generator).to(z) < (-rise).exp()
@@ -56,21 +61,6 @@ class AberrationSampler:
             accepted += float(goes.to(z).mean()) / n_moves
         self.momentum = momentum
         return z, accepted
-
-    def _energy(self, state: State, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Return misfit plus prior of each frame (T,), and the gradient in its own parameters (T, n_own)."""
-        objective = self.objective
-        frames, precision, unit = objective.scaled_data(state.calibration)
-        misfit = data_fidelity(
-            *(objective.model, state.image, z, frames, precision),
-            want_object=False,
-            unit=unit,
-            parallel=objective.parallel,
-        )
-        assert misfit.aberration_gradient is not None
-        held = objective.aberration_weight(state.calibration, z) * (z - objective.centre)
-        energy = misfit.value.to(z) + 0.5 * (held * (z - objective.centre)).sum(1)
-        return energy, (misfit.aberration_gradient + held)[:, : objective.model.aberrations.n_own]
 
     def _normal(self, z: Tensor) -> Tensor:
         shape = (len(z), self.objective.model.aberrations.n_own)
@@ -82,6 +72,28 @@ class AberrationSampler:
     def _unwhiten(self, change: Tensor) -> Tensor:
         own = torch.linalg.solve_triangular(self.factor.mT, change[..., None], upper=True)[..., 0]
         return pad(own, (0, self.objective.model.aberrations.n_common))
+
+
+def _energy(
+    objective: MyopicObjective,
+    z: Tensor,
+    image: Tensor,
+    frames: Tensor,
+    precision: Tensor,
+    unit: Tensor,
+    weight: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Return misfit plus prior of each frame (T,), and the gradient in its own parameters (T, n_own).
+
+    After the image come `ScaledData` and the weights (K,) of the aberrations' prior.
+    """
+    misfit = data_fidelity(
+        *(objective.model, image, z, frames, precision), want_object=False, unit=unit, parallel=objective.parallel
+    )
+    assert misfit.aberration_gradient is not None
+    held = weight * (z - objective.centre)
+    energy = misfit.value.to(z) + 0.5 * (held * (z - objective.centre)).sum(1)
+    return energy, (misfit.aberration_gradient + held)[:, : objective.model.aberrations.n_own]
 
 
 @torch.no_grad()
