@@ -230,6 +230,21 @@ def test_a_search_under_a_lighter_prior_descends_under_the_given_one_again(
     ]
 
 
+@pytest.mark.parametrize(("gentle", "too_steep"), [(False, True), (True, False), (True, True)])
+def test_an_object_that_is_steeper_than_its_gentle_slopes_is_integrated_as_astray(
+    gentle, too_steep, explained, monkeypatch
+):
+    objective, state = explained
+    told = []
+    monkeypatch.setattr(
+        finish, "integrate_aberrations", lambda *given, astray, **more: told.append(astray) or (state, 0)
+    )
+    monkeypatch.setattr(finish, "shows_gentle_slopes", lambda *given: gentle)
+    monkeypatch.setattr(finish, "is_too_steep", lambda *given: too_steep)
+    ended(objective, state, Setting.of(objective), Schedule(), end=End.INTEGRATION)
+    assert told == [gentle and too_steep]
+
+
 def test_nothing_follows_the_search_of_a_schedule_without_last_segments(observe, five_holes):
     assert End.of(math.inf, TRAITS, Schedule(), BLIND) is End.LAST_DESCENT
     assert End.of(10.0, TRAITS, Schedule(last_segments=0), BLIND) is End.NONE

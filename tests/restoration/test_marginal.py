@@ -7,7 +7,7 @@ import torch
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import SparseAperture
-from torchmask.restoration import sampler
+from torchmask.restoration import marginal, sampler
 from torchmask.restoration.aberrations import turbulent_basis
 from torchmask.restoration.descent import descend
 from torchmask.restoration.forward import ExposureModel
@@ -119,8 +119,8 @@ def test_the_metric_of_moves_is_renewed_now_and_then(explain, monkeypatch):
     made = []
 
     class Counted(AberrationSampler):
-        def __init__(self, objective, state, generator):
-            super().__init__(objective, state, generator)
+        def __init__(self, objective, state, generator, *, shared):
+            super().__init__(objective, state, generator, shared=shared)
             made.append(state)
 
     monkeypatch.setattr(sampler, "AberrationSampler", Counted)
@@ -130,6 +130,44 @@ def test_the_metric_of_moves_is_renewed_now_and_then(explain, monkeypatch):
     found = [now for now, _ in rounds]
     assert len(made) == 3  # before rounds 0, 2 and 4
     assert torch.equal(made[2].z, found[3].z)
+
+
+@pytest.mark.parametrize("alone", [False, True])
+def test_samples_that_are_heated_alone_leave_the_object_its_noise(explain, monkeypatch, alone):
+    objective, state = explain(n_frames=2)
+    settled, metrics = [], []
+    monkeypatch.setattr(
+        sampler, "settle", lambda objective, state, n: settled.append(state.calibration.noise_inflation) or state
+    )
+    moved = AberrationSampler.sample
+    monkeypatch.setattr(
+        AberrationSampler,
+        "sample",
+        lambda self, state, *rest: (
+            metrics.append((self.factor.ndim, float(state.calibration.noise_inflation[0]))) or moved(self, state, *rest)
+        ),
+    )
+    rounds = sampler.sample_rounds(
+        objective, state, [4.0, 2.0], BRIEF, torch.Generator().manual_seed(0), follow_r0=False, alone=alone
+    )
+    noise = [float(found.calibration.noise_inflation[0]) for found, _ in rounds]
+    assert metrics == [(2 if alone else 3, 4.0), (2 if alone else 3, 2.0)]  # one metric, or one for each frame
+    assert noise == [float(of[0]) for of in settled] == ([1.0, 1.0] if alone else [4.0, 2.0])
+
+
+def test_a_shared_metric_keeps_exact_samples_exact_and_takes_larger_moves(explain):
+    """True aberrations, drawn from the prior, are a sample of the posterior, and remain one: 300 frames tell."""
+    objective, state = explain(n_frames=300, noise=0.3)
+    accepted = []
+    for shared in (True, False):
+        chains = AberrationSampler(objective, state, torch.Generator().manual_seed(0), shared=shared)
+        z, share = chains.sample(state, 60, 0.3)
+        accepted.append(share)
+        if shared:
+            grown = 0.5 * (z.square() - state.z.square()).sum(1)
+            assert abs(float(grown.mean())) < 4 * float(grown.std()) / len(z) ** 0.5
+            assert not torch.allclose(z, state.z, atol=0.1)
+    assert 1 - accepted[0] < 0.5 * (1 - accepted[1])
 
 
 def one_frame(objective, state):
@@ -206,6 +244,24 @@ def test_one_seed_one_result_and_a_record_of_every_round(explain):
     assert not torch.equal(first.image, other.image)
     assert [record.step for record in records] == [1, 2, 3, 4] * 3
     assert all(record.stage == "integration" and 0 <= record.scalars["accepted"] <= 1 for record in records)
+
+
+@pytest.mark.parametrize("astray", [False, True])
+def test_what_has_gone_astray_is_sampled_in_noise_that_falls(monkeypatch, astray):
+    """From three times the noise, by the same factor in every round, until four of ten are over."""
+    objective, state = one_piston(10.0, 3)
+    asked = []
+
+    def rounds(objective, state, heats, schedule, generator, *, follow_r0, alone):
+        asked.append((list(heats), alone))
+        return iter([(state, 1.0)] * 10)
+
+    monkeypatch.setattr(marginal, "sample_rounds", rounds)
+    integrate_aberrations(objective, state, 10, BRIEF, ProjectedLBFGS(), seed=0, follow_r0=False, astray=astray)
+    expected = [3.0, 3**0.75, 3**0.5, 3**0.25] + 6 * [1.0] if astray else 10 * [1.0]
+    ((heats, alone),) = asked
+    assert heats == pytest.approx(expected)
+    assert alone is astray
 
 
 def test_the_object_is_the_mean_of_the_later_rounds(monkeypatch):

@@ -103,6 +103,24 @@ def test_more_frames_tell_the_power_of_slopes_better_as_far_as_noise_hides_it(se
     assert 0.5 < ratios[0] < 0.75 < ratios[1] < 1.0
 
 
+@pytest.mark.parametrize("steeper", [0.9, 1.1])
+def test_an_object_is_too_steep_if_its_slopes_are_above_those_of_the_frames(seen, monkeypatch, steeper):
+    """Squared slopes of 1.5 times those that frames show, one standard error more, are the limit."""
+    objective, state = seen(0)
+    squares = squares_of(state.image)
+    monkeypatch.setattr(spectrum, "power_of_slopes", lambda *given: Power(squares / 1.5 / math.exp(0.2) / steeper, 0.2))
+    assert spectrum.is_too_steep(objective, state) == (steeper > 1)
+
+
+def test_what_follows_noise_is_too_steep_and_the_true_object_is_not(seen):
+    for seed in range(5):
+        objective, state = seen(seed)
+        assert not spectrum.is_too_steep(objective, state)
+        rough = torch.randn(state.image.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+        rough = state.image + 2 * rough * (squares_of(state.image) / squares_of(rough)) ** 0.5
+        assert spectrum.is_too_steep(objective, replace(state, image=rough))
+
+
 def test_the_power_of_slopes_does_not_depend_on_phases_that_are_wrong(seen):
     """Pistons that all frames have in common, which the object takes over; nor on the image itself, or the precision
     of numbers."""

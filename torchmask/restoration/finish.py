@@ -31,7 +31,7 @@ from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.retrieval import retrieve_lost_frames
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.slopes import rate_in_noise
-from torchmask.restoration.spectrum import shows_gentle_slopes
+from torchmask.restoration.spectrum import is_too_steep, shows_gentle_slopes
 from torchmask.restoration.state import State
 from torchmask.restoration.traits import End, Traits
 
@@ -63,8 +63,10 @@ class Finisher:
             rounds = self.schedule.fine_rounds if end.descends else self.schedule.rounds
             how = (self.schedule, self.minimizer, self.callback)
             known = {"seed": self.traits.seed, "follow_r0": self.traits.r0_is_open}
-            objective = objective.with_changes(prior=self._suited(prior, objective, ended.state))
-            ended.state, spent = integrate_aberrations(objective, ended.state, rounds, *how, **known)
+            gentle = shows_gentle_slopes(objective, ended.state, self.change)
+            astray = gentle and is_too_steep(objective, ended.state)
+            objective = objective.with_changes(prior=self._suited(prior, ended.state, gentle=gentle))
+            ended.state, spent = integrate_aberrations(objective, ended.state, rounds, *how, **known, astray=astray)
             ended.n_evaluations += spent
             ended.integrated = True
         return objective
@@ -117,9 +119,8 @@ class Finisher:
         ended.state = state
         return objective
 
-    def _suited(self, prior: ObjectPrior, objective: MyopicObjective, state: State) -> ObjectPrior:
+    def _suited(self, prior: ObjectPrior, state: State, *, gentle: bool) -> ObjectPrior:
         """Return the prior at the scale of the object, as far as it has slopes."""
-        gentle = shows_gentle_slopes(objective, state, self.change)
         rate = rate_in_noise(state.image, self.change, gentle=gentle)
         return prior.suited_to(rate) if rate > 0 else prior
 

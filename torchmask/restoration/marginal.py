@@ -9,7 +9,6 @@ which are then moved on for the new object, and the result is its mean over the 
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
 
 import torch
@@ -21,6 +20,9 @@ from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.sampler import sample_rounds
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.state import State
+
+_HEAT = 3.0  # factor of the noise in which samples begin if a descent has gone astray
+_HEATED = 0.4  # share of the rounds in which it falls to 1
 
 
 @torch.no_grad()
@@ -34,15 +36,18 @@ def integrate_aberrations(
     *,
     seed: int,
     follow_r0: bool,
+    astray: bool = False,
 ) -> tuple[State, int]:
     """Return the marginal estimate of the object with its best-fitting aberrations, and the number of evaluations.
 
     `state` is the end of a descent, with a positive weight of the aberrations' prior; with `follow_r0` this weight is
-    estimated from the samples. The callback is called with a `Record` after every round.
+    estimated from the samples. If the descent has gone `astray` after noise, samples first wander in three times the
+    noise, which falls until 0.4 of the rounds. The callback is called with a `Record` after every round.
     """
     generator, spent = torch.Generator().manual_seed(seed), 0
     total, first = torch.zeros_like(state.image), rounds // 2
-    sampled = sample_rounds(objective, state, itertools.repeat(1.0, rounds), schedule, generator, follow_r0=follow_r0)
+    heats = (_HEAT ** max(0.0, 1 - number / (_HEATED * rounds)) if astray else 1.0 for number in range(rounds))
+    sampled = sample_rounds(objective, state, heats, schedule, generator, follow_r0=follow_r0, alone=astray)
     for number, (state, accepted) in enumerate(sampled):
         if number >= first:
             total += state.image / (rounds - first)

@@ -29,14 +29,20 @@ class AberrationSampler:
 
     A move is one leapfrog step, after which part of the momentum is kept (Horowitz, Phys. Lett. B 268, 247, 1991).
     Moves are accepted or rejected for each frame separately, since frames depend on each other only through the object.
-    Their metric is Laplace's approximation at the state for which the sampler is made. Aberrations common to all frames
-    stay fixed.
+    Aberrations common to all frames stay fixed.
+
+    The metric of moves is Laplace's approximation at the state for which the sampler is made: of each frame by itself
+    or, if the metric is `shared`, its mean over the frames. That of a frame depends on where its samples begin, which
+    shifts those that follow for many moves; the mean hardly does, and takes larger moves.
     """
 
-    def __init__(self, objective: MyopicObjective, state: State, generator: torch.Generator) -> None:
+    def __init__(
+        self, objective: MyopicObjective, state: State, generator: torch.Generator, *, shared: bool = False
+    ) -> None:
         self.objective: MyopicObjective = objective
         self.generator: torch.Generator = generator
-        self.factor: Tensor = torch.linalg.cholesky(laplace_precision(objective, state))
+        precision = laplace_precision(objective, state)
+        self.factor: Tensor = torch.linalg.cholesky(precision.mean(0) if shared else precision)
         self.momentum: Tensor = self._normal(state.z)
         self._energy = graphed(partial(_energy, objective), state.z.device)
 
@@ -124,21 +130,23 @@ def sample_rounds(
     generator: torch.Generator,
     *,
     follow_r0: bool,
+    alone: bool = False,
 ) -> Iterator[tuple[State, float]]:
     """Yield the state after each round, and the share of moves that it accepted.
 
     In a round the aberrations are moved for the object at hand, and the object is fitted to them. The variance of the
-    noise is that of `state` times one of the `heats`, which leaves both more freedom. With `follow_r0` the weight of
+    noise is that of `state` times one of the `heats`, which leaves both more freedom; if the samples are heated
+    `alone`, the object is fitted in the noise of `state`, and the frames share a metric. With `follow_r0` the weight of
     the aberrations' prior is estimated from the samples.
     """
     noise, size = state.calibration.noise_inflation, schedule.move_size
     for number, heat in enumerate(heats):
-        state = replace(state, calibration=replace(state.calibration, noise_inflation=heat * noise))
+        hot = replace(state, calibration=replace(state.calibration, noise_inflation=heat * noise))
         if number % schedule.renewal == 0:
-            sampler = AberrationSampler(objective, state, generator)
-        z, accepted = sampler.sample(state, schedule.moves, size)
+            sampler = AberrationSampler(objective, hot, generator, shared=alone)
+        z, accepted = sampler.sample(hot, schedule.moves, size)
         size = size * _ADAPTED if accepted > _ACCEPTED else size / _ADAPTED
-        state = settle(objective, replace(state, z=z), schedule.settling)
+        state = settle(objective, replace(state if alone else hot, z=z), schedule.settling)
         state = unwrap_pistons(objective, state)
         state = follow_turbulence(objective, state) if follow_r0 else state
         yield state, accepted

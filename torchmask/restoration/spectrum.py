@@ -27,6 +27,7 @@ _GENTLE = 0.5  # rate by bright frames from which slopes are gentle: 0.12 to 0.3
 _DOUBT = 2.0  # standard errors of which slopes have the benefit there: a ball of 0.36, error 0.23, has 0.57 with it
 _GENTLE_FAINT = 0.22  # limit by faint frames, one error less: 0.03 to 0.17 of satellites, 0.28 on of balls
 _OF_NOISE = 0.82  # rate found of gentle slopes below which an object follows noise: 0.3 to 0.78 of asteroids that do
+_TOO_STEEP = 1.5  # 0.8 to 1.1 of asteroids that integrations find, 1.4 to 40 of balls and others that they do not
 _VAGUE = 100.0  # error of a logarithm above which nothing is known
 
 
@@ -55,6 +56,15 @@ def shows_gentle_slopes(objective: MyopicObjective, state: State, change: Change
     if change.each < Schedule.faint:
         return 3 * total > _GENTLE_FAINT * power.off_by(1)
     return 3 * total > _GENTLE * power.off_by(-_DOUBT)
+
+
+def is_too_steep(objective: MyopicObjective, state: State) -> bool:
+    """Return whether the object follows noise: its squared slopes are more than those that the frames show.
+
+    Their sum is above 1.5 times that of the frames, one standard error more.
+    """
+    slopes = float(torch.hypot(*gradient(state.image)).square().sum())
+    return slopes > _TOO_STEEP * power_of_slopes(objective, state).off_by(1)
 
 
 def rate_in_search(objective: MyopicObjective, state: State, change: Change) -> float:
