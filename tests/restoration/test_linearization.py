@@ -6,8 +6,10 @@ import pytest
 import torch
 
 from torchmask.grid import Grid
+from torchmask.memory import AtATime
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.band import Band
+from torchmask.restoration import linearization
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.linearization import Linearization
 
@@ -33,6 +35,16 @@ def test_forward_is_the_derivative(band):
     for number in range(len(images)):
         exact = torch.autograd.functional.jvp(model, (image, z), (images[number], zs[number]))[1]
         torch.testing.assert_close(linear[number], exact, rtol=1e-10, atol=1e-12 * float(exact.abs().max()))
+
+
+@pytest.mark.parametrize("n_bytes", [2**17, 2**30])
+def test_as_many_changes_at_a_time_as_suit_the_device(n_bytes, monkeypatch):
+    """Three of five at a time, and all, give what single ones give, to the rounding of other orders of sums."""
+    model, image, z, images, zs, _ = setup()
+    tangent = Linearization(model, image, z)
+    expected = tangent.forward(images, zs)
+    monkeypatch.setattr(linearization, "_AT_A_TIME", AtATime(processor=n_bytes, gpu=1))
+    torch.testing.assert_close(tangent.forward(images, zs), expected, rtol=0, atol=1e-13 * float(expected.abs().max()))
 
 
 @pytest.mark.parametrize(("dtype", "rounding"), [(torch.float64, 1e-12), (torch.float32, 1e-4)])
