@@ -63,12 +63,12 @@ class Corrections(ABC):
 class UpdatedCorrections(Corrections):
     """Corrections whose products are updated by the latest pair and by the few variables that enter or leave a bound.
 
-    The products, a few dozen rows, are kept on the host, where small systems are solved fastest.
+    They are for processors, where what changes in a step is little beside all pairs.
     """
 
     def __init__(self, size: int, like: Tensor) -> None:
         super().__init__(size, like)
-        self._products = like.new_zeros(2 * size, 2 * size, device="cpu")  # of the pairs with each other
+        self._products = like.new_zeros(2 * size, 2 * size)  # of the pairs with each other
         self._free = torch.ones_like(like, dtype=torch.bool)
         self._free_products = torch.zeros_like(self._products)  # the same over the free variables only
         self._order: list[int] = []  # oldest first
@@ -100,7 +100,7 @@ class UpdatedCorrections(Corrections):
         middle = middle - self._free_products[w[:, None], w] * (scale[:, None] * scale) / theta
         weights = torch.zeros_like(products)
         weights[w] = scale * torch.linalg.solve(middle, scale * products[w])
-        return (gradient + (weights.to(gradient.device) @ self._pairs) * free / theta) / theta
+        return (gradient + (weights @ self._pairs) * free / theta) / theta
 
     def _update(self, gradient: Tensor, free: Tensor) -> Tensor:
         """Update all products to the latest pair and to the variables now `free`, and return those with `gradient`.
@@ -112,7 +112,7 @@ class UpdatedCorrections(Corrections):
             rows = [row, self._size + row]
             change, step = self._pairs[row], self._pairs[self._size + row]
             vectors += [change, step, change * self._free]
-        products, *new = (self._pairs @ torch.stack(vectors).T).to("cpu").T
+        products, *new = (self._pairs @ torch.stack(vectors).T).T
         if row is not None:
             change, step, free_change = new  # a step is 0 where variables were not free
             for table, found in ((self._products, change), (self._free_products, free_change)):
@@ -123,7 +123,7 @@ class UpdatedCorrections(Corrections):
         if len(changed):
             entered = self._pairs[:, changed]
             sign = free[changed].to(gradient) * 2 - 1
-            self._free_products += ((entered * sign) @ entered.T).to("cpu")
+            self._free_products += (entered * sign) @ entered.T
         self._free = free
         return products
 

@@ -27,7 +27,7 @@ _GENTLE = 0.5  # rate by bright frames from which slopes are gentle: 0.12 to 0.3
 _DOUBT = 2.0  # standard errors of which slopes have the benefit there: a ball of 0.36, error 0.23, has 0.57 with it
 _GENTLE_FAINT = 0.22  # limit by faint frames, one error less: 0.03 to 0.17 of satellites, 0.28 on of balls
 _OF_NOISE = 0.82  # rate found of gentle slopes below which an object follows noise: 0.3 to 0.78 of asteroids that do
-_TOO_STEEP = 1.5  # 0.8 to 1.1 of asteroids that integrations find, 1.4 to 40 of balls and others that they do not
+_TOO_STEEP = 1.5  # times those of frames, one error less: 0.6 to 1.1 of what heat harms or leaves, 1.6 to 41 of others
 _VAGUE = 100.0  # error of a logarithm above which nothing is known
 
 
