@@ -27,7 +27,7 @@ from torchmask.restoration.priors import EdgePreserving, SmoothVariation, TotalV
 from torchmask.restoration.projected_lbfgs import Minimum, ProjectedLBFGS
 from torchmask.restoration.recipe import ModelRecipe
 from torchmask.restoration.schedule import Schedule
-from torchmask.restoration.slopes import gradient, rate_of_slopes
+from torchmask.restoration.slopes import gradient, rate_of_descent, rate_of_slopes
 from torchmask.restoration.solver import Solver
 from torchmask.restoration.spectrum import Power
 from torchmask.restoration.traits import End, Refinement, Traits
@@ -37,6 +37,7 @@ BLIND = Free.OBJECT | Free.ABERRATIONS | Free.COMMON
 R0, OUTER_SCALE = 0.25, 20.0
 GRID = Grid.nyquist(1.0, 550e-9, 32, oversampling=1.2)
 FULL_PUPIL = Traits(True, False, True, False, R0, OUTER_SCALE, 1000, 0.0, 0, Refinement.OFF)
+CHANGE = Change(100.0, 10, 4096)
 TRAITS = Traits(False, False, True, False, R0, OUTER_SCALE, 1000, 0.0, 0, Refinement.OFF)
 
 
@@ -90,13 +91,21 @@ def test_a_recipe_has_a_finer_basis_if_it_has_more_modes(options, n_modes, five_
 
 
 def ended(
-    objective, state, setting, schedule, records=None, minimizer=None, end=End.LAST_DESCENT, traits=TRAITS, finer=None
+    objective,
+    state,
+    setting,
+    schedule,
+    records=None,
+    minimizer=None,
+    end=End.LAST_DESCENT,
+    traits=TRAITS,
+    finer=None,
+    change=CHANGE,
 ):
     progress = Progress(Candidates(state, 1), finer=finer)
     listen = None if records is None else records.append
-    finisher = Finisher(
-        setting, schedule, minimizer or ProjectedLBFGS(), listen, traits, lambda progress: None, Change(100.0, 10, 4096)
-    )
+    minimizer = minimizer or ProjectedLBFGS()
+    finisher = Finisher(setting, schedule, minimizer, listen, traits, lambda progress: None, change)
     return finisher.finish(objective, progress, end), progress
 
 
@@ -257,47 +266,44 @@ def test_nothing_follows_the_search_of_a_schedule_without_last_segments(observe,
     assert "TotalVariation" in result.prior
 
 
-def hill(height):
-    """An image whose slopes are in proportion to its height."""
-    x = torch.linspace(-1, 1, 24, dtype=torch.float64)
-    return height * torch.exp(-3 * (x**2 + x[:, None] ** 2))
-
-
 def test_the_priors_of_the_last_descent():
-    """One where the weight of the slopes is heavier, up to three times; else from the given one down to theirs."""
+    """One that is heavier by the rate, up to three times; else from the given one down to the rate."""
     prior = TotalVariation(2.0, 0.3)
-    rate = rate_of_slopes(hill(1.0))
-    for height, weight in [(rate / 1.5, 3.0), (rate / 2.9, 5.8), (rate / 3.1, 6.0)]:
-        (heavier,) = prior.choices(hill(height))
+    for rate, weight in [(1.5, 3.0), (2.9, 5.8), (3.1, 6.0)]:
+        (heavier,) = prior.choices(rate)
         assert isinstance(heavier, SmoothVariation)
         assert (heavier.weight, heavier.bending, heavier.epsilon) == pytest.approx((weight, 0.25, 0.3), rel=1e-9)
     every = [2.0, 1.26, 0.8, 0.5, 0.32, 0.2, 0.126, 0.08, 0.05]
-    for its_rate, weights in [(0.97, every[:1]), (0.5, every[:2]), (0.2, every[:4]), (0.01, every)]:
-        lighter = prior.choices(hill(rate / its_rate))
+    for rate, weights in [(0.97, every[:1]), (0.5, every[:2]), (0.2, every[:4]), (0.01, every), (0.0, every[:1])]:
+        lighter = prior.choices(rate)
         assert [choice.weight for choice in lighter] == pytest.approx(weights, rel=1e-9)
         assert {(type(choice), choice.bending, choice.epsilon) for choice in lighter} == {(SmoothVariation, 0.1, 0.3)}
-    for image in (torch.zeros(24, 24), None):
-        (same,) = prior.choices(image)
-        assert isinstance(same, SmoothVariation)
-        assert (same.weight, same.bending) == (2.0, 0.1)
     for own in (heavier, EdgePreserving()):
-        assert own.choices(hill(1.0)) == own.family(hill(1.0)) == (own,)
+        assert own.choices(1.5) == own.family(1.5) == (own,)
 
 
 def test_the_priors_for_known_aberrations():
-    """Lighter ones than the given, with its epsilon, and heavier ones, which bend less, if the slopes suit those."""
-    rate = rate_of_slopes(hill(1.0))
-    family = TotalVariation(2.0, 0.3).family(hill(rate / 1.01))
-    weights = [5.0, 3.2, 2.0, 1.26, 0.8, 0.5, 0.32, 0.2, 0.126, 0.08, 0.05]
+    """Lighter ones than the given, with its epsilon, and for a rate above 1 heavier ones too, with more on bends."""
+    family = TotalVariation(2.0, 0.3).family(1.01)
+    weights = [12.6, 8.0, 5.0, 3.2, 2.0, 1.26, 0.8, 0.5, 0.32, 0.2, 0.126, 0.08, 0.05]
     assert [prior.weight for prior in family] == pytest.approx(weights, rel=1e-9)
-    assert [prior.bending for prior in family] == 2 * [0.25] + 9 * [0.1]
-    assert {(type(prior), prior.epsilon) for prior in family} == {(SmoothVariation, 0.3)}
-    lighter = TotalVariation(2.0, 0.3).family(hill(rate / 0.99))
-    assert [prior.weight for prior in lighter] == pytest.approx(weights[2:], rel=1e-9)
+    assert {(type(prior), prior.bending, prior.epsilon) for prior in family} == {(SmoothVariation, 0.25, 0.3)}
+    lighter = TotalVariation(2.0, 0.3).family(0.99)
+    assert [prior.weight for prior in lighter] == pytest.approx(weights[4:], rel=1e-9)
+    assert {prior.bending for prior in lighter} == {0.1}
+
+
+@pytest.mark.parametrize("full", [False, True])
+def test_gentle_slopes_ask_for_a_heavier_prior_in_a_last_descent(full):
+    """Three times the weight that suits them, up to 2 or 3 times the given one, but never less than what suits them."""
+    most = 3.0 if full else 2.0
+    rates = (0.0, 0.1, 0.33, 0.34, 0.6, 0.99, 1.5, 2.5, 3.5)
+    expected = [0.0, 0.1, 0.33, 1.02, 1.8, min(2.97, most), most, max(2.5, most), 3.5]
+    assert [rate_of_descent(rate, full=full) for rate in rates] == pytest.approx(expected, rel=1e-12)
 
 
 def test_the_frames_choose_the_prior_of_each_segment_and_of_the_end(explained, five_holes, monkeypatch):
-    """They are asked with the object at hand and the finer modes; before an integration they are not asked."""
+    """They are asked with the object at hand, in finer modes; those of full pupils or before integrations are not."""
     objective, state = explained
     asked = []
 
@@ -311,6 +317,7 @@ def test_the_frames_choose_the_prior_of_each_segment_and_of_the_end(explained, f
         return replace(state, image=1.5 * state.image)
 
     monkeypatch.setattr(finish, "choose_prior", choose)
+    monkeypatch.setattr(finish, "rate_found", lambda objective, state, change: rate_of_slopes(state.image))
     monkeypatch.setattr(finish, "descend", descend)
     monkeypatch.setattr(finish, "recalibrate", lambda objective, state, power, **more: state)
     monkeypatch.setattr(finish, "settle", lambda objective, state, n_iterations: state)
@@ -322,13 +329,16 @@ def test_the_frames_choose_the_prior_of_each_segment_and_of_the_end(explained, f
     assert asked == [(pytest.approx(peak * 1.5**number), 7 + number, 7, 8) for number in range(3)]
     assert found.prior.weight == pytest.approx(0.25)
     monkeypatch.setattr(finish, "choose_prior", None)
+    monkeypatch.setattr(finish, "_chi_square", lambda *given: 1.0)
+    of_a_full_pupil, _ = ended(objective, begun, setting, schedule, traits=FULL_PUPIL, end=End.FULL_PUPIL)
+    assert of_a_full_pupil.prior.weight == 1.0
     monkeypatch.setattr(finish, "integrate_aberrations", lambda given, state, *rest, **more: (state, 0))
     ended(objective, begun, setting, schedule, end=End.BOTH)
 
 
-@pytest.mark.parametrize(("end", "expected"), [(End.LAST_DESCENT, [0.6, 0.9, 1.35]), (End.BOTH, [0.5, 0.5, 0.5])])
-def test_each_segment_of_the_last_descent_has_the_prior_of_its_object(end, expected, explained, monkeypatch):
-    """It is the given one at the scale of the object, whatever that was before; an integration has that of its own."""
+@pytest.mark.parametrize(("end", "expected"), [(End.LAST_DESCENT, [0.9, 0.9, 0.9]), (End.BOTH, [0.5, 0.5, 0.5])])
+def test_the_last_descent_has_the_prior_of_the_object_that_the_search_has_found(end, expected, explained, monkeypatch):
+    """It is heavier than that of its slopes, whatever these become under it; an integration has that of its own."""
     objective, state = explained
     weights = []
 
@@ -345,8 +355,9 @@ def test_each_segment_of_the_last_descent_has_the_prior_of_its_object(end, expec
     monkeypatch.setattr(finish, "descend", descend)
     monkeypatch.setattr(finish, "settle", settle)
     monkeypatch.setattr(finish, "recalibrate", lambda objective, state, power, **more: state)
+    monkeypatch.setattr(finish, "rate_found", lambda objective, state, change: rate_of_slopes(state.image))
     objective = objective.with_changes(prior=TotalVariation(0.5))
-    begun = replace(state, image=state.image * rate_of_slopes(state.image) / 1.2)  # of this rate, and 1.8 and 2.7 later
+    begun = replace(state, image=state.image * rate_of_slopes(state.image) / 0.6)  # and 0.9 and 1.35 later
     schedule = Schedule(segment=1, last_segments=2, last_gain=0.0, lost=math.inf)
     integrated = []
 
@@ -358,7 +369,7 @@ def test_each_segment_of_the_last_descent_has_the_prior_of_its_object(end, expec
     found, progress = ended(objective, begun, Setting.of(objective), schedule, end=end)
     assert weights == pytest.approx(expected, rel=1e-9)
     assert integrated == ([found.prior] if end.integrates else [])
-    assert found.prior.weight == pytest.approx(1.35, rel=1e-9)
+    assert found.prior.weight == pytest.approx(0.675 if end.integrates else 0.9, rel=1e-9)
     assert isinstance(found.prior, SmoothVariation)
     assert progress.n_evaluations == 6 + 100 * end.integrates
 
@@ -418,7 +429,8 @@ def test_known_aberrations_keep_one_prior_that_the_frames_choose(traits, explain
     objective = objective.with_changes(prior=TotalVariation(0.5), free=Free.OBJECT)
     schedule = Schedule(segment=1, last_segments=3, last_gain=0.0, last_gain_full=0.0, last_settling=7, comparing=3)
     found, progress = ended(objective, state, Setting.of(objective), schedule, end=End.OBJECT, traits=traits)
-    assert asked == [(state, [prior.weight for prior in objective.prior.family(state.image)], 7)]
+    rate = rate_of_descent(rate_of_slopes(state.image), full=traits.many_minima)
+    assert asked == [(state, [prior.weight for prior in objective.prior.family(rate)], 7)]
     assert used == 3 * [found.prior.weight] == 3 * [asked[0][1][0]]
     assert torch.equal(progress.state.z, state.z)
     assert not torch.equal(progress.state.image, state.image)
@@ -691,6 +703,19 @@ def test_a_last_descent_that_loses_frames_of_a_full_pupil_is_not_kept(traits, en
     found, progress = ended(objective, state, Setting.of(objective), schedule, minimizer=loses, traits=traits, end=end)
     assert (progress.state is state) is not kept
     assert (found is objective) is not kept
+
+
+@pytest.mark.parametrize(("rise", "kept"), [(0.9, True), (1.1, False)])
+def test_a_last_descent_of_a_full_pupil_may_leave_more_noise_by_chance(rise, kept, explained, monkeypatch):
+    """A mean of n squares of unit normal deviates has the standard error (2 / n)^0.5; two of them may be chance."""
+    objective, state = explained
+    change = Change(each=100.0, n_frames=4, n_pixels=800.0)
+    found = iter([1.5 + rise * 2 * math.sqrt(2 / 3200), 1.5])
+    monkeypatch.setattr(finish, "_chi_square", lambda *given: next(found))
+    schedule = Schedule(segment=2, last_segments=1)
+    setting = Setting.of(objective)
+    _, progress = ended(objective, state, setting, schedule, traits=FULL_PUPIL, end=End.FULL_PUPIL, change=change)
+    assert (progress.state is not state) is kept
 
 
 def test_the_object_of_a_full_pupil_is_settled_before_each_segment(explain):

@@ -15,7 +15,7 @@ from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.priors import TotalVariation
 from torchmask.restoration.slopes import gradient, rate_of_slopes
-from torchmask.restoration.spectrum import Power, power_of_slopes, rate_in_search, shows_gentle_slopes
+from torchmask.restoration.spectrum import Power, power_of_slopes, rate_found, rate_in_search, shows_gentle_slopes
 from torchmask.restoration.state import State
 
 N_OBJECTS = 40
@@ -192,3 +192,17 @@ def test_the_rate_of_a_search_is_that_of_its_object_unless_it_follows_noise(seen
         for gentle, expected in ((False, min(own, 1.0)), (True, 1.5 if own < 0.82 else min(own, 1.0))):
             monkeypatch.setattr(spectrum, "shows_gentle_slopes", lambda *given, answer=gentle: answer)
             assert rate_in_search(objective, found, change) == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("shown", [0.6, 1.4])
+def test_the_rate_that_a_search_has_found_is_that_of_its_frames_if_gentle_slopes_were_found_steeper(
+    shown, seen, monkeypatch
+):
+    """Squared slopes that are fewer by a factor have a rate that is higher by it, for as steep an object."""
+    objective, state = seen(0)
+    rate, squares = rate_of_slopes(state.image), squares_of(state.image)
+    monkeypatch.setattr(spectrum, "power_of_slopes", lambda *given: Power(squares / shown, 0.1))
+    for gentle, expected in ((False, rate), (True, rate * max(shown, 1.0))):
+        monkeypatch.setattr(spectrum, "shows_gentle_slopes", lambda *given, answer=gentle: answer)
+        assert rate_found(objective, state, BRIGHT) == pytest.approx(expected, rel=1e-9)
+    assert rate_found(objective, replace(state, image=torch.zeros_like(state.image)), BRIGHT) == 0

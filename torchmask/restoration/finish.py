@@ -13,6 +13,7 @@ the object alone descends once more, under the prior of its whole family (`Objec
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -30,8 +31,8 @@ from torchmask.restoration.priors import ObjectPrior
 from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.retrieval import retrieve_lost_frames
 from torchmask.restoration.schedule import Schedule
-from torchmask.restoration.slopes import rate_in_noise
-from torchmask.restoration.spectrum import is_too_steep, shows_gentle_slopes
+from torchmask.restoration.slopes import rate_in_noise, rate_of_descent, rate_of_slopes
+from torchmask.restoration.spectrum import is_too_steep, rate_found, shows_gentle_slopes
 from torchmask.restoration.state import State
 from torchmask.restoration.traits import End, Traits
 
@@ -85,12 +86,12 @@ class Finisher:
         least_gain = schedule.last_gain_full if self.traits.many_minima else schedule.last_gain
         searched = not (self.traits.many_minima or self.traits.estimated or end is End.OBJECT)
         may_find = searched and objective.model.pupil.n_rasters == 1 and len(state.z) > 1
-        chosen = self._choose_for_all(objective, ended.state, end)
+        chosen = self._choose_for_all(first, ended.state, end)
 
         def prior_of(state: State) -> ObjectPrior:
             if chosen is not None:
                 return chosen
-            return choose_prior(objective, state, first.prior.choices(state.image), schedule.comparing)
+            return choose_prior(objective, state, first.prior.choices(rate_of_slopes(state.image)), schedule.comparing)
 
         def listen(cost: float, evaluations: int, variables: Variables) -> None:
             costs.append(cost)
@@ -114,7 +115,7 @@ class Finisher:
         objective = objective.with_changes(prior=prior_of(state))
         # a descent moves flat parts of the object slowly
         state = settle(objective, state, schedule.last_settling)
-        if end is End.FULL_PUPIL and _chi_square(objective, state) > _chi_square(first, ended.state):
+        if end is End.FULL_PUPIL and _chi_square(objective, state) > _chi_square(first, ended.state) + self._chance():
             return first
         ended.state = state
         return objective
@@ -136,9 +137,20 @@ class Finisher:
         """Return the prior of all segments; None if it is chosen anew before each."""
         if end is End.OBJECT and len(state.z) > 1:
             state = self._recalibrate(objective, state)
-            return choose_prior(objective, state, objective.prior.family(state.image), self.schedule.last_settling)
-        # an integration finds the object's scale, and would find too heavy a one in what a heavier prior leaves
-        return objective.prior.choices(None)[0] if end.integrates or end is End.OBJECT else None
+            family = objective.prior.family(rate_of_descent(rate_of_slopes(state.image), full=self.traits.many_minima))
+            return choose_prior(objective, state, family, self.schedule.last_settling)
+        if end.integrates or end is End.OBJECT:
+            # an integration finds the object's scale, and would find too heavy a one in what a heavier prior leaves
+            return objective.prior.choices(0.0)[0]
+        rate = rate_of_descent(rate_found(objective, state, self.change), full=self.traits.many_minima)
+        heaviest, *lighter = objective.prior.choices(rate)
+        # faint frames of a full pupil would choose too light a one; and the heavier a prior, the gentler are the slopes
+        # that it leaves, which would ask for a heavier one
+        return heaviest if self.traits.many_minima or not lighter else None
+
+    def _chance(self) -> float:
+        """Return by how much the mean chi-square may rise by chance: a heavier prior leaves more of the noise."""
+        return self.schedule.chance * math.sqrt(2 / (self.change.n_frames * self.change.n_pixels))
 
     def _recalibrate(self, objective: MyopicObjective, state: State) -> State:
         if not self.schedule.recalibrates:

@@ -8,15 +8,15 @@ import torch
 from torch import Tensor, nn
 
 from torchmask.numbers import require
-from torchmask.restoration.slopes import divergence, gradient, rate_of_slopes
+from torchmask.restoration.slopes import divergence, gradient
 
 _PROBES = 8  # random vectors that estimate the diagonal of a Hessian
 _SEED = 0
 _BENDS = 0.25  # weight of bends over that of slopes
-_FEW_BENDS = 0.1  # the same for the factors up to 1: 0 to 0.25 tried
-_HEAVIEST = 3.0  # factor on a prior for bright frames: up to 2.8 seen and up to 3.2 tried
+_FEW_BENDS = 0.1  # the same if slopes are steep: 0 to 0.25 tried
+_HEAVIEST = 3.0  # factor on a prior in the last descent: up to 10 tried
 _LIGHTEST = 0.25  # factor on a prior in the search
-_FACTORS = (2.5, 1.6, 1.0, 0.63, 0.4, 0.25, 0.16, 0.1, 0.063, 0.04, 0.025)  # on a prior, to choose from
+_FACTORS = (6.3, 4.0, 2.5, 1.6, 1.0, 0.63, 0.4, 0.25, 0.16, 0.1, 0.063, 0.04, 0.025)  # on a prior, to choose from
 
 
 class ObjectPrior(nn.Module):
@@ -71,15 +71,16 @@ class ObjectPrior(nn.Module):
         """
         return self
 
-    def family(self, image: Tensor) -> tuple[ObjectPrior, ...]:
-        """Return the priors to choose from for known aberrations and the object `image` (H', W'), heaviest first."""
+    def family(self, rate: float) -> tuple[ObjectPrior, ...]:
+        """Return the priors to choose from for known aberrations, heaviest first; the rate is as for `choices`."""
         return (self,)
 
-    def choices(self, image: Tensor | None) -> tuple[ObjectPrior, ...]:
-        """Return the priors to choose from for the last descent, from `image` (H', W') on, if aberrations are unknown.
+    def choices(self, rate: float) -> tuple[ObjectPrior, ...]:
+        """Return the priors to choose from for the last descent, heaviest first, if aberrations are unknown.
 
-        They are fewer than the `family`: once aberrations are bent to an object that follows noise, frames predict each
-        other best under too light a prior. `image` is None where no scale is to be found: then the first is taken.
+        The rate is that of `slopes.rate_of_descent`, 0 where no scale is to be found: then the first is taken. They are
+        fewer than the `family`: once aberrations are bent to an object that follows noise, frames predict each other
+        best under too light a prior.
         """
         return (self,)
 
@@ -141,27 +142,27 @@ class TotalVariation(ObjectPrior):
         """Return a `SmoothVariation` of `weight` times the rate."""
         return SmoothVariation(self.weight * rate, epsilon=self.epsilon)
 
-    def family(self, image: Tensor) -> tuple[ObjectPrior, ...]:
-        """Return `SmoothVariation` of 2.5 to 0.025 times the weight, with less weight on bends from 1 down.
+    def family(self, rate: float) -> tuple[ObjectPrior, ...]:
+        """Return `SmoothVariation` of 1 to 0.025 times the weight, or for a rate above 1 of 6.3 times on.
 
-        The slopes have to suit more than 1 for those above it, as bright frames of a full pupil take long to tell.
+        Bends weigh more for that. For others the heaviest are left out, as bright frames of a full pupil take long to
+        tell that they are too heavy.
         """
-        return tuple(self._smooth(factor) for factor in _FACTORS if factor <= 1 or rate_of_slopes(image) > 1)
+        return tuple(self._smooth(factor, gentle=rate > 1) for factor in _FACTORS if factor <= 1 or rate > 1)
 
-    def choices(self, image: Tensor | None) -> tuple[ObjectPrior, ...]:
-        """Return `SmoothVariation` of several weights for bright frames of an object, so far `image` (H', W').
+    def choices(self, rate: float) -> tuple[ObjectPrior, ...]:
+        """Return `SmoothVariation` of one or several weights.
 
-        If the weight that suits the object's slopes is heavier, by up to a factor of 3, it is the only one: the heavier
-        a prior, the gentler are the slopes that it leaves, which suit a heavier one. Else they go down from the given
-        weight, by up to a factor of 40 but not below that one, with less weight on bends.
+        A rate above 1, up to 3, is the only factor on the given weight. Else they go down from the given one, by up to
+        a factor of 40 but not below the rate, with less weight on bends.
         """
-        rate = 1.0 if image is None else min(rate_of_slopes(image), _HEAVIEST)
         if rate > 1:
-            return (self._smooth(rate),)
-        return tuple(self._smooth(factor) for factor in _FACTORS if factor == 1 or 1 > factor > rate > 0)
+            return (self._smooth(min(rate, _HEAVIEST), gentle=True),)
+        factors = (factor for factor in _FACTORS if factor == 1 or 1 > factor > rate > 0)
+        return tuple(self._smooth(factor, gentle=False) for factor in factors)
 
-    def _smooth(self, factor: float) -> SmoothVariation:
-        bending = _FEW_BENDS if factor <= 1 else _BENDS
+    def _smooth(self, factor: float, *, gentle: bool) -> SmoothVariation:
+        bending = _BENDS if gentle else _FEW_BENDS
         return SmoothVariation(self.weight * factor, bending=bending, epsilon=self.epsilon)
 
     def _slopes(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -224,10 +225,10 @@ class SmoothVariation(TotalVariation):
         straight = 8 * inverse + left + above + inverse.roll(-1, -1) + inverse.roll(-1, -2)
         return super().curvature(image) + straight + 2 * (inverse + left + above + left.roll(1, -2))
 
-    def family(self, image: Tensor) -> tuple[ObjectPrior, ...]:
+    def family(self, rate: float) -> tuple[ObjectPrior, ...]:
         return (self,)
 
-    def choices(self, image: Tensor | None) -> tuple[ObjectPrior, ...]:
+    def choices(self, rate: float) -> tuple[ObjectPrior, ...]:
         return (self,)
 
     def _bends(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

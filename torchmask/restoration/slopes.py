@@ -9,6 +9,8 @@ from torchmask.restoration.change import Change
 _LIGHT = 40.0  # light from which on the rate of gentle slopes is at least 1
 _MOST = 2.0  # the highest least rate: up to 8 tried
 _SHOWN = 2048.0  # chi-square of a frame beyond noise below which it is the prior that has made slopes gentle
+_BENT = 3.0  # factor on the rate of gentle slopes if aberrations are unknown: 1 to 10 tried
+_BENT_MOST, _BENT_MOST_FULL = 2.0, 3.0  # what it leads to at most, for a mask and for a full pupil: up to 10 tried
 _SMALLEST = 0.25  # the smallest factor by which they are taken to be steeper then: down to 0.125 tried
 
 
@@ -37,6 +39,17 @@ def rate_in_noise(image: Tensor, change: Change, *, gentle: bool) -> float:
     if change.n_frames > 1 and (part := shown(change)) < 1:
         return rate * max(part, _SMALLEST)
     return max(rate, rate_in_light(change)) if gentle and change.light > _LIGHT else rate
+
+
+def rate_of_descent(rate: float, *, full: bool) -> float:
+    """Return the rate that the prior of a last descent suits for slopes of this `rate`.
+
+    Aberrations that are unknown bend to what an object shows of the noise, from which a heavier prior keeps it. So
+    gentle slopes, whose rate is above a third, have three times that rate, but no more than 2, or 3 for a `full` pupil.
+    The numbers are empirical.
+    """
+    heavier = min(_BENT * rate, _BENT_MOST_FULL if full else _BENT_MOST)
+    return max(rate, heavier) if heavier > 1 else rate
 
 
 def rate_in_light(change: Change) -> float:

@@ -78,6 +78,18 @@ def rate_in_search(objective: MyopicObjective, state: State, change: Change) -> 
     return rate_in_light(change) if follows_noise else min(rate, 1.0)
 
 
+def rate_found(objective: MyopicObjective, state: State, change: Change) -> float:
+    """Return the rate of the slopes that a search has found.
+
+    Where slopes are gentle it is that which the frames show, if it is higher: the object follows noise then.
+    """
+    rate = rate_of_slopes(state.image)
+    if rate == 0 or not shows_gentle_slopes(objective, state, change):
+        return rate
+    total = float(torch.hypot(*gradient(state.image)).sum())
+    return max(rate, 3 * total / power_of_slopes(objective, state).value)
+
+
 def power_of_slopes(objective: MyopicObjective, state: State) -> Power:
     """Return the sum of the squared slopes of the object that the frames show, below the cut-off frequency.
 
