@@ -372,6 +372,10 @@ def test_the_last_descent_has_the_prior_of_the_object_that_the_search_has_found(
     assert found.prior.weight == pytest.approx(0.675 if end.integrates else 0.9, rel=1e-9)
     assert isinstance(found.prior, SmoothVariation)
     assert progress.n_evaluations == 6 + 100 * end.integrates
+    weights.clear()
+    interrupted = replace(begun, image=begun.image / 2)
+    ended(objective, begun, Setting.of(objective), schedule, end=end, finer=interrupted)
+    assert weights == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize("end", [End.INTEGRATION, End.BOTH])
