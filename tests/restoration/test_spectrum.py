@@ -206,3 +206,6 @@ def test_the_rate_that_a_search_has_found_is_that_of_its_frames_if_gentle_slopes
         monkeypatch.setattr(spectrum, "shows_gentle_slopes", lambda *given, answer=gentle: answer)
         assert rate_found(objective, state, BRIGHT) == pytest.approx(expected, rel=1e-9)
     assert rate_found(objective, replace(state, image=torch.zeros_like(state.image)), BRIGHT) == 0
+    hardly = Change(0.875 + 1024 / 4096, 8, 4096)  # half of what tells slopes
+    monkeypatch.undo()
+    assert rate_found(objective, state, hardly) == pytest.approx(rate / 2, rel=1e-9)

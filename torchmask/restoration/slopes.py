@@ -9,9 +9,9 @@ from torchmask.restoration.change import Change
 _LIGHT = 40.0  # light from which on the rate of gentle slopes is at least 1
 _MOST = 2.0  # the highest least rate: up to 8 tried
 _SHOWN = 2048.0  # chi-square of a frame beyond noise below which it is the prior that has made slopes gentle
+_SMALLEST = 0.25  # the smallest factor by which they are taken to be steeper then: down to 0.125 tried
 _BENT = 3.0  # factor on the rate of gentle slopes if aberrations are unknown: 1 to 10 tried
 _BENT_MOST, _BENT_MOST_FULL = 2.0, 3.0  # what it leads to at most, for a mask and for a full pupil: up to 10 tried
-_SMALLEST = 0.25  # the smallest factor by which they are taken to be steeper then: down to 0.125 tried
 
 
 def rate_of_slopes(image: Tensor) -> float:

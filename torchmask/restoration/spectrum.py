@@ -17,7 +17,7 @@ from torchmask.restoration.change import Change
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.projected_lbfgs import minimize_bounded
 from torchmask.restoration.schedule import Schedule
-from torchmask.restoration.slopes import gradient, rate_in_light, rate_of_slopes, shown
+from torchmask.restoration.slopes import gradient, rate_in_light, rate_in_noise, rate_of_slopes, shown
 from torchmask.restoration.state import State
 
 _ITERATIONS = 100
@@ -81,9 +81,10 @@ def rate_in_search(objective: MyopicObjective, state: State, change: Change) -> 
 def rate_found(objective: MyopicObjective, state: State, change: Change) -> float:
     """Return the rate of the slopes that a search has found.
 
-    Where slopes are gentle it is that which the frames show, if it is higher: the object follows noise then.
+    Where slopes are gentle it is that which the frames show, if it is higher: the object follows noise then. Where
+    frames change by hardly more than their noise it is lower, as the prior has smoothed the object (`rate_in_noise`).
     """
-    rate = rate_of_slopes(state.image)
+    rate = rate_in_noise(state.image, change, gentle=False)
     if rate == 0 or not shows_gentle_slopes(objective, state, change):
         return rate
     total = float(torch.hypot(*gradient(state.image)).sum())
