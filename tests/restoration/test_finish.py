@@ -266,6 +266,11 @@ def test_nothing_follows_the_search_of_a_schedule_without_last_segments(observe,
     assert "TotalVariation" in result.prior
 
 
+def found_rate(objective, state, change, *, full):
+    """The rate of slopes that are gentle."""
+    return rate_of_descent(rate_of_slopes(state.image), full=full)
+
+
 def test_the_priors_of_the_last_descent():
     """One that is heavier by the rate, up to three times; else from the given one down to the rate."""
     prior = TotalVariation(2.0, 0.3)
@@ -317,7 +322,7 @@ def test_the_frames_choose_the_prior_of_each_segment_and_of_the_end(explained, f
         return replace(state, image=1.5 * state.image)
 
     monkeypatch.setattr(finish, "choose_prior", choose)
-    monkeypatch.setattr(finish, "rate_found", lambda objective, state, change: rate_of_slopes(state.image))
+    monkeypatch.setattr(finish, "rate_at_end", found_rate)
     monkeypatch.setattr(finish, "descend", descend)
     monkeypatch.setattr(finish, "recalibrate", lambda objective, state, power, **more: state)
     monkeypatch.setattr(finish, "settle", lambda objective, state, n_iterations: state)
@@ -355,7 +360,7 @@ def test_the_last_descent_has_the_prior_of_the_object_that_the_search_has_found(
     monkeypatch.setattr(finish, "descend", descend)
     monkeypatch.setattr(finish, "settle", settle)
     monkeypatch.setattr(finish, "recalibrate", lambda objective, state, power, **more: state)
-    monkeypatch.setattr(finish, "rate_found", lambda objective, state, change: rate_of_slopes(state.image))
+    monkeypatch.setattr(finish, "rate_at_end", found_rate)
     objective = objective.with_changes(prior=TotalVariation(0.5))
     begun = replace(state, image=state.image * rate_of_slopes(state.image) / 0.6)  # and 0.9 and 1.35 later
     schedule = Schedule(segment=1, last_segments=2, last_gain=0.0, lost=math.inf)

@@ -14,8 +14,8 @@ from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.priors import TotalVariation
-from torchmask.restoration.slopes import gradient, rate_of_slopes
-from torchmask.restoration.spectrum import Power, power_of_slopes, rate_found, rate_in_search, shows_gentle_slopes
+from torchmask.restoration.slopes import gradient, rate_of_descent, rate_of_slopes
+from torchmask.restoration.spectrum import Power, power_of_slopes, rate_at_end, rate_in_search, shows_gentle_slopes
 from torchmask.restoration.state import State
 
 N_OBJECTS = 40
@@ -194,18 +194,19 @@ def test_the_rate_of_a_search_is_that_of_its_object_unless_it_follows_noise(seen
             assert rate_in_search(objective, found, change) == pytest.approx(expected, rel=1e-9)
 
 
+@pytest.mark.parametrize("full", [False, True])
 @pytest.mark.parametrize("shown", [0.6, 1.4])
-def test_the_rate_that_a_search_has_found_is_that_of_its_frames_if_gentle_slopes_were_found_steeper(
-    shown, seen, monkeypatch
+def test_the_rate_at_the_end_is_higher_for_gentle_slopes_and_that_of_the_frames_if_these_show_more(
+    shown, full, seen, monkeypatch
 ):
     """Squared slopes that are fewer by a factor have a rate that is higher by it, for as steep an object."""
     objective, state = seen(0)
-    rate, squares = rate_of_slopes(state.image), squares_of(state.image)
+    state = replace(state, image=state.image * rate_of_slopes(state.image) / 0.4)
+    squares = squares_of(state.image)
     monkeypatch.setattr(spectrum, "power_of_slopes", lambda *given: Power(squares / shown, 0.1))
-    for gentle, expected in ((False, rate), (True, rate * max(shown, 1.0))):
+    gentle_rate = rate_of_descent(0.4 * max(shown, 1.0), full=full)
+    for gentle, expected in ((False, 0.4), (True, gentle_rate)):
         monkeypatch.setattr(spectrum, "shows_gentle_slopes", lambda *given, answer=gentle: answer)
-        assert rate_found(objective, state, BRIGHT) == pytest.approx(expected, rel=1e-9)
-    assert rate_found(objective, replace(state, image=torch.zeros_like(state.image)), BRIGHT) == 0
-    hardly = Change(0.875 + 1024 / 4096, 8, 4096)  # half of what tells slopes
-    monkeypatch.undo()
-    assert rate_found(objective, state, hardly) == pytest.approx(rate / 2, rel=1e-9)
+        assert rate_at_end(objective, state, BRIGHT, full=full) == pytest.approx(expected, rel=1e-9)
+    dark = replace(state, image=torch.zeros_like(state.image))
+    assert rate_at_end(objective, dark, BRIGHT, full=full) == 0

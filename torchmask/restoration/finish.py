@@ -32,7 +32,7 @@ from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.retrieval import retrieve_lost_frames
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.slopes import rate_in_noise, rate_of_descent, rate_of_slopes
-from torchmask.restoration.spectrum import is_too_steep, rate_found, shows_gentle_slopes
+from torchmask.restoration.spectrum import is_too_steep, rate_at_end, shows_gentle_slopes
 from torchmask.restoration.state import State
 from torchmask.restoration.traits import End, Traits
 
@@ -142,7 +142,7 @@ class Finisher:
         if end.integrates or end is End.OBJECT:
             # an integration finds the object's scale, and would find too heavy a one in what a heavier prior leaves
             return objective.prior.choices(0.0)[0]
-        rate = rate_of_descent(rate_found(objective, state, self.change), full=self.traits.many_minima)
+        rate = rate_at_end(objective, state, self.change, full=self.traits.many_minima)
         heaviest, *lighter = objective.prior.choices(rate)
         # faint frames of a full pupil would choose too light a one; and the heavier a prior, the gentler are the slopes
         # that it leaves, which would ask for a heavier one

@@ -78,7 +78,7 @@ class ObjectPrior(nn.Module):
     def choices(self, rate: float) -> tuple[ObjectPrior, ...]:
         """Return the priors to choose from for the last descent, heaviest first, if aberrations are unknown.
 
-        The rate is that of `slopes.rate_of_descent`, 0 where no scale is to be found: then the first is taken. They are
+        The rate is that of `spectrum.rate_at_end`, 0 where no scale is to be found: then the first is taken. They are
         fewer than the `family`: once aberrations are bent to an object that follows noise, frames predict each other
         best under too light a prior.
         """

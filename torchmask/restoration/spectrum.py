@@ -17,7 +17,7 @@ from torchmask.restoration.change import Change
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.projected_lbfgs import minimize_bounded
 from torchmask.restoration.schedule import Schedule
-from torchmask.restoration.slopes import gradient, rate_in_light, rate_in_noise, rate_of_slopes, shown
+from torchmask.restoration.slopes import gradient, rate_in_light, rate_of_descent, rate_of_slopes, shown
 from torchmask.restoration.state import State
 
 _ITERATIONS = 100
@@ -78,17 +78,17 @@ def rate_in_search(objective: MyopicObjective, state: State, change: Change) -> 
     return rate_in_light(change) if follows_noise else min(rate, 1.0)
 
 
-def rate_found(objective: MyopicObjective, state: State, change: Change) -> float:
-    """Return the rate of the slopes that a search has found.
+def rate_at_end(objective: MyopicObjective, state: State, change: Change, *, full: bool) -> float:
+    """Return the rate that the prior of a last descent suits, for the slopes that a search has found.
 
-    Where slopes are gentle it is that which the frames show, if it is higher: the object follows noise then. Where
-    frames change by hardly more than their noise it is lower, as the prior has smoothed the object (`rate_in_noise`).
+    It is that of the object unless the frames show gentle slopes. Then it is that of `rate_of_descent` for what the
+    frames show if that is higher, as the object follows noise.
     """
-    rate = rate_in_noise(state.image, change, gentle=False)
+    rate = rate_of_slopes(state.image)
     if rate == 0 or not shows_gentle_slopes(objective, state, change):
         return rate
     total = float(torch.hypot(*gradient(state.image)).sum())
-    return max(rate, 3 * total / power_of_slopes(objective, state).value)
+    return rate_of_descent(max(rate, 3 * total / power_of_slopes(objective, state).value), full=full)
 
 
 def power_of_slopes(objective: MyopicObjective, state: State) -> Power:
