@@ -206,7 +206,8 @@ def test_the_rate_at_the_end_is_higher_for_gentle_slopes_and_that_of_the_frames_
     monkeypatch.setattr(spectrum, "power_of_slopes", lambda *given: Power(squares / shown, 0.1))
     gentle_rate = rate_of_descent(0.4 * max(shown, 1.0), full=full)
     for gentle, expected in ((False, 0.4), (True, gentle_rate)):
-        monkeypatch.setattr(spectrum, "shows_gentle_slopes", lambda *given, answer=gentle: answer)
+        monkeypatch.setattr(spectrum, "_are_gentle", lambda *given, answer=gentle: answer)
         assert rate_at_end(objective, state, BRIGHT, full=full) == pytest.approx(expected, rel=1e-9)
     dark = replace(state, image=torch.zeros_like(state.image))
     assert rate_at_end(objective, dark, BRIGHT, full=full) == 0
+    assert rate_at_end(objective, state, BRIGHT._replace(n_frames=1), full=full) == pytest.approx(0.4, rel=1e-9)

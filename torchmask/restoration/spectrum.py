@@ -49,13 +49,7 @@ def shows_gentle_slopes(objective: MyopicObjective, state: State, change: Change
     those of the object in `state` are steep, as it may follow noise. Only the sum of its slopes is taken from it.
     Frames that change by hardly more than noise do not tell, nor does a single one.
     """
-    if change.n_frames == 1 or shown(change) < 1:
-        return False
-    total = float(torch.hypot(*gradient(state.image)).sum())
-    power = power_of_slopes(objective, state)
-    if change.each < Schedule.faint:
-        return 3 * total > _GENTLE_FAINT * power.off_by(1)
-    return 3 * total > _GENTLE * power.off_by(-_DOUBT)
+    return _tell(change) and _are_gentle(_sum_of_slopes(state), power_of_slopes(objective, state), change)
 
 
 def is_too_steep(objective: MyopicObjective, state: State) -> bool:
@@ -84,11 +78,11 @@ def rate_at_end(objective: MyopicObjective, state: State, change: Change, *, ful
     It is that of the object unless the frames show gentle slopes. Then it is that of `rate_of_descent` for what the
     frames show if that is higher, as the object follows noise.
     """
-    rate = rate_of_slopes(state.image)
-    if rate == 0 or not shows_gentle_slopes(objective, state, change):
+    rate, total = rate_of_slopes(state.image), _sum_of_slopes(state)
+    if total == 0 or not _tell(change):
         return rate
-    total = float(torch.hypot(*gradient(state.image)).sum())
-    return rate_of_descent(max(rate, 3 * total / power_of_slopes(objective, state).value), full=full)
+    power = power_of_slopes(objective, state)
+    return rate_of_descent(max(rate, 3 * total / power.value), full=full) if _are_gentle(total, power, change) else rate
 
 
 def power_of_slopes(objective: MyopicObjective, state: State) -> Power:
@@ -158,3 +152,20 @@ def _fit(nu: Tensor, passed: Tensor, power: Tensor, noise: float) -> Tensor:
     start = torch.stack([first.log(), first.new_tensor(2 * lowest).log(), -first.new_tensor(3.0).log()])
     lower = start.new_tensor([-torch.inf, math.log(lowest), -math.log(_STEEPEST)])
     return minimize_bounded(cost, start, lower, max_iterations=_ITERATIONS).x
+
+
+def _sum_of_slopes(state: State) -> float:
+    return float(torch.hypot(*gradient(state.image)).sum())
+
+
+def _tell(change: Change) -> bool:
+    """Return whether frames tell slopes at all."""
+    return change.n_frames > 1 and shown(change) >= 1
+
+
+def _are_gentle(total: float, power: Power, change: Change) -> bool:
+    """Return whether slopes whose sum is `total` and whose squares' sum is `power` are gentle; see
+    `shows_gentle_slopes`."""
+    if change.each < Schedule.faint:
+        return 3 * total > _GENTLE_FAINT * power.off_by(1)
+    return 3 * total > _GENTLE * power.off_by(-_DOUBT)
