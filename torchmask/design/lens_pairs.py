@@ -63,9 +63,11 @@ class LensPairs:
         step = _NODE * (self.geometry.reach + self.coherence.spread / 2 * middle.abs())
         n_slots = int(entries.slot.max()) + 1
         nodes = middle.new_zeros(n_slots, 9)
-        for some, n in ((largest > _RICH, 3), (largest <= _RICH, 1)):
-            found = self.coherence.around(first[some], second[some], separation[some], step[some], n).flatten(1)
-            nodes = nodes.index_add(0, entries.slot[some], found.expand(-1, 9))
+        rich, poor = largest > _RICH, largest <= _RICH
+        found = self.coherence.around(first[rich], second[rich], separation[rich], step[rich]).flatten(1)
+        nodes = nodes.index_add(0, entries.slot[rich], found)
+        found = self.coherence.midway(first[poor], second[poor], separation[poor])
+        nodes = nodes.index_add(0, entries.slot[poor], found[:, None].expand(-1, 9))
         one = torch.zeros_like(entries.slot[:n_slots])
         one[entries.slot] = torch.arange(len(largest), device=one.device)  # an entry of each slot
         pairs = Entries(*(part[one] for part in entries))
