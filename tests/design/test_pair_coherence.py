@@ -9,7 +9,7 @@ from torchmask.atmosphere.colour_coherence import ColourCoherence, colour_loss
 from torchmask.atmosphere.seeing import Seeing
 from torchmask.atmosphere.transfer import difference_variance
 from torchmask.design.overlap import Geometry
-from torchmask.design.pair_coherence import _FOUR, _NINE, PairCoherence, _shared_phases
+from torchmask.design.pair_coherence import _POINTS, PairCoherence, _shared_phases
 from torchmask.optics.band import Band
 from torchmask.optics.shapes import Disc
 
@@ -65,15 +65,9 @@ def test_moments_are_those_of_the_lens_of_two_discs(distance):
 def test_points_have_the_moments_of_the_separations_between_two_discs():
     """Along one axis x a disc of radius R has <x^2> = R^2 / 4 and <x^4> = R^4 / 8, so that its kurtosis is 2; that of
     the difference of two points is (2 + 3) / 2."""
-
-    def mean(points, x, y=0):
-        return sum(weight * i**x * j**y for i, j, weight in points)
-
-    for points in (_NINE, _FOUR):
-        for axes in (points, [(j, i, weight) for i, j, weight in points]):
-            assert [mean(axes, power) for power in range(4)] == pytest.approx([1, 0, 1, 0], abs=1e-12)
-            assert [mean(axes, 1, power) for power in (1, 2)] == pytest.approx([0, 0], abs=1e-12)
-    assert mean(_NINE, 4) == pytest.approx(5 / 2, abs=1e-12)
+    for power, expected in ((0, 1), (1, 0), (2, 1), (3, 0), (4, 5 / 2)):
+        for axis in (0, 1):
+            assert sum(point[2] * point[axis] ** power for point in _POINTS) == pytest.approx(expected, abs=1e-12)
 
 
 @each_separation
@@ -81,7 +75,7 @@ def test_points_have_the_moments_of_the_separations_between_two_discs():
 def test_one_colour_is_the_mean_over_pairs_of_points(distance, ratio):
     seeing = Seeing(DIAMETER / ratio)
     coherence, separation = coherence_of(seeing), torch.tensor([[0.6, -0.8]]).double() * distance * DIAMETER
-    found = coherence.midway(BASELINE, BASELINE, separation)
+    found = coherence.around(BASELINE, BASELINE, separation, torch.ones_like(BASELINE), 1)
     expected = math.log(mean_over_points(seeing, (BASELINE, BASELINE), (1.0, 1.0), separation))
     assert float((found * coherence.far(*BASELINE[0])).log()) == pytest.approx(expected, abs=tolerance(ratio))
 
@@ -94,7 +88,7 @@ def test_two_colours_are_the_mean_over_pairs_of_points_beside_what_they_keep_in_
     colours = ColourCoherence(Disc(), DIAMETER, seeing, band, REFERENCE, LONGEST)
     coherence, separation = coherence_of(seeing, colours), torch.tensor([[0.6, -0.8]]).double() * distance * DIAMETER
     first, second = (stretch * BASELINE for stretch in STRETCH)  # of which BASELINE is the mean
-    found = coherence.midway(first, second, separation)
+    found = coherence.around(first, second, separation, torch.ones_like(BASELINE), 1)
     one, other = (torch.tensor(1 / stretch) for stretch in STRETCH)
     factors = (factor.flatten()[0] for factor in colours.factors(BASELINE / ((one + other) / 2)))
     kept = math.log(mean_over_points(seeing, (first, second), (float(one), float(other)), separation))
@@ -109,7 +103,7 @@ def test_the_coherence_around_is_the_mean_over_pairs_of_points_of_narrower_lense
     over which the phase has a variance of 1.03 (d / r0)^(5/3) (Noll 1976)."""
     seeing, step, moments = Seeing(DIAMETER / ratio), 0.4 * DIAMETER, 0.01 * 1.03 * ratio ** (5 / 3)
     coherence, separation = coherence_of(seeing), torch.tensor([[0.6, -0.8]]).double() * distance * DIAMETER
-    found = coherence.around(BASELINE, BASELINE, separation, torch.full_like(BASELINE, step))[0]
+    found = coherence.around(BASELINE, BASELINE, separation, torch.full_like(BASELINE, step), 3)[0]
     for row, y in enumerate((-step, 0.0, step)):
         for column, x in enumerate((-step, 0.0, step)):
             place = torch.tensor([x, y], dtype=torch.float64)

@@ -63,11 +63,9 @@ class LensPairs:
         step = _NODE * (self.geometry.reach + self.coherence.spread / 2 * middle.abs())
         n_slots = int(entries.slot.max()) + 1
         nodes = middle.new_zeros(n_slots, 9)
-        rich, poor = largest > _RICH, largest <= _RICH
-        found = self.coherence.around(first[rich], second[rich], separation[rich], step[rich]).flatten(1)
-        nodes = nodes.index_add(0, entries.slot[rich], found)
-        found = self.coherence.midway(first[poor], second[poor], separation[poor])
-        nodes = nodes.index_add(0, entries.slot[poor], found[:, None].expand(-1, 9))
+        for some, n in ((largest > _RICH, 3), (largest <= _RICH, 1)):
+            found = self.coherence.around(first[some], second[some], separation[some], step[some], n).flatten(1)
+            nodes = nodes.index_add(0, entries.slot[some], found.expand(-1, 9))
         one = torch.zeros_like(entries.slot[:n_slots])
         one[entries.slot] = torch.arange(len(largest), device=one.device)  # an entry of each slot
         pairs = Entries(*(part[one] for part in entries))
@@ -83,17 +81,16 @@ class LensPairs:
     def _select(self, lenses: Lenses, centers: Tensor) -> tuple[Entries, Tensor]:
         """Return the pairs that share something, and about the most that each gives anywhere."""
         n, count = centers.shape[1], lenses.baseline.shape[1]
+        one, other = torch.triu_indices(count, count, device=centers.device)
         x, y = (lenses.baseline * self.pixel).unbind(-1)
         limit, found = (2 * self.geometry.reach) ** 2, []
-        upper = torch.ones(count, count, dtype=torch.bool, device=centers.device).triu()
         # lenses at baseline 0 are their own opposites: what they share with another's opposite, they share with it
-        for sign, allowed in (
-            (1, upper.triu(1)),
-            (-1, upper & (torch.arange(count, device=upper.device) > 0)[:, None]),
-        ):
-            dx, dy = self._between([sign * part[..., None] for part in (x, y)], [part[:, None] for part in (x, y)])
-            mask, i, j = (allowed & (dx * dx + dy * dy < limit)).nonzero().unbind(-1)
-            found.append((mask, mask * count + i, mask * count + j, torch.full_like(mask, sign)))
+        for sign, allowed in ((1, one < other), (-1, one > 0)):
+            i, j = one[allowed], other[allowed]
+            first, second = ([part.index_select(1, lens) for part in (x, y)] for lens in (i, j))
+            dx, dy = self._between([sign * part for part in first], second)
+            mask, pair = (dx * dx + dy * dy < limit).nonzero().unbind(-1)
+            found.append((mask, mask * count + i[pair], mask * count + j[pair], torch.full_like(mask, sign)))
         columns = [torch.cat(parts) for parts in zip(*found, strict=True)]
         columns.append(torch.arange(len(columns[0]), device=centers.device))
         central = columns[1] % count == 0

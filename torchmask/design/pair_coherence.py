@@ -6,15 +6,13 @@ For lenses with middles s apart it is, at the baseline b, the mean over t of
 
 (`torchmask.atmosphere.transfer.difference_variance`) for pairs of points s + t apart, one in each lens, and light whose
 phases are a and a' times those at the reference wavelength: exp(-Q(b, s + t) / 2) for one wavelength. The separation t
-is known by its second moments, to which the exposure adds those of the drift: nine points or four stand for it.
+is known by its second moments, to which the exposure adds those of the drift: nine points stand for it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -31,38 +29,14 @@ _KURTOSIS = 2.5  # along one axis, of the separation of two points of two discs
 _PLACES = [
     (i * math.sqrt(_KURTOSIS), (1 - abs(i)) * (1 - 1 / _KURTOSIS) + abs(i) / (2 * _KURTOSIS)) for i in (-1, 0, 1)
 ]
-_NINE = [(i, j, a * b) for i, a in _PLACES for j, b in _PLACES]
-_FOUR = [(i, j, 0.25) for i in (-1, 1) for j in (-1, 1)]  # of the same mean squares
-_CROSS, _CORNERS = [1, 3, 4, 5, 7], [0, 2, 6, 8]  # of a square of 3 x 3
-_IN_ORDER = [(_CROSS + _CORNERS).index(i) for i in range(9)]
+_POINTS = [(i, j, a * b) for i, a in _PLACES for j, b in _PLACES]
 # what the exponent sums, by the signs of the baselines that are added to a separation, and the factor of the structure
 # function there: -Q(b, s) / 2, and the same of two colours, b being the mean and half the difference of their baselines
 _ONE_COLOUR = [(1, 0.5), (-1, 0.5), (0, -1.0)]
 _TWO_COLOURS = [(1, 0, 0.5), (-1, 0, 0.5), (0, 1, -0.5), (0, -1, -0.5)]
 _LIGHT = 0.13  # mean square of a place in a lens's T, a Gaussian here, along either axis, over the hole's diameter^2
 _STEPS = 4  # of the spline to a hole
-_CHUNK = AtATime(processor=2**14, gpu=2**18)  # baselines
-
-
-class _Points(NamedTuple):
-    """Points for which the mean over separations stands.
-
-    displacements : (terms * points, vectors) those of each term, over the middles' separation, the axes of the lenses'
-        own separations, and the baselines
-    weights : (points,)
-    """
-
-    displacements: Tensor
-    weights: Tensor
-
-    @classmethod
-    def of(cls, points: Sequence[tuple[float, float, float]], terms: list[Any]) -> _Points:
-        rows = [(1.0, i, j, *signs) for *signs, _ in terms for i, j, _ in points]
-        weights = [weight for *_, weight in points]
-        return cls(torch.tensor(rows, dtype=torch.float64), torch.tensor(weights, dtype=torch.float64))
-
-    def to(self, device: torch.device, dtype: torch.dtype) -> _Points:
-        return _Points(self.displacements.to(device, dtype), self.weights.to(device, dtype))
+_CHUNK = AtATime(processor=2**12, gpu=2**18)  # baselines
 
 
 class PairCoherence:
@@ -82,8 +56,12 @@ class PairCoherence:
     ) -> None:
         self.reach: float = geometry.reach
         terms = _ONE_COLOUR if colours is None else _TWO_COLOURS
+        # (terms * points, axes): the displacements of each term, over the middles' separation, the axes of the lenses'
+        # own separations, and the baselines
+        rows = [(1.0, i, j, *signs) for *signs, _ in terms for i, j, _ in _POINTS]
+        self.displacements: Tensor = torch.tensor(rows, dtype=torch.float64).to(device, dtype)
         self.factors: list[float] = [factor for *_, factor in terms]
-        self.nine, self.four = (_Points.of(points, terms).to(device, dtype) for points in (_NINE, _FOUR))
+        self.weights: Tensor = torch.tensor([weight for *_, weight in _POINTS], dtype=torch.float64).to(device, dtype)
         points, weights = geometry.shape.quadrature(4, geometry.diameter)
         self.variance: float = float((weights @ points**2).mean())  # of the points of a hole, along either axis [m^2]
         steps, shares = seeing.drift()
@@ -107,33 +85,20 @@ class PairCoherence:
         crossed = self.structure.at(sx + bx, sy + by) + self.structure.at(sx - bx, sy - by)
         return torch.exp(crossed / 2 - self.structure.at(bx, by) - self.structure.at(sx, sy))
 
-    def midway(self, first: Tensor, second: Tensor, separation: Tensor) -> Tensor:
-        """Return the coherence (E,) over `far` at the baseline midway between those of the lenses.
+    def around(self, first: Tensor, second: Tensor, separation: Tensor, step: Tensor, n: int) -> Tensor:
+        """Return the coherence over `far`, (E, rows, columns), at n x n baselines around that midway.
 
-        Lenses have the baselines `first` and `second` (E, 2) and middles a `separation` (E, 2) apart, all in m.
+        Lenses have the baselines `first` and `second` (E, 2) and middles a `separation` (E, 2) apart; the baselines
+        are `step` (E, 2) apart, all in m.
         """
-        return self._at((first + second)[:, None] / 2, first, second, separation, self.nine)[:, 0]
+        nodes = torch.arange(n, dtype=first.dtype, device=first.device) - (n - 1) / 2
+        nodes = torch.stack(torch.meshgrid(nodes, nodes, indexing="xy"), -1)
+        first, second, separation, step = (one[:, None, None] for one in (first, second, separation, step))
+        parts = torch.broadcast_tensors((first + second) / 2 + step * nodes, first, second, separation)
+        found = by_chunks(self._over_far, torch.stack(parts, -2).flatten(0, 2), _CHUNK.on(step.device))
+        return found.view(-1, n, n)
 
-    def around(self, first: Tensor, second: Tensor, separation: Tensor, step: Tensor) -> Tensor:
-        """Return the same (E, rows, columns) at 3 x 3 baselines around that midway, `step` (E, 2) [m] apart.
-
-        In the corners, where both lenses are narrow and dark, four points do.
-        """
-        nodes = step.new_tensor([-1.0, 0.0, 1.0])
-        nodes = torch.stack(torch.meshgrid(nodes, nodes, indexing="xy"), -1).flatten(0, 1)
-        baselines = (first + second)[:, None] / 2 + step[:, None] * nodes
-        parts = ((_CROSS, self.nine), (_CORNERS, self.four))
-        found = [self._at(baselines[:, some], first, second, separation, points) for some, points in parts]
-        return torch.cat(found, 1)[:, _IN_ORDER].unflatten(1, (3, 3))
-
-    def _at(self, baselines: Tensor, first: Tensor, second: Tensor, separation: Tensor, points: _Points) -> Tensor:
-        """Return the coherence (E, K) over `far` at `baselines` (E, K, 2), by the mean over `points`."""
-        parts = torch.broadcast_tensors(baselines, *(one[:, None] for one in (first, second, separation)))
-        places = torch.stack(parts, -2).flatten(0, 1)
-        found = by_chunks(partial(self._over_far, points), places, _CHUNK.on(places.device))
-        return found.view(baselines.shape[:2])
-
-    def _over_far(self, points: _Points, places: Tensor) -> Tensor:
+    def _over_far(self, places: Tensor) -> Tensor:
         """Return the coherence (Q,) over `far` at baselines of two lenses, by `places` (Q, 4, 2) [m].
 
         They are the baseline, those of the lenses, and the separation of their middles.
@@ -143,7 +108,7 @@ class PairCoherence:
         between = self.structure.at(bx, by)
         if self.colours is None:
             axes = self._axes(bx - x, by - y)
-            known, found = -between, self._changing(points, [separation, *axes, (bx, by)])
+            known, found = -between, self._changing([separation, *axes, (bx, by)])
         else:
             phases, spreads = self._phases(bx, by, x, y)
             at = torch.stack([bx, by], -1)[None] / phases.mean(0)[:, None]
@@ -154,8 +119,8 @@ class PairCoherence:
             mx, my, hx, hy = bx * mean, by * mean, bx * half, by * half
             own = self.structure.at(mx + hx, my + hy) * one**2 + self.structure.at(mx - hx, my - hy) * other**2
             known = colour_loss(second, third, one, other) - own / 2
-            found = self._changing(points, [separation, *axes, (mx, my), (hx, hy)]) * (one * other)
-        return points.weights @ found.add_(known - _log_far(between)).exp_()
+            found = self._changing([separation, *axes, (mx, my), (hx, hy)]) * (one * other)
+        return self.weights @ found.add_(known - _log_far(between)).exp_()
 
     def _axes(self, x: Tensor, y: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Return x and y (Q,) of the two axes in which `_POINTS` count, for two lenses at the places (x, y) (2, Q)."""
@@ -166,10 +131,10 @@ class PairCoherence:
         skew = xy / trace
         return [((xx + root) / trace, skew), (skew, (yy + root) / trace)]
 
-    def _changing(self, points: _Points, axes: list[Any]) -> Tensor:
+    def _changing(self, axes: list[Any]) -> Tensor:
         """Return the part of the exponent (points, Q) that changes with the points' separation, over the product of the
         phases, by x and y (Q,) of all that `displacements` count in."""
-        x, y = (points.displacements @ torch.stack(parts) for parts in zip(*axes, strict=True))
+        x, y = (self.displacements @ torch.stack(parts) for parts in zip(*axes, strict=True))
         terms = self.structure.at(x, y).unflatten(0, (len(self.factors), -1))
         total = terms[0] * self.factors[0]
         for term, factor in zip(terms[1:], self.factors[1:], strict=True):
