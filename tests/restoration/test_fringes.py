@@ -144,10 +144,16 @@ def test_an_escape_of_a_mask_changes_them(wide):
 
 
 def test_a_descent_does_not_find_them(wide):
-    """Which is why they are tried: it ends at a higher cost."""
+    """Which is why they are tried: for four frames, with each hole off by a wave either way, it ends at a higher cost.
+
+    By chance it finds one now and then: one of the 40 was seen, where the aberrations are those of other signs of
+    eigenvectors, as processors differ in these. At that rate more than four are found in 0.4 % of all cases (Poisson).
+    """
     objective, state = wide
-    lost = off(objective, state, [[0, 1, 0, 0, 0], [0, 0, 0, -1, 0], [0, 0, 1, 0, 0], [0, 0, 0, 0, -1]])
     alone = objective.with_changes(free=Free.ABERRATIONS)
-    ended = descend(alone, lost, 200, ProjectedLBFGS(), lambda *told: None)
-    least = objective.frame_costs(state.image, state.z, state.calibration)
-    assert (objective.frame_costs(ended.image, ended.z, ended.calibration) > least + 1).all()
+    least, higher = objective.frame_costs(state.image, state.z, state.calibration), 0
+    for hole, wave in itertools.product(range(5), (-1, 1)):
+        lost = off(objective, state, [[wave if other == hole else 0 for other in range(5)]] * 4)
+        ended = descend(alone, lost, 200, ProjectedLBFGS(), lambda *told: None)
+        higher += int((objective.frame_costs(ended.image, ended.z, ended.calibration) > least + 1).sum())
+    assert higher >= 40 - 4
