@@ -19,7 +19,7 @@ from torchmask.restoration.background import Background
 from torchmask.restoration.baselines import average_psf, shift_and_add
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.objective import MyopicObjective
-from torchmask.restoration.priors import TotalVariation
+from torchmask.restoration.variation import TotalVariation
 from torchmask.restoration.wiener import multiframe_wiener
 from torchmask.spectra import NoisePSD, PowerLawPSD
 

@@ -23,7 +23,7 @@ from torchmask.restoration.cuda_graphs import graphed
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.objective import MyopicObjective
-from torchmask.restoration.priors import TotalVariation
+from torchmask.restoration.variation import TotalVariation
 
 
 def seconds(function: Callable[[], object], device: str, repeats: int) -> float:

@@ -62,7 +62,7 @@ from torchmask.optics.pupil import Aperture
 from torchmask.planning.bounds import myopic_bound
 from torchmask.record import Callback
 from torchmask.restoration.myopic import MyopicDeconvolution
-from torchmask.restoration.priors import TotalVariation
+from torchmask.restoration.variation import TotalVariation
 from torchmask.simulation.exposures import simulate_observation
 from torchmask.spectra import NoisePSD, PowerLawPSD
 

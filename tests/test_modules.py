@@ -30,8 +30,9 @@ from torchmask.restoration.aberrations import AberrationBasis, plain_basis
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.given_prior import FunctionPrior
 from torchmask.restoration.objective import MyopicObjective
-from torchmask.restoration.priors import EdgePreserving, ObjectPrior, SmoothVariation, TotalVariation
+from torchmask.restoration.priors import EdgePreserving, ObjectPrior
 from torchmask.restoration.pupil import SampledPupil
+from torchmask.restoration.variation import SmoothVariation, TotalVariation
 from torchmask.spectra import NoisePSD, PowerLawPSD
 
 GRID = Grid.nyquist(1.0, 550e-9, 32)

@@ -41,8 +41,9 @@ from torchmask.planning.success import BlindOutlook, SuccessMap, success_map
 from torchmask.restoration.baselines import average_psf, shift_and_add
 from torchmask.restoration.many import restore_many
 from torchmask.restoration.myopic import MyopicDeconvolution
-from torchmask.restoration.priors import EdgePreserving, SmoothVariation, TotalVariation
+from torchmask.restoration.priors import EdgePreserving
 from torchmask.restoration.result import RestorationResult
+from torchmask.restoration.variation import SmoothVariation, TotalVariation
 from torchmask.restoration.wiener import multiframe_wiener
 from torchmask.simulation.conditions import Conditions
 from torchmask.simulation.dataset import StackDataset, StackRanges

@@ -82,7 +82,7 @@ def test_relative_mse_is_1_for_a_restoration_of_nothing():
 
 
 def test_tv_is_isotropic_and_its_corner_is_rounded_by_epsilon():
-    from torchmask.restoration.priors import TotalVariation
+    from torchmask.restoration.variation import TotalVariation
 
     image = torch.zeros(8, 8, dtype=torch.float64)
     image[3, 4] = 2.0

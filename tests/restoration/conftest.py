@@ -17,9 +17,9 @@ from torchmask.restoration.aberrations import AberrationBasis, turbulent_basis
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.objective import MyopicObjective
-from torchmask.restoration.priors import TotalVariation
 from torchmask.restoration.result import RestorationResult
 from torchmask.restoration.state import Calibration, State
+from torchmask.restoration.variation import TotalVariation
 from torchmask.simulation.exposures import simulate_observation
 
 R0, OUTER_SCALE, READOUT = 0.25, 20.0, 1.5

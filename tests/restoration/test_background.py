@@ -13,8 +13,8 @@ from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.objective import MyopicObjective
-from torchmask.restoration.priors import TotalVariation
 from torchmask.restoration.state import Calibration, State
+from torchmask.restoration.variation import TotalVariation
 from torchmask.restoration.verdict import Finding
 
 GRID = Grid((12, 15), 2.3e-7, 550e-9)

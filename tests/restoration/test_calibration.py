@@ -21,8 +21,8 @@ from torchmask.restoration.calibration import (
 )
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.objective import Free, MyopicObjective
-from torchmask.restoration.priors import TotalVariation
 from torchmask.restoration.state import Calibration, State
+from torchmask.restoration.variation import TotalVariation
 
 GRID = Grid((16, 18), 2.3e-7, 550e-9)
 TRANSMISSION = torch.tensor([0.7, 0.9, 1.1, 1.3], dtype=torch.float64)

@@ -17,9 +17,9 @@ from torchmask.restoration.candidates import Candidates, play_stage, select, sev
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.objective import MyopicObjective
-from torchmask.restoration.priors import TotalVariation
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.state import Calibration, State
+from torchmask.restoration.variation import TotalVariation
 from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
 

@@ -19,12 +19,13 @@ from torchmask.restoration.given_prior import as_prior
 from torchmask.restoration.minimizers import TorchMinimizer
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.objective import Free, MyopicObjective
-from torchmask.restoration.priors import EdgePreserving, TotalVariation
+from torchmask.restoration.priors import EdgePreserving
 from torchmask.restoration.projected_lbfgs import ProjectedLBFGS
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.solver import Solver
 from torchmask.restoration.state import Calibration, State
 from torchmask.restoration.traits import Refinement
+from torchmask.restoration.variation import TotalVariation
 
 CPU = torch.device("cpu")
 

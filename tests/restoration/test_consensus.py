@@ -16,10 +16,10 @@ from torchmask.restoration.escapes import tilt
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.objective import MyopicObjective
-from torchmask.restoration.priors import TotalVariation
 from torchmask.restoration.projected_lbfgs import ProjectedLBFGS
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.state import Calibration, State
+from torchmask.restoration.variation import TotalVariation
 
 PUPIL, FRAMES, NOISE = FullAperture(1.0), 3, 0.03
 GRID = Grid.nyquist(1.0, 550e-9, 32, oversampling=1.2)

@@ -12,9 +12,10 @@ from torchmask.restoration import cross_validation
 from torchmask.restoration.cross_validation import choose_prior
 from torchmask.restoration.descent import descend
 from torchmask.restoration.objective import Free
-from torchmask.restoration.priors import ObjectPrior, SmoothVariation, TotalVariation
+from torchmask.restoration.priors import ObjectPrior
 from torchmask.restoration.projected_lbfgs import ProjectedLBFGS
 from torchmask.restoration.state import Calibration, State
+from torchmask.restoration.variation import SmoothVariation, TotalVariation
 
 SHAPE = (6, 8)
 

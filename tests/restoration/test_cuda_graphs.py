@@ -12,9 +12,10 @@ from torchmask.restoration.cuda_graphs import Captured, Graphed, graphed, shared
 from torchmask.restoration.descent import descend
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.objective import Free, MyopicObjective
-from torchmask.restoration.priors import ObjectPrior, TotalVariation
+from torchmask.restoration.priors import ObjectPrior
 from torchmask.restoration.projected_lbfgs import ProjectedLBFGS, minimize_bounded
 from torchmask.restoration.state import State
+from torchmask.restoration.variation import TotalVariation
 
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 

@@ -23,7 +23,7 @@ from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.motion import Setting
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.objective import Free, MyopicObjective
-from torchmask.restoration.priors import EdgePreserving, SmoothVariation, TotalVariation
+from torchmask.restoration.priors import EdgePreserving
 from torchmask.restoration.projected_lbfgs import Minimum, ProjectedLBFGS
 from torchmask.restoration.recipe import ModelRecipe
 from torchmask.restoration.schedule import Schedule
@@ -31,6 +31,7 @@ from torchmask.restoration.slopes import gradient, rate_of_descent, rate_of_slop
 from torchmask.restoration.solver import Solver
 from torchmask.restoration.spectrum import Power
 from torchmask.restoration.traits import End, Refinement, Traits
+from torchmask.restoration.variation import SmoothVariation, TotalVariation
 from torchmask.simulation.scene import SceneOptions, make_scene
 
 BLIND = Free.OBJECT | Free.ABERRATIONS | Free.COMMON

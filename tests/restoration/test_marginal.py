@@ -13,11 +13,11 @@ from torchmask.restoration.descent import descend
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.marginal import integrate_aberrations
 from torchmask.restoration.objective import Free, MyopicObjective
-from torchmask.restoration.priors import TotalVariation
 from torchmask.restoration.projected_lbfgs import ProjectedLBFGS, minimize_bounded
 from torchmask.restoration.sampler import AberrationSampler, laplace_precision
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.state import Calibration, State
+from torchmask.restoration.variation import TotalVariation
 
 GRID = Grid.nyquist(1.0, 550e-9, 32, oversampling=1.2)
 BRIEF = Schedule(moves=3, renewal=2, segment=3)

@@ -12,8 +12,8 @@ from torchmask.restoration.background import Background
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.model_error import LeftOut, expected_error
 from torchmask.restoration.objective import Free, MyopicObjective
-from torchmask.restoration.priors import TotalVariation
 from torchmask.restoration.state import Calibration, State
+from torchmask.restoration.variation import TotalVariation
 
 
 @pytest.mark.parametrize(("n_modes", "noll", "beyond"), [(3, 0.134, 0.0164), (6, 0.0648, 0.0132)])

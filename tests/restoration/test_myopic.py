@@ -13,8 +13,8 @@ from torchmask.metrics import relative_error
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.restoration.minimizers import TorchMinimizer
 from torchmask.restoration.myopic import MyopicDeconvolution
-from torchmask.restoration.priors import TotalVariation
 from torchmask.restoration.schedule import Schedule
+from torchmask.restoration.variation import TotalVariation
 
 
 def errors(observation, image):

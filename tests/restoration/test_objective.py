@@ -14,8 +14,9 @@ from torchmask.restoration.adjoint import data_fidelity
 from torchmask.restoration.background import Background
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.objective import Free, MyopicObjective
-from torchmask.restoration.priors import EdgePreserving, TotalVariation
+from torchmask.restoration.priors import EdgePreserving
 from torchmask.restoration.state import LEAST_TRANSMISSION, Calibration
+from torchmask.restoration.variation import TotalVariation
 
 GRID = Grid((12, 15), 2.3e-7, 550e-9)
 THERE = [[0.05, 0.28], [0.21, -0.27], [-0.33, 0.02]]

@@ -10,7 +10,7 @@ from torchmask.restoration.adjoint import data_fidelity
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.linearization import Linearization
 from torchmask.restoration.objective import MyopicObjective
-from torchmask.restoration.priors import TotalVariation
+from torchmask.restoration.variation import TotalVariation
 
 GRID = Grid((12, 15), 2.3e-7, 550e-9)
 MASK = SparseAperture([[0.0, 0.3], [0.3, -0.2], [-0.3, -0.15]], 0.36, 1.0)

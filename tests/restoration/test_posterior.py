@@ -22,11 +22,11 @@ from torchmask.restoration.posterior import (
     _prior_noise,
     _sample,
     evenness,
-    smooth,
 )
-from torchmask.restoration.priors import TotalVariation
 from torchmask.restoration.slopes import divergence, gradient
 from torchmask.restoration.state import Calibration, State
+from torchmask.restoration.structure import smooth
+from torchmask.restoration.variation import TotalVariation
 from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
 

@@ -8,13 +8,9 @@ import torch
 from torch import nn
 
 from torchmask.restoration.given_prior import FunctionPrior, as_prior, check_prior
-from torchmask.restoration.priors import (
-    EdgePreserving,
-    ObjectPrior,
-    SmoothVariation,
-    TotalVariation,
-)
+from torchmask.restoration.priors import EdgePreserving, ObjectPrior
 from torchmask.restoration.slopes import divergence, gradient
+from torchmask.restoration.variation import SmoothVariation, TotalVariation
 
 
 def squares(image):

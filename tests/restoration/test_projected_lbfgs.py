@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import Bounds, minimize
 
-from torchmask.restoration.priors import TotalVariation
 from torchmask.restoration.projected_lbfgs import ProjectedLBFGS, minimize_bounded
+from torchmask.restoration.variation import TotalVariation
 
 
 def bowl(seed, n, dtype=torch.float64):

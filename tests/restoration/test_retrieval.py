@@ -20,13 +20,13 @@ from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.frame_retrieval import Trial, parameters_of_fields, retrieve_frames
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.objective import Free, MyopicObjective
-from torchmask.restoration.priors import TotalVariation
 from torchmask.restoration.projected_lbfgs import ProjectedLBFGS
 from torchmask.restoration.reflections import LAST, STEPS, retrieve_fields
 from torchmask.restoration.retrieval import retrieve_lost_frames, retrieve_phases
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.state import Calibration, State
 from torchmask.restoration.traits import Refinement, Traits
+from torchmask.restoration.variation import TotalVariation
 
 PUPIL, GRID, MODES, NOISE = FullAperture(1.0), Grid.nyquist(1.0, 550e-9, 32), 21, 0.01
 

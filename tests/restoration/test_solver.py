@@ -21,13 +21,13 @@ from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.objective import Free
-from torchmask.restoration.priors import TotalVariation
 from torchmask.restoration.projected_lbfgs import Minimum, ProjectedLBFGS
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.slopes import rate_of_slopes
 from torchmask.restoration.solver import Solver
 from torchmask.restoration.starts import Known
 from torchmask.restoration.traits import End, Refinement, Traits
+from torchmask.restoration.variation import TotalVariation
 from torchmask.restoration.verdict import Finding
 
 ALL_MISSED = {"chance": -1e9}  # no fit is good enough

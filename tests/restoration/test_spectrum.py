@@ -13,10 +13,10 @@ from torchmask.restoration.change import Change
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.objective import MyopicObjective
-from torchmask.restoration.priors import TotalVariation
 from torchmask.restoration.slopes import gradient, rate_of_descent, rate_of_slopes
 from torchmask.restoration.spectrum import Power, power_of_slopes, rate_at_end, rate_in_search, shows_gentle_slopes
 from torchmask.restoration.state import State
+from torchmask.restoration.variation import TotalVariation
 
 N_OBJECTS = 40
 DARK = 5.0  # objects fall off as exp(-DARK r^2), with r = 1 in the middle of each side

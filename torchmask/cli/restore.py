@@ -32,8 +32,8 @@ from torchmask.observation import Observation
 from torchmask.restoration.background import Background
 from torchmask.restoration.many import restore_in_turn
 from torchmask.restoration.myopic import MyopicDeconvolution
-from torchmask.restoration.priors import TotalVariation
 from torchmask.restoration.result import RestorationResult
+from torchmask.restoration.variation import TotalVariation
 
 REFINEMENTS = {"if-seen": None, "yes": True, "no": False}
 SKIES = {

@@ -25,7 +25,7 @@ from torchmask.restoration.frames import Array, FrameStack
 from torchmask.restoration.given_prior import as_prior, check_prior
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.parallel import each_on_a_core
-from torchmask.restoration.priors import ObjectPrior, TotalVariation
+from torchmask.restoration.priors import ObjectPrior
 from torchmask.restoration.projected_lbfgs import Minimizer, ProjectedLBFGS
 from torchmask.restoration.recipe import FULL_MODES, ModelRecipe
 from torchmask.restoration.result import RestorationResult
@@ -33,6 +33,7 @@ from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.solver import Solver
 from torchmask.restoration.starts import Known
 from torchmask.restoration.traits import Refinement, Traits, check_numbers, check_samples
+from torchmask.restoration.variation import TotalVariation
 
 
 class MyopicDeconvolution:
@@ -63,8 +64,7 @@ class MyopicDeconvolution:
     readout_noise : float, optional
         Read-out noise [electrons rms per pixel]. None: the noise is measured beyond the cut-off frequency.
     wavelengths : sequence of float, optional
-        Wavelengths [m] that represent a broad band. None: that of the grid. Coefficients are in rad at the wavelength
-        of the grid; path differences are the same at all wavelengths.
+        Wavelengths [m] that represent a broad band. None: that of the grid, at which coefficients are in rad anyway.
     weights : sequence of float, optional
         Relative flux at each wavelength, any positive numbers. None: equal.
     static_modes : int

@@ -94,7 +94,7 @@ class MyopicObjective(nn.Module):
     --------
     >>> from torchmask.grid import Grid
     >>> from torchmask.optics.aperture import SparseAperture
-    >>> from torchmask.restoration.priors import TotalVariation
+    >>> from torchmask.restoration.variation import TotalVariation
     >>> mask = SparseAperture([[0.0, 0.3], [-0.3, -0.2], [0.3, -0.2]], 0.2, 1.0)
     >>> model = ExposureModel(mask, Grid.nyquist(1.0, 550e-9, 32), 3)
     >>> frames = torch.rand(4, 32, 32, dtype=torch.float64)

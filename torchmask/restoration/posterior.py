@@ -28,6 +28,7 @@ from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.placement import slopes_of_frames
 from torchmask.restoration.slopes import divergence, gradient
 from torchmask.restoration.state import State
+from torchmask.restoration.structure import smooth
 
 _REACH = 0.7  # smoothing of the gradients' variance [1 / cut-off]: 0.5 to 1.4 tried, see docs/tried.md
 _ROUNDS, _FEW = 3, 6  # rounds and samples of expectation maximisation; few suffice, as they are smoothed
@@ -219,10 +220,3 @@ def _filter(x: Tensor, response: Tensor) -> Tensor:
 def _energy(image: Tensor) -> Tensor:
     dy, dx = gradient(image)
     return dy**2 + dx**2
-
-
-def smooth(image: Tensor, width: float) -> Tensor:
-    """Convolve images (..., H, W) periodically with a Gaussian of standard deviation `width` [pixels]."""
-    nu_y = torch.fft.fftfreq(image.shape[-2], dtype=image.dtype, device=image.device)[:, None]
-    nu_x = torch.fft.rfftfreq(image.shape[-1], dtype=image.dtype, device=image.device)
-    return _filter(image, torch.exp(-2 * (math.pi * width) ** 2 * (nu_y**2 + nu_x**2)))
