@@ -188,6 +188,45 @@ def test_aberrations_are_integrated_out_after_the_last_descent_or_in_its_place(e
 
 
 @pytest.mark.parametrize(
+    ("end", "descends", "integrates"),
+    [
+        (End.LAST_DESCENT, True, None),
+        (End.FULL_PUPIL, True, None),
+        (End.OBJECT, True, None),
+        (End.BOTH, False, True),
+        (End.INTEGRATION, None, False),
+    ],
+)
+def test_which_priors_are_adapted_to_the_object(end, descends, integrates, explained, monkeypatch):
+    """That of a descent to the object before each of its segments, that of an integration to what a descent has left:
+    it is neither adapted in the descent before, nor where the search has ended in faint frames."""
+    objective, state = explained
+    asked, told = {True: set(), False: set()}, []
+    monkeypatch.setattr(SmoothVariation, "adapted_to", lambda self, image, reach: told.append((image, reach)) or self)
+    descend, integrate = finish.descend, finish.integrate_aberrations
+
+    def look_at_descent(objective, state, *rest):
+        asked[True].add(any(image is state.image for image, _ in told))
+        return descend(objective, state, *rest)
+
+    def look_at_integration(objective, state, *rest, **more):
+        asked[False].add(any(image is state.image for image, _ in told))
+        return integrate(objective, state, *rest, **more)
+
+    monkeypatch.setattr(finish, "descend", look_at_descent)
+    monkeypatch.setattr(finish, "integrate_aberrations", look_at_integration)
+    monkeypatch.setattr(finish, "settle", lambda objective, state, n_iterations: state)
+    schedule = Schedule(segment=4, last_segments=2, last_gain=0.0, last_gain_full=0.0, rounds=2, fine_rounds=2, moves=1)
+    traits = FULL_PUPIL if end is End.FULL_PUPIL else TRAITS
+    ended(objective, state, Setting.of(objective), schedule, traits=traits, end=end)
+    assert asked == {
+        True: set() if descends is None else {descends},
+        False: set() if integrates is None else {integrates},
+    }
+    assert {reach for _, reach in told} <= {0.5 / objective.model.cutoff}
+
+
+@pytest.mark.parametrize(
     ("prior", "rate", "n_segments"),
     [
         (TotalVariation(0.5), 0.3, 3),
@@ -410,10 +449,10 @@ def test_a_result_holds_the_modes_of_the_search(observe, five_holes):
     result = method.restore(seen.frames, callback=lambda record: stages.append(record.stage))
     assert stages == 20 * ["restoration"] + 10 * ["last descent"]
     assert result.coefficients.shape == (2, 5, method.n_modes) == (2, 5, 6)
-    assert "SmoothVariation" in result.prior
+    assert "AdaptedVariation" in result.prior
     assert method.restore(seen.frames, start=result).coefficients.shape == (2, 5, 6)
     known = method.restore(seen.frames, coefficients=result.coefficients)
-    assert "SmoothVariation" in known.prior
+    assert "AdaptedVariation" in known.prior
 
 
 @pytest.mark.parametrize("traits", [TRAITS, FULL_PUPIL])

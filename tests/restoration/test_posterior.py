@@ -25,7 +25,6 @@ from torchmask.restoration.posterior import (
 )
 from torchmask.restoration.slopes import divergence, gradient
 from torchmask.restoration.state import Calibration, State
-from torchmask.restoration.structure import smooth
 from torchmask.restoration.variation import TotalVariation
 from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
@@ -50,14 +49,6 @@ def problem(mask, n_common=0, free=Free.OBJECT | Free.ABERRATIONS | Free.COMMON,
 
 def power_of(stated, state):
     return stated.object_quadratic(state.image, state.z, state.calibration)[1]
-
-
-def test_smooth_is_a_gaussian_of_that_width():
-    point = torch.zeros(64, 48, dtype=torch.float64)
-    point[20, 30] = 1
-    y, x = torch.meshgrid(torch.arange(64.0) - 20, torch.arange(48.0) - 30, indexing="ij")
-    expected = torch.exp(-(y**2 + x**2) / (2 * 3.0**2)) / (2 * math.pi * 3.0**2)
-    torch.testing.assert_close(smooth(point, 3.0), expected.double(), rtol=0, atol=1e-8)  # float32 distances
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-12, 1e9])

@@ -10,7 +10,7 @@ from torch import nn
 from torchmask.restoration.given_prior import FunctionPrior, as_prior, check_prior
 from torchmask.restoration.priors import EdgePreserving, ObjectPrior
 from torchmask.restoration.slopes import divergence, gradient
-from torchmask.restoration.variation import SmoothVariation, TotalVariation
+from torchmask.restoration.variation import AdaptedVariation, SmoothVariation, TotalVariation
 
 
 def squares(image):
@@ -50,11 +50,32 @@ class Ridge(ObjectPrior):
         return 0.7 * (image**2).sum()
 
 
+class AdaptedToAnother(ObjectPrior):
+    """An `AdaptedVariation`, made for images of any size, adapted to one that is steeper to the right and below."""
+
+    def forward(self, image):
+        return self.for_images_like(image)(image)
+
+    def value_and_gradient(self, image):
+        return self.for_images_like(image).value_and_gradient(image)
+
+    def curvature(self, image):
+        return self.for_images_like(image).curvature(image)
+
+    @staticmethod
+    def for_images_like(image):
+        other = rough(*image.shape, seed=7).cumsum(0).cumsum(1).to(image.dtype)
+        found = SmoothVariation(0.7, 0.4, 0.05).adapted_to(other, 1.0)
+        assert isinstance(found, AdaptedVariation)
+        return found
+
+
 PRIORS = {
     "total variation": TotalVariation,
     "smoother total variation": lambda: TotalVariation(2.0, 0.3),
     "total variation with bends": SmoothVariation,
     "more bends": lambda: SmoothVariation(0.3, 2.0, 0.1),
+    "adapted to another image": AdaptedToAnother,
     "edge preserving": EdgePreserving,
     "edge preserving, other threshold": lambda: EdgePreserving(0.7, 0.1),
     "function": lambda: squares,
@@ -112,7 +133,9 @@ def test_curvature_majorises_or_is_the_diagonal_of_the_hessian(make):
         assert bool((found.flatten() >= exact - 1e-12).all())
 
 
-@pytest.mark.parametrize("make", [TotalVariation, partial(TotalVariation, 2.0, 0.3), SmoothVariation, EdgePreserving])
+@pytest.mark.parametrize(
+    "make", [TotalVariation, partial(TotalVariation, 2.0, 0.3), SmoothVariation, AdaptedToAnother, EdgePreserving]
+)
 def test_curvature_majorises(make):
     """A quadratic in one pixel with that curvature lies above the prior everywhere and touches it at the image."""
     prior = make()
@@ -157,6 +180,34 @@ def test_bends_of_known_images():
     even = torch.arange(6, dtype=torch.float64) + 2 * torch.arange(5, dtype=torch.float64)[:, None]
     inside = SmoothVariation(1.0, 1e3).value_and_gradient(even)[1][2, 2:4]  # nothing pulls at an even slope
     assert float(inside.abs().max()) < 1e-12
+
+
+def test_an_adapted_variation_takes_less_from_edges_and_more_from_noise():
+    """An edge, seen through noise: its own slopes cost less than they did, those of the noise alone more."""
+    edge = torch.zeros(32, 32, dtype=torch.float64)
+    edge[8:24, 8:24] = 5.0
+    noise = 0.1 * rough(32, 32)
+    prior = SmoothVariation(2.0, 0.1)
+    found = prior.adapted_to(edge + noise, 1.0)
+    assert (found.weight, found.bending, found.epsilon) == (2.0, 0.1, 0.01)
+    assert float(found(edge)) < 0.9 * float(prior(edge))
+    assert float(found(noise)) > 2 * float(prior(noise))
+    assert repr(found) == "AdaptedVariation(weight=2, bending=0.1, epsilon=0.01)"
+
+
+def test_an_adapted_variation_costs_what_it_did_for_its_own_object():
+    """Without bends, and up to the smoothing of slopes by epsilon."""
+    image = rough(12, 13)
+    prior = SmoothVariation(2.0, 1e-9, 1e-9)
+    assert float(prior.adapted_to(image, 1.0)(image)) == pytest.approx(float(prior(image)), rel=1e-6)
+
+
+def test_what_is_adapted_to_an_even_object_stays_as_it_is():
+    even = torch.full((6, 7), 2.0, dtype=torch.float64)
+    for prior in (SmoothVariation(), TotalVariation(), EdgePreserving(), as_prior(squares)):
+        assert prior.adapted_to(even, 1.0) is prior
+    for prior in (TotalVariation(), EdgePreserving(), as_prior(squares)):
+        assert prior.adapted_to(rough(), 1.0) is prior
 
 
 def test_a_variation_suited_to_an_object_has_the_scale_of_its_gradients():

@@ -36,6 +36,8 @@ from torchmask.restoration.spectrum import is_too_steep, rate_at_end, shows_gent
 from torchmask.restoration.state import State
 from torchmask.restoration.traits import End, Traits
 
+_REACH = 0.5  # width over which the structure of an object is taken [resolution elements]: 0.35 to 2.5 tried
+
 
 @dataclass(frozen=True)
 class Finisher:
@@ -66,7 +68,10 @@ class Finisher:
             known = {"seed": self.traits.seed, "follow_r0": self.traits.r0_is_open}
             gentle = shows_gentle_slopes(objective, ended.state, self.change)
             astray = gentle and is_too_steep(objective, ended.state)
-            objective = objective.with_changes(prior=self._suited(prior, ended.state, gentle=gentle))
+            prior = self._suited(prior, ended.state, gentle=gentle)
+            # what a search finds in faint frames follows noise, a last descent finds more of the object
+            prior = _adapted(prior, objective, ended.state) if end.descends else prior
+            objective = objective.with_changes(prior=prior)
             ended.state, spent = integrate_aberrations(objective, ended.state, rounds, *how, **known, astray=astray)
             ended.n_evaluations += spent
             ended.integrated = True
@@ -89,9 +94,12 @@ class Finisher:
         chosen = self._choose_for_all(first, ended.state, end)
 
         def prior_of(state: State) -> ObjectPrior:
-            if chosen is not None:
-                return chosen
-            return choose_prior(objective, state, first.prior.choices(rate_of_slopes(state.image)), schedule.comparing)
+            prior = chosen
+            if prior is None:
+                choices = first.prior.choices(rate_of_slopes(state.image))
+                prior = choose_prior(objective, state, choices, schedule.comparing)
+            # an integration finds an object of its own, after a descent that has not been led by what noise looks like
+            return prior if end.integrates else _adapted(prior, objective, state)
 
         def listen(cost: float, evaluations: int, variables: Variables) -> None:
             costs.append(cost)
@@ -171,6 +179,11 @@ class Finisher:
         # the sharper the object, the more it matters where it lies on the pixels
         found = centre_on_pixels(objective, self._recalibrate(objective, found), self.schedule)
         return settle(objective, found, self.schedule.last_settling)
+
+
+def _adapted(prior: ObjectPrior, objective: MyopicObjective, state: State) -> ObjectPrior:
+    """Return the prior that suits the structure of the object, down to half a resolution element."""
+    return prior.adapted_to(state.image, _REACH / objective.model.cutoff)
 
 
 def _chi_square(objective: MyopicObjective, state: State) -> float:

@@ -77,6 +77,13 @@ class ObjectPrior(nn.Module):
         """
         return (self,)
 
+    def adapted_to(self, image: Tensor, reach: float) -> ObjectPrior:
+        """Return the prior that suits the structure of an object (H', W') near the true one, as far as it is known.
+
+        `reach` is the width of what the object shows [pixels]. It is `self` if it does not depend on that.
+        """
+        return self
+
 
 class EdgePreserving(ObjectPrior):
     """Penalty that is quadratic in small slopes and linear in edges, so smooth shading remains smooth.

@@ -1,11 +1,67 @@
-"""Local means of an image."""
+"""How steep an image is around each pixel and in which direction: its structure tensor, and a metric that evens it out.
+
+The structure tensor is the local mean of g g^T, with g the gradient: across an edge it is large, along it small
+(Foerstner & Guelch, Proc. ISPRS Intercommission Conf. Interlaken, 281, 1987).
+"""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
+
+from torchmask.restoration.slopes import gradient
+
+_POWER = 0.7  # of the local slope: 0 leaves slopes as they are, 1 makes all alike; 0.5 to 1 tried
+_LEAST = 0.05  # local slope, in units of the mean one, below which an image counts as even: 0.02 to 0.2 tried
+
+
+class Metric(NamedTuple):
+    """By how much slopes count around each pixel, all (H', W'): g as |M g|, with the symmetric matrix M, bends by size.
+
+    yy, xy, xx : the elements of M
+    size : by how much bends count
+    """
+
+    yy: Tensor
+    xy: Tensor
+    xx: Tensor
+    size: Tensor
+
+    def of(self, dy: Tensor, dx: Tensor) -> tuple[Tensor, Tensor]:
+        """Return M times (dy, dx)."""
+        return self.yy * dy + self.xy * dx, self.xy * dy + self.xx * dx
+
+
+def even_metric(image: Tensor, reach: float) -> Metric | None:
+    """Return the metric in which the slopes of `image` (H', W') are more even; None if it has none.
+
+    M is the structure tensor, over `reach` pixels, to the power -0.35: a slope of the local root mean square in its
+    direction counts by that to the power -0.7, bends by its mean over all directions. Both are scaled so that all
+    slopes of the image together cost as much as they did.
+    """
+    dy, dx = gradient(image)
+    length = torch.hypot(dy, dx)
+    total = length.sum()
+    if not total > 0:
+        return None
+    yy, xx, xy = smooth(torch.stack([dy * dy, dx * dx, dy * dx]), reach)
+    mean, half = (yy + xx) / 2, (yy - xx) / 2
+    spread = torch.hypot(half, xy)
+    steepest = (mean * length).sum() / total
+
+    def counts(square: Tensor) -> Tensor:
+        return (square / steepest).clamp(min=_LEAST**2) ** (-_POWER / 2)
+
+    across, along, size = counts(mean + spread), counts(mean - spread), counts(mean)
+    straight = torch.where(spread > 0, (across - along) / 2 / spread.clamp(min=torch.finfo(spread.dtype).tiny), 0.0)
+    level = (across + along) / 2
+    metric = Metric(level + straight * half, straight * xy, level - straight * half, size)
+    scale = total / torch.hypot(*metric.of(dy, dx)).sum()
+    size = size * total / (size * length).sum()
+    return Metric(scale * metric.yy, scale * metric.xy, scale * metric.xx, size)
 
 
 def smooth(image: Tensor, width: float) -> Tensor:
