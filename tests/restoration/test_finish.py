@@ -31,7 +31,7 @@ from torchmask.restoration.slopes import gradient, rate_of_descent, rate_of_slop
 from torchmask.restoration.solver import Solver
 from torchmask.restoration.spectrum import Power
 from torchmask.restoration.traits import End, Refinement, Traits
-from torchmask.restoration.variation import SmoothVariation, TotalVariation
+from torchmask.restoration.variation import AdaptedVariation, SmoothVariation, TotalVariation
 from torchmask.simulation.scene import SceneOptions, make_scene
 
 BLIND = Free.OBJECT | Free.ABERRATIONS | Free.COMMON
@@ -198,8 +198,8 @@ def test_aberrations_are_integrated_out_after_the_last_descent_or_in_its_place(e
     ],
 )
 def test_which_priors_are_adapted_to_the_object(end, descends, integrates, explained, monkeypatch):
-    """That of a descent to the object before each of its segments, that of an integration to what a descent has left:
-    it is neither adapted in the descent before, nor where the search has ended in faint frames."""
+    """That of a descent, before each of its segments, and that of an integration after one: neither in the descent
+    before it, nor where the search has ended in faint frames."""
     objective, state = explained
     asked, told = {True: set(), False: set()}, []
     monkeypatch.setattr(SmoothVariation, "adapted_to", lambda self, image, reach: told.append((image, reach)) or self)
@@ -294,6 +294,33 @@ def test_an_object_that_is_steeper_than_its_gentle_slopes_is_integrated_as_astra
     assert told == [gentle and too_steep]
 
 
+def test_a_prior_is_adapted_to_an_object_that_is_settled_under_itself(explained, monkeypatch):
+    """Never to one that was settled under an adapted prior, whose edges are sharper already."""
+    objective, state = explained
+    asked, settled = [], []
+    adapted_to, settle = SmoothVariation.adapted_to, finish.settle
+
+    def adapt(self, image, reach):
+        asked.append((self, image))
+        return adapted_to(self, image, reach)
+
+    def look(objective, state, n_iterations):
+        found = settle(objective, state, n_iterations)
+        settled.append((objective.prior, found.image, n_iterations))
+        return found
+
+    monkeypatch.setattr(SmoothVariation, "adapted_to", adapt)
+    monkeypatch.setattr(finish, "settle", look)
+    schedule = Schedule(segment=4, last_segments=2, last_gain=0.0, last_settling=5, lost=math.inf)
+    found, _ = ended(objective, state, Setting.of(objective), schedule)
+    assert isinstance(found.prior, AdaptedVariation)
+    plain = [(prior, image) for prior, image, _ in settled if not isinstance(prior, AdaptedVariation)]
+    assert len(plain) == 3  # before two segments and after them
+    for prior, image in plain:
+        assert any(one is prior and other is image for one, other in asked)
+    assert {n_iterations for *_, n_iterations in settled} == {5}
+
+
 def test_nothing_follows_the_search_of_a_schedule_without_last_segments(observe, five_holes):
     assert End.of(math.inf, TRAITS, Schedule(), BLIND) is End.LAST_DESCENT
     assert End.of(10.0, TRAITS, Schedule(last_segments=0), BLIND) is End.NONE
@@ -381,9 +408,14 @@ def test_the_frames_choose_the_prior_of_each_segment_and_of_the_end(explained, f
     ended(objective, begun, setting, schedule, end=End.BOTH)
 
 
-@pytest.mark.parametrize(("end", "expected"), [(End.LAST_DESCENT, [0.9, 0.9, 0.9]), (End.BOTH, [0.5, 0.5, 0.5])])
-def test_the_last_descent_has_the_prior_of_the_object_that_the_search_has_found(end, expected, explained, monkeypatch):
-    """It is heavier than that of its slopes, whatever these become under it; an integration has that of its own."""
+@pytest.mark.parametrize(
+    ("end", "expected", "last"), [(End.LAST_DESCENT, 6 * [0.9], None), (End.BOTH, 3 * [0.5], 0.675)]
+)
+def test_the_last_descent_has_the_prior_of_the_object_that_the_search_has_found(
+    end, expected, last, explained, monkeypatch
+):
+    """It is heavier than that of its slopes, whatever these become under it; an integration has that of its own. Either
+    is adapted to an object that is settled under it."""
     objective, state = explained
     weights = []
 
@@ -412,7 +444,7 @@ def test_the_last_descent_has_the_prior_of_the_object_that_the_search_has_found(
 
     monkeypatch.setattr(finish, "integrate_aberrations", integrate)
     found, progress = ended(objective, begun, Setting.of(objective), schedule, end=end)
-    assert weights == pytest.approx(expected, rel=1e-9)
+    assert weights == pytest.approx([*expected, last] if last else expected, rel=1e-9)
     assert integrated == ([found.prior] if end.integrates else [])
     assert found.prior.weight == pytest.approx(0.675 if end.integrates else 0.9, rel=1e-9)
     assert isinstance(found.prior, SmoothVariation)
@@ -420,7 +452,7 @@ def test_the_last_descent_has_the_prior_of_the_object_that_the_search_has_found(
     weights.clear()
     interrupted = replace(begun, image=begun.image / 2)
     ended(objective, begun, Setting.of(objective), schedule, end=end, finer=interrupted)
-    assert weights == pytest.approx(expected, rel=1e-9)
+    assert weights == pytest.approx([*expected, 2 * last] if last else expected, rel=1e-9)
 
 
 @pytest.mark.parametrize("end", [End.INTEGRATION, End.BOTH])
@@ -611,8 +643,13 @@ def test_lost_frames_are_looked_for_between_segments(change, calls, observe, fiv
     whole = method.restore(seen.frames, callback=records.append)
     assert tried == calls
     assert 1000 * len(calls) < whole.n_evaluations < 1000 * len(calls) + 1000
-    if not seen.aperture.is_full:
-        assert calls_of == n_found * bool(calls) * ["centre_on_pixels", "settle"] + ["settle"]  # this at the end
+    n_segments = sum(record.stage == "last descent" for record in records) // 4
+    if not seen.aperture.is_full:  # its prior is adapted to an object settled before each segment, and at the end
+        moved = [["centre_on_pixels", "settle"]] * (n_found * bool(calls)) + [[]] * n_segments
+        adapted = [name for number in range(n_segments) for name in ["settle", *moved[number]]]
+        integrated = "integrated" in whole.message  # the prior of one frame is adapted only then
+        assert integrated is (seen.frames.shape[0] == 1)
+        assert calls_of == ([] if integrated else adapted) + ["settle", "settle"]
     assert ("phases were retrieved" in whole.message) is (len(calls) > 1)
     if sum(record.stage == "last descent" for record in records) > 6:
         interrupt_last_descent(method, seen.frames, path := tmp_path / "state.npz", 6)

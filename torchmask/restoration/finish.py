@@ -69,8 +69,8 @@ class Finisher:
             gentle = shows_gentle_slopes(objective, ended.state, self.change)
             astray = gentle and is_too_steep(objective, ended.state)
             prior = self._suited(prior, ended.state, gentle=gentle)
-            # what a search finds in faint frames follows noise, a last descent finds more of the object
-            prior = _adapted(prior, objective, ended.state) if end.descends else prior
+            # what a search finds in faint frames shows too little of the object
+            prior = self._adapted(prior, objective, ended.state) if end.descends else prior
             objective = objective.with_changes(prior=prior)
             ended.state, spent = integrate_aberrations(objective, ended.state, rounds, *how, **known, astray=astray)
             ended.n_evaluations += spent
@@ -98,8 +98,8 @@ class Finisher:
             if prior is None:
                 choices = first.prior.choices(rate_of_slopes(state.image))
                 prior = choose_prior(objective, state, choices, schedule.comparing)
-            # an integration finds an object of its own, after a descent that has not been led by what noise looks like
-            return prior if end.integrates else _adapted(prior, objective, state)
+            # noisy frames show edges that are none; their integration adapts its own prior to what this descent finds
+            return prior if end.integrates else self._adapted(prior, objective, state)
 
         def listen(cost: float, evaluations: int, variables: Variables) -> None:
             costs.append(cost)
@@ -132,6 +132,18 @@ class Finisher:
         """Return the prior at the scale of the object, as far as it has slopes."""
         rate = rate_in_noise(state.image, self.change, gentle=gentle)
         return prior.suited_to(rate) if rate > 0 else prior
+
+    def _adapted(self, prior: ObjectPrior, objective: MyopicObjective, state: State) -> ObjectPrior:
+        """Return the prior that suits the structure of the object, down to half a resolution element.
+
+        The object that is asked is settled under `prior` itself: one under a prior that was adapted before has sharper
+        edges already, and would ask for still sharper ones.
+        """
+        reach = _REACH / objective.model.cutoff
+        if prior.adapted_to(state.image, reach) is prior:
+            return prior
+        settled = settle(objective.with_changes(prior=prior), state, self.schedule.last_settling)
+        return prior.adapted_to(settled.image, reach)
 
     def _descend_again(self, objective: MyopicObjective, ended: Progress) -> None:
         """Descend under the given prior again: a lighter one finds more, but bends aberrations to noise."""
@@ -179,11 +191,6 @@ class Finisher:
         # the sharper the object, the more it matters where it lies on the pixels
         found = centre_on_pixels(objective, self._recalibrate(objective, found), self.schedule)
         return settle(objective, found, self.schedule.last_settling)
-
-
-def _adapted(prior: ObjectPrior, objective: MyopicObjective, state: State) -> ObjectPrior:
-    """Return the prior that suits the structure of the object, down to half a resolution element."""
-    return prior.adapted_to(state.image, _REACH / objective.model.cutoff)
 
 
 def _chi_square(objective: MyopicObjective, state: State) -> float:

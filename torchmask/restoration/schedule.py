@@ -100,8 +100,8 @@ class Schedule:
     renewal : number of rounds after which that approximation is recomputed
     settling : maximum number of iterations that fit the object in a round
     last_settling : the same after the last descent and after phases of a mask's lost frames have been found, and for a
-        full pupil before each of its segments and of those between rounds of phase retrieval; also as `comparing`,
-        where aberrations are known
+        full pupil before each of its segments and of those between rounds of phase retrieval; also of the object to
+        which a prior is adapted, and as `comparing`, where aberrations are known
     last_modes : number of modes of each sub-aperture of a mask in the last descent of frames that are not faint
     last_modes_full : the same of a full pupil, however faint
     comparing : number of iterations that fit the object to half of the frames, to compare priors for that descent
