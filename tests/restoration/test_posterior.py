@@ -59,7 +59,7 @@ def test_deviations_of_even_objects_shrink_with_the_share_of_even_pixels(side, s
     image[8 : 8 + side, 6 : 6 + side] = scale
     share = (1 - 1 / side) ** 2
     for pedestal in (0.0, 0.05 * scale):
-        assert evenness(image + pedestal) == pytest.approx(math.exp(-3.5 * share**2), rel=1e-12)
+        assert evenness(image + pedestal) == pytest.approx(math.exp(-2 * share**2), rel=1e-12)
 
 
 def test_deviations_of_objects_without_even_pixels_stay():

@@ -69,8 +69,8 @@ class Finisher:
             gentle = shows_gentle_slopes(objective, ended.state, self.change)
             astray = gentle and is_too_steep(objective, ended.state)
             prior = self._suited(prior, ended.state, gentle=gentle)
-            # what a search finds in faint frames shows too little of the object
-            prior = self._adapted(prior, objective, ended.state) if end.descends else prior
+            if end.descends:  # what a search finds in faint frames shows too little of the object
+                prior = prior.adapted_to(ended.state.image, _reach(objective))
             objective = objective.with_changes(prior=prior)
             ended.state, spent = integrate_aberrations(objective, ended.state, rounds, *how, **known, astray=astray)
             ended.n_evaluations += spent
@@ -134,12 +134,12 @@ class Finisher:
         return prior.suited_to(rate) if rate > 0 else prior
 
     def _adapted(self, prior: ObjectPrior, objective: MyopicObjective, state: State) -> ObjectPrior:
-        """Return the prior that suits the structure of the object, down to half a resolution element.
+        """Return the prior that suits the structure of the object.
 
         The object that is asked is settled under `prior` itself: one under a prior that was adapted before has sharper
         edges already, and would ask for still sharper ones.
         """
-        reach = _REACH / objective.model.cutoff
+        reach = _reach(objective)
         if prior.adapted_to(state.image, reach) is prior:
             return prior
         settled = settle(objective.with_changes(prior=prior), state, self.schedule.last_settling)
@@ -191,6 +191,11 @@ class Finisher:
         # the sharper the object, the more it matters where it lies on the pixels
         found = centre_on_pixels(objective, self._recalibrate(objective, found), self.schedule)
         return settle(objective, found, self.schedule.last_settling)
+
+
+def _reach(objective: MyopicObjective) -> float:
+    """Return the width over which the structure of an object is taken [pixels]."""
+    return _REACH / objective.model.cutoff
 
 
 def _chi_square(objective: MyopicObjective, state: State) -> float:

@@ -35,7 +35,7 @@ _ROUNDS, _FEW = 3, 6  # rounds and samples of expectation maximisation; few suff
 _LEAST = 1e-6  # of the largest value: minimum, for a finite prior in dark parts and a finite scale of all aberrations
 _FLAT = 0.1  # of the gradients' root mean square: a pixel with less is even
 _BRIGHT = 0.1  # of the peak: pixels that are asked
-_EVEN = 3.5  # by how much errors are smaller, in the logarithm, if all light is in such: 1.5 to 5 tried
+_EVEN = 2.0  # by how much errors are smaller, in the logarithm, if all light is in such: 0.5 to 5 tried
 _BATCH = 8  # samples drawn at once, each of which takes the memory of several stacks
 _ITERATIONS = 50  # of conjugate gradients: variances below the cut-off are then within 3 % of their limit
 
@@ -64,7 +64,7 @@ def standard_deviations(
 def evenness(image: Tensor) -> float:
     """Return the factor, at most 1, by which to multiply `standard_deviations` of an object as even as `image`.
 
-    It is exp(-3.5 q^2), where q is the share of the light in even pixels, whose gradient is below a tenth of its root
+    It is exp(-2 q^2), where q is the share of the light in even pixels, whose gradient is below a tenth of its root
     mean square, by light, of all pixels above a tenth of the peak. The rule was found by trial (docs/tried.md). It does
     not hold where light is faint, as the prior makes any object even there.
     """
