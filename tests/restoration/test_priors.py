@@ -10,6 +10,7 @@ from torch import nn
 from torchmask.restoration.given_prior import FunctionPrior, as_prior, check_prior
 from torchmask.restoration.priors import EdgePreserving, ObjectPrior
 from torchmask.restoration.slopes import divergence, gradient
+from torchmask.restoration.structure import Metric
 from torchmask.restoration.variation import AdaptedVariation, SmoothVariation, TotalVariation
 
 
@@ -200,6 +201,29 @@ def test_an_adapted_variation_costs_what_it_did_for_its_own_object():
     image = rough(12, 13)
     prior = SmoothVariation(2.0, 1e-9, 1e-9)
     assert float(prior.adapted_to(image, 1.0)(image)) == pytest.approx(float(prior(image)), rel=1e-6)
+
+
+@pytest.mark.parametrize("times", [0.3, 1.0, 4.0])
+def test_an_even_metric_multiplies_the_whole_penalty(times):
+    """Its rounded corners, gradient and curvature as well."""
+    prior, image = SmoothVariation(0.7, 0.4, 0.05), 0.1 * rough()
+    everywhere = torch.full_like(image, times)
+    adapted = AdaptedVariation(prior, Metric(everywhere, torch.zeros_like(image), everywhere, everywhere))
+    for found, expected in zip(adapted.value_and_gradient(image), prior.value_and_gradient(image), strict=True):
+        torch.testing.assert_close(found, times * expected, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(adapted.curvature(image), times * prior.curvature(image), rtol=1e-12, atol=1e-12)
+
+
+def test_curvature_of_an_adapted_variation_is_the_diagonal_of_a_quadratic():
+    """Of the one that touches it at the image, without bends: its lengths stand in the denominators."""
+    image = rough()
+    prior = SmoothVariation(0.7, 1e-30, 0.05).adapted_to(rough(seed=7).cumsum(0).cumsum(1), 1.0)
+    dy, dx = prior.metric.of(*gradient(image))
+    inverse = 0.7 / torch.sqrt(dy**2 + dx**2 + (0.05 * prior.metric.size) ** 2)
+    units = torch.eye(image.numel(), dtype=torch.float64).view(-1, *image.shape)
+    by_dy, by_dx = prior.metric.of(*gradient(units))
+    diagonal = (inverse * (by_dy**2 + by_dx**2)).sum(dim=(-2, -1)).view(image.shape)
+    torch.testing.assert_close(prior.curvature(image), diagonal, rtol=1e-12, atol=1e-12)
 
 
 def test_what_is_adapted_to_an_even_object_stays_as_it_is():

@@ -84,8 +84,8 @@ class MyopicDeconvolution:
         is misplaced. Frames of a star give both more precisely (`calibrate_mask`).
     prior : callable
         Prior on the object: a function or module that maps an image (H', W'), in units of the stack's mean pixel and on
-        a field somewhat wider than the frames, to a differentiable scalar, such as `TotalVariation` (the default; its
-        weight suits the object at the end) or `EdgePreserving`. Its `gradient` and `curvature(image)` are used if any.
+        a field somewhat wider than the frames, to a differentiable scalar, such as `TotalVariation` (the default; it
+        suits the object at the end) or `EdgePreserving`. Its `gradient` and `curvature(image)` are used if any.
     aberration_prior : bool
         False: leave out 1/2 ||z||^2; z are then the Zernike coefficients themselves.
     max_iterations : int
