@@ -85,6 +85,10 @@ def costly(module: MyopicObjective, kind: Kind) -> Tensor:
     return module(random(*module.model.window.field.shape, **kind), random(2, 12, **kind))
 
 
+def adapted(values: Tensor) -> ObjectPrior:
+    return SmoothVariation().adapted_to(values.double().view(8, 8), 1.0)
+
+
 def penalised(module: ObjectPrior, kind: Kind) -> Tensor:
     return module(random(8, 8, **kind))
 
@@ -154,6 +158,9 @@ MODULES: dict[str, Entry] = {
     "objective": Entry(lambda: objective(mask()), costly, lambda: objective(moved())),
     "total variation": Entry(TotalVariation, penalised),
     "total variation with bends": Entry(SmoothVariation, penalised),
+    "adapted total variation": Entry(
+        lambda: adapted(torch.arange(64.0).square()), penalised, lambda: adapted(torch.arange(64.0).sin())
+    ),
     "edge-preserving prior": Entry(EdgePreserving, penalised),
     "prior that is a module": Entry(
         lambda: FunctionPrior(nn.Sequential(nn.Flatten(0), nn.Softplus(), nn.LayerNorm(64, elementwise_affine=False))),

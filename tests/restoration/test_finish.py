@@ -1,5 +1,6 @@
 """The end of a restoration: more modes, a smoother object, and when there is neither."""
 
+import functools
 import math
 from dataclasses import replace
 
@@ -621,9 +622,14 @@ def test_lost_frames_are_looked_for_between_segments(change, calls, observe, fiv
         tried.append(sum(record.stage == "last descent" for record in records))
         return (replace(state, z=1.01 * state.z) if seed < n_found else state), 1000  # seeds count up from 0
 
+    def look(objective, *given, name, made):
+        calls_of.append(name)
+        under.setdefault(name, set()).add(type(objective.prior))
+        return made(objective, *given)
+
+    under = {}
     for name in ("centre_on_pixels", "settle"):
-        made = getattr(finish, name)
-        monkeypatch.setattr(finish, name, lambda *given, name=name, made=made: calls_of.append(name) or made(*given))
+        monkeypatch.setattr(finish, name, functools.partial(look, name=name, made=getattr(finish, name)))
     monkeypatch.setattr(finish, "retrieve_lost_frames", stand_in)
     monkeypatch.setattr(myopic, "FULL_MODES", 10)
     options = {"start_iterations": 8, "segment": 4, "last_modes": 8, "chance": math.inf, "faint": 0.0, "retrievals": 0}
@@ -648,6 +654,8 @@ def test_lost_frames_are_looked_for_between_segments(change, calls, observe, fiv
         integrated = "integrated" in whole.message  # one frame counts as noisy, whose descent has no adapted prior
         assert integrated is (seen.frames.shape[0] == 1)
         assert calls_of == (["settle"] if integrated else [*adapted, "settle", "settle"])
+    # a prior that is adapted to an object would keep it from moving
+    assert under.get("centre_on_pixels", set()) <= {SmoothVariation}
     assert ("phases were retrieved" in whole.message) is (len(calls) > 1)
     if sum(record.stage == "last descent" for record in records) > 6:
         interrupt_last_descent(method, seen.frames, path := tmp_path / "state.npz", 6)

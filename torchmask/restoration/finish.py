@@ -7,7 +7,8 @@ of a mask uncertain, they are integrated out after it, or in its place if frames
 of the object; a faint search under a lighter prior descends under the given one before. Between segments of the last
 descent the phases of frames are retrieved that a mask's search has left in poor minima (`retrieval`). For a full pupil
 its segments begin with the object settled for the aberrations at hand: a joint descent is too slow at the frequencies
-that a full pupil hardly passes, in which most of the error in bright light would lie. Where the aberrations are known,
+that a full pupil hardly passes, in which most of the error in bright light would lie. The prior of a last descent, and
+of an integration after it, is adapted to the object that is known by then. Where the aberrations are known,
 the object alone descends once more, under the prior of its whole family (`ObjectPrior.family`) that the frames choose.
 """
 
@@ -36,7 +37,7 @@ from torchmask.restoration.spectrum import is_too_steep, rate_at_end, shows_gent
 from torchmask.restoration.state import State
 from torchmask.restoration.traits import End, Traits
 
-_REACH = 0.5  # width over which the structure of an object is taken [resolution elements]: 0.35 to 2.5 tried
+_REACH = 0.5  # width over which the structure of an object is taken [resolution elements]: 0.5 to 2.5 tried
 
 
 @dataclass(frozen=True)
@@ -94,12 +95,14 @@ class Finisher:
         chosen = self._choose_for_all(first, ended.state, end)
 
         def prior_of(state: State) -> ObjectPrior:
-            prior = chosen
-            if prior is None:
-                choices = first.prior.choices(rate_of_slopes(state.image))
-                prior = choose_prior(objective, state, choices, schedule.comparing)
+            if chosen is not None:
+                return chosen
+            choices = first.prior.choices(rate_of_slopes(state.image))
+            return choose_prior(objective, state, choices, schedule.comparing)
+
+        def adapted(prior: ObjectPrior, state: State) -> MyopicObjective:
             # noisy frames show edges that are none; their integration adapts its own prior to what this descent finds
-            return prior if end.integrates else self._adapted(prior, objective, state)
+            return objective.with_changes(prior=prior if end.integrates else self._adapted(prior, objective, state))
 
         def listen(cost: float, evaluations: int, variables: Variables) -> None:
             costs.append(cost)
@@ -108,19 +111,21 @@ class Finisher:
         while ended.last_segments < schedule.last_segments:
             costs.clear()
             state = self._recalibrate(objective, state)
-            objective = objective.with_changes(prior=prior_of(state))
+            objective = adapted(prior := prior_of(state), state)
             if self.traits.many_minima:
                 state = settle(objective, state, schedule.last_settling)
             state = descend(objective, state, schedule.segment, self.minimizer, listen)
             gains = bool(costs) and costs[len(costs) // 2] - costs[-1] > least_gain * abs(costs[-1])
             is_last = ended.last_segments + 1 == schedule.last_segments
             if may_find and not (ended.seeks_no_more or is_last):
-                descended, state = state, self._find_lost_frames(objective, state, ended)
+                # which moves the object, and an adapted prior would hold it where it was
+                plain = objective.with_changes(prior=prior)
+                descended, state = state, self._find_lost_frames(plain, state, ended)
                 ended.seeks_no_more = state is descended
                 gains = gains or not ended.seeks_no_more
             ended.finer, ended.last_segments = state, ended.last_segments + 1 if gains else schedule.last_segments
             self.save(ended)
-        objective = objective.with_changes(prior=prior_of(state))
+        objective = adapted(prior_of(state), state)
         # a descent moves flat parts of the object slowly
         state = settle(objective, state, schedule.last_settling)
         if end is End.FULL_PUPIL and _chi_square(objective, state) > _chi_square(first, ended.state) + self._chance():

@@ -35,7 +35,7 @@ _ROUNDS, _FEW = 3, 6  # rounds and samples of expectation maximisation; few suff
 _LEAST = 1e-6  # of the largest value: minimum, for a finite prior in dark parts and a finite scale of all aberrations
 _FLAT = 0.1  # of the gradients' root mean square: a pixel with less is even
 _BRIGHT = 0.1  # of the peak: pixels that are asked
-_EVEN = 2.0  # by how much errors are smaller, in the logarithm, if all light is in such: 0.5 to 5 tried
+_EVEN = 2.0  # by how much errors are smaller, in the logarithm, if all light is in such: 1 to 5 tried
 _BATCH = 8  # samples drawn at once, each of which takes the memory of several stacks
 _ITERATIONS = 50  # of conjugate gradients: variances below the cut-off are then within 3 % of their limit
 

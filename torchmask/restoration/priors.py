@@ -80,7 +80,7 @@ class ObjectPrior(nn.Module):
     def adapted_to(self, image: Tensor, reach: float) -> ObjectPrior:
         """Return the prior that suits the structure of an object (H', W') near the true one, as far as it is known.
 
-        `reach` is the width of what the object shows [pixels]. It is `self` if it does not depend on that.
+        `reach` is the width of what the object shows [pixels]. It is `self` where the prior has no regard for that.
         """
         return self
 

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from torchmask.restoration.slopes import gradient
 
-_POWER = 0.7  # of the local slope: 0 leaves slopes as they are, 1 makes all alike; 0.5 to 1 tried
-_LEAST = 0.05  # local slope, in units of the mean one, below which an image counts as even: 0.02 to 0.2 tried
+_POWER = 0.7  # of the local slope: 0 leaves slopes as they are, 1 makes all alike; 0.7 to 1 tried
+_LEAST = 0.05  # local slope, over the root of the mean of tr J / 2 by slopes, that counts as even: 0.02 to 0.2 tried
 
 
 class Metric(NamedTuple):
@@ -38,22 +38,24 @@ class Metric(NamedTuple):
 def even_metric(image: Tensor, reach: float) -> Metric | None:
     """Return the metric in which the slopes of `image` (H', W') are more even; None if it has none.
 
-    M is the structure tensor, over `reach` pixels, to the power -0.35: a slope of the local root mean square in its
-    direction counts by that to the power -0.7, bends by its mean over all directions. Both are scaled so that all
-    slopes of the image together cost as much as they did.
+    Each slope is multiplied by the local root mean square of the slopes in its direction, to the power -0.7, and bends
+    by that over all directions: M is the structure tensor to the power -0.35. The local mean is by a Gaussian whose
+    standard deviation is `reach` pixels. Both are scaled so that all slopes of the image cost what they did together.
     """
     dy, dx = gradient(image)
+    steepest = torch.hypot(dy, dx).max()
+    if not steepest > 0:
+        return None
+    dy, dx = dy / steepest, dx / steepest  # of any unit: squares would vanish
     length = torch.hypot(dy, dx)
     total = length.sum()
-    if not total > 0:
-        return None
     yy, xx, xy = smooth(torch.stack([dy * dy, dx * dx, dy * dx]), reach)
     mean, half = (yy + xx) / 2, (yy - xx) / 2
     spread = torch.hypot(half, xy)
-    steepest = (mean * length).sum() / total
+    unit = (mean * length).sum() / total
 
     def counts(square: Tensor) -> Tensor:
-        return (square / steepest).clamp(min=_LEAST**2) ** (-_POWER / 2)
+        return (square / unit).clamp(min=_LEAST**2) ** (-_POWER / 2)
 
     across, along, size = counts(mean + spread), counts(mean - spread), counts(mean)
     straight = torch.where(spread > 0, (across - along) / 2 / spread.clamp(min=torch.finfo(spread.dtype).tiny), 0.0)

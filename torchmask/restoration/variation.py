@@ -50,14 +50,13 @@ class TotalVariation(ObjectPrior):
         require("epsilon", epsilon)
         self.weight: float = float(weight)
         self.epsilon: float = float(epsilon)
-        self.size: Tensor | float = 1.0  # by how much slopes and bends count, around each pixel
 
     def forward(self, image: Tensor) -> Tensor:
-        return self.weight * (self._slopes(image)[2] - self.epsilon * self.size).sum(dim=(-2, -1))
+        return self.weight * (self._slopes(image)[2] - self.epsilon * self._size).sum(dim=(-2, -1))
 
     def value_and_gradient(self, image: Tensor) -> tuple[Tensor, Tensor]:
         dy, dx, length = self._slopes(image)
-        value = (length - self.epsilon * self.size).sum(dim=(-2, -1))
+        value = (length - self.epsilon * self._size).sum(dim=(-2, -1))
         return self.weight * value, self.weight * self._pull(dy / length, dx / length)
 
     def curvature(self, image: Tensor) -> Tensor:
@@ -94,6 +93,11 @@ class TotalVariation(ObjectPrior):
             return (self._smooth(min(rate, _HEAVIEST), gentle=True),)
         factors = (factor for factor in _FACTORS if factor == 1 or 1 > factor > rate > 0)
         return tuple(self._smooth(factor, gentle=False) for factor in factors)
+
+    @property
+    def _size(self) -> Tensor | float:
+        """By how much slopes and bends count around each pixel."""
+        return 1.0
 
     def _smooth(self, factor: float, *, gentle: bool) -> SmoothVariation:
         bending = _BENDS if gentle else _FEW_BENDS
@@ -148,20 +152,20 @@ class SmoothVariation(TotalVariation):
         self.bending: float = float(bending)
 
     def forward(self, image: Tensor) -> Tensor:
-        bends = (self.size * (self._bends(image)[3] - self.epsilon)).sum(dim=(-2, -1))
+        bends = (self._size * (self._bends(image)[3] - self.epsilon)).sum(dim=(-2, -1))
         return super().forward(image) + self.weight * self.bending * bends
 
     def value_and_gradient(self, image: Tensor) -> tuple[Tensor, Tensor]:
         value, slope = super().value_and_gradient(image)
         yy, xx, xy, length = self._bends(image)
-        weight = self.weight * self.bending * self.size
+        weight = self.weight * self.bending * self._size
         inverse = weight / length
         yy, xx, xy = yy * inverse, xx * inverse, 2 * xy * inverse
         by_dy, by_dx = yy - yy.roll(-1, -2) + xy.roll(1, -1) - xy, xx - xx.roll(-1, -1)
         return value + (weight * (length - self.epsilon)).sum(dim=(-2, -1)), slope + divergence(by_dy, by_dx)
 
     def curvature(self, image: Tensor) -> Tensor:
-        inverse = self.weight * self.bending * self.size / self._bends(image)[3]
+        inverse = self.weight * self.bending * self._size / self._bends(image)[3]
         left, above = inverse.roll(1, -1), inverse.roll(1, -2)
         straight = 8 * inverse + left + above + inverse.roll(-1, -1) + inverse.roll(-1, -2)
         return self._curvature_of_slopes(image) + straight + 2 * (inverse + left + above + left.roll(1, -2))
@@ -191,27 +195,41 @@ class AdaptedVariation(SmoothVariation):
 
     Total variation takes from an edge what it takes from noise. Once an object shows where its edges are, and how they
     run, slopes across them may cost less and all others more: weight * sum of |M gradient| + bending * size * |Hessian|
-    over the pixels, with M and `size` by `structure.even_metric` of that object. For the same object it is worth what
-    the slopes of the `SmoothVariation` are. Reweighted l1 norms do the same for sparse vectors (Candes, Wakin & Boyd,
-    J. Fourier Anal. Appl. 14, 877, 2008), and the direction is that of anisotropic total variation (Grasmair & Lenzen,
-    Appl. Math. Optim. 62, 323, 2010).
+    over the pixels, with M and `size` by `structure.even_metric` of that object. Its slopes together cost what they do
+    under the `SmoothVariation`, but for epsilon; its bends need not. Reweighted l1 norms do the same for sparse vectors
+    (Candes, Wakin & Boyd, J. Fourier Anal. Appl. 14, 877, 2008), and the direction is that of anisotropic total
+    variation (Grasmair & Lenzen, Appl. Math. Optim. 62, 323, 2010).
 
     Parameters
     ----------
     prior : SmoothVariation
         Weights of slopes and bends.
     metric : Metric
-        By how much they count around each pixel, where the images are.
+        By how much they count around each pixel. Its tensors are the buffers `yy`, `xy`, `xx` and `size`.
     """
+
+    yy: Tensor
+    xy: Tensor
+    xx: Tensor
+    size: Tensor
 
     def __init__(self, prior: SmoothVariation, metric: Metric) -> None:
         super().__init__(prior.weight, prior.bending, prior.epsilon)
-        self.metric: Metric = metric
-        self.size: Tensor | float = metric.size
+        for name, values in metric._asdict().items():
+            self.register_buffer(name, values)
+
+    @property
+    def metric(self) -> Metric:
+        """By how much slopes and bends count around each pixel."""
+        return Metric(self.yy, self.xy, self.xx, self.size)
+
+    @property
+    def _size(self) -> Tensor:
+        return self.size
 
     def _slopes(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         dy, dx = self.metric.of(*gradient(image))
-        return dy, dx, torch.sqrt(dy**2 + dx**2 + (self.epsilon * self.size) ** 2)
+        return dy, dx, torch.sqrt(dy**2 + dx**2 + (self.epsilon * self._size) ** 2)
 
     def _curvature_of_slopes(self, image: Tensor) -> Tensor:
         inverse, (yy, xy, xx, _) = self.weight / self._slopes(image)[2], self.metric
