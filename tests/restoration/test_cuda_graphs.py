@@ -15,7 +15,7 @@ from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.priors import ObjectPrior
 from torchmask.restoration.projected_lbfgs import ProjectedLBFGS, minimize_bounded
 from torchmask.restoration.state import State
-from torchmask.restoration.variation import TotalVariation
+from torchmask.restoration.variation import SmoothVariation, TotalVariation
 
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 
@@ -130,9 +130,11 @@ def told(objective, state, n_iterations):
 
 @needs_gpu
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize("moves", [False, True])
-def test_a_descent_by_graphs_is_that_without(dtype, moves, monkeypatch):
+@pytest.mark.parametrize(("moves", "adapts"), [(False, False), (True, False), (False, True)])
+def test_a_descent_by_graphs_is_that_without(dtype, moves, adapts, monkeypatch):
     objective, state = exposures(dtype)
+    if adapts:
+        objective = objective.with_changes(prior=SmoothVariation().adapted_to(state.image, 1.0))
     if moves:
         objective = objective.with_changes(free=objective.free | Free.PLACE)
     with shared_graph_memory(torch.device("cuda")):
