@@ -322,6 +322,16 @@ def test_a_prior_is_adapted_to_an_object_that_is_settled_under_itself(explained,
     assert {n_iterations for *_, n_iterations in settled} == {5}
 
 
+@pytest.mark.parametrize(("each", "adapts"), [(4.9, False), (5.0, True)])
+def test_priors_of_faint_frames_are_not_adapted(each, adapts, explained):
+    """They show too little of the object, even where the aberrations are known."""
+    objective, state = explained
+    schedule = Schedule(segment=2, last_segments=1, lost=math.inf)
+    assert schedule.faint == 5.0
+    found, _ = ended(objective, state, Setting.of(objective), schedule, change=Change(each, 10, 4096))
+    assert isinstance(found.prior, AdaptedVariation) is adapts
+
+
 def test_nothing_follows_the_search_of_a_schedule_without_last_segments(observe, five_holes):
     assert End.of(math.inf, TRAITS, Schedule(), BLIND) is End.LAST_DESCENT
     assert End.of(10.0, TRAITS, Schedule(last_segments=0), BLIND) is End.NONE

@@ -142,10 +142,10 @@ class Finisher:
         """Return the prior that suits the structure of the object.
 
         The object that is asked is settled under `prior` itself: one under a prior that was adapted before has sharper
-        edges already, and would ask for still sharper ones.
+        edges already, and would ask for still sharper ones. Faint frames show too little structure: `prior` stays.
         """
         reach = _reach(objective)
-        if prior.adapted_to(state.image, reach) is prior:
+        if self.change.each < self.schedule.faint or prior.adapted_to(state.image, reach) is prior:
             return prior
         settled = settle(objective.with_changes(prior=prior), state, self.schedule.last_settling)
         return prior.adapted_to(settled.image, reach)

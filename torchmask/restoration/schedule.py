@@ -90,7 +90,7 @@ class Schedule:
     farthest : a mask found displaced by more than this fraction is reset to the given geometry
     still : the geometry has converged when a segment moves holes by less than this fraction
     faint : change from frame to frame, in noise variances, below which frames are faint: the aberrations are integrated
-        out in place of a last descent
+        out in place of a last descent, and priors are not adapted to the object
     noisy : the same below which they are integrated out after the last descent
     faint_segments : number of segments under the given prior between a search under a lighter one and the integration
     rounds : number of rounds of the integration of faint frames; the object is the mean of the second half of them
