@@ -79,6 +79,21 @@ def test_restored_image_lies_where_the_frames_did_on_the_sky(tmp_path, write_fit
     assert again.grid.pixel_scale == pytest.approx(observation.grid.pixel_scale, rel=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("prior", "card"),
+    [
+        ("AdaptedVariation(weight=0.420453, bending=0.25, epsilon=0.01)",) * 2,
+        ("Learned(\n  (net): Conv2d(1, 8)\n  name=α\n)", "Learned( (net): Conv2d(1, 8) name=? )"),
+        ("Long(" + 30 * "number=1, " + ")",) * 2,
+    ],
+)
+def test_any_prior_has_a_card(prior, card, tmp_path, write_fits, mask, cube):
+    """Without a warning that something is cut off, which would fail here."""
+    observation = read_observation(write_fits("a.fits", cube), mask, crop=8)
+    save_restored(tmp_path / "r.fits", dataclasses.replace(result_for(observation), prior=prior), observation)
+    assert fits.getheader(tmp_path / "r.fits")["PRIOR"] == card
+
+
 def test_standard_deviations_are_an_extension(tmp_path, write_fits, mask, cube, sky):
     observation = read_observation(write_fits("a.fits", cube, **sky), mask, crop=8)
     result = dataclasses.replace(result_for(observation), object_std=torch.rand(8, 8, dtype=torch.float64))

@@ -86,7 +86,7 @@ def save_restored(
         "CHISQMAX": (float(result.chi_square.max()), "the same of the worst frame"),
         "NOISE": (result.noise, "[electron] rms per pixel and frame"),
         "SKY": (result.sky, "[electron] mean light of the sky in a pixel"),
-        "PRIOR": (result.prior, "on the object"),
+        "PRIOR": (_in_a_card(result.prior), ""),  # which fills its card
         "R0": (result.r0, "[m] Fried parameter of the prior"),
         "CONVERGD": (result.converged, "whether the restoration came to rest"),
     }
@@ -109,7 +109,7 @@ def save_restored(
             hdu.header[name] = (value, comment)
     lines = [history] if isinstance(history, str) else list(history)
     for line in ["restored by torchmask.MyopicDeconvolution", *lines]:
-        hdu.header.add_history(line.encode("ascii", "replace").decode().replace("\n", " "))
+        hdu.header.add_history(_in_a_card(line))
     if result.object_std is not None:
         errors = fits.ImageHDU(as_array(result.object_std).astype("float64"), name="ERR")
         for name in (*observation.header, "BUNIT", "PIXELSCL"):
@@ -120,3 +120,8 @@ def save_restored(
     hdus.writeto(content, checksum=True)
     with atomic_write(path) as file:
         file.write(content.getvalue())
+
+
+def _in_a_card(text: str) -> str:
+    """Return the text in one line of ASCII, as FITS wants it."""
+    return " ".join(text.encode("ascii", "replace").decode().split())
