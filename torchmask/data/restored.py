@@ -124,4 +124,4 @@ def save_restored(
 
 def _in_a_card(text: str) -> str:
     """Return the text in one line of ASCII, as FITS wants it."""
-    return " ".join(text.encode("ascii", "replace").decode().split())
+    return " ".join(line.strip() for line in text.encode("ascii", "replace").decode().splitlines())

@@ -8,8 +8,8 @@ of the object; a faint search under a lighter prior descends under the given one
 descent the phases of frames are retrieved that a mask's search has left in poor minima (`retrieval`). For a full pupil
 its segments begin with the object settled for the aberrations at hand: a joint descent is too slow at the frequencies
 that a full pupil hardly passes, in which most of the error in bright light would lie. The prior of a last descent, and
-of an integration after it, is adapted to the object that is known by then. Where the aberrations are known,
-the object alone descends once more, under the prior of its whole family (`ObjectPrior.family`) that the frames choose.
+of an integration after it, is adapted to the object that is known by then. Where the aberrations are known, the object
+alone descends once more, under the prior of its whole family (`ObjectPrior.family`) that the frames choose.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ class Finisher:
             choices = first.prior.choices(rate_of_slopes(state.image))
             return choose_prior(objective, state, choices, schedule.comparing)
 
-        def adapted(prior: ObjectPrior, state: State) -> MyopicObjective:
+        def objective_under(prior: ObjectPrior, state: State) -> MyopicObjective:
             # noisy frames show edges that are none; their integration adapts its own prior to what this descent finds
             return objective.with_changes(prior=prior if end.integrates else self._adapted(prior, objective, state))
 
@@ -111,7 +111,7 @@ class Finisher:
         while ended.last_segments < schedule.last_segments:
             costs.clear()
             state = self._recalibrate(objective, state)
-            objective = adapted(prior := prior_of(state), state)
+            objective = objective_under(prior := prior_of(state), state)
             if self.traits.many_minima:
                 state = settle(objective, state, schedule.last_settling)
             state = descend(objective, state, schedule.segment, self.minimizer, listen)
@@ -125,7 +125,7 @@ class Finisher:
                 gains = gains or not ended.seeks_no_more
             ended.finer, ended.last_segments = state, ended.last_segments + 1 if gains else schedule.last_segments
             self.save(ended)
-        objective = adapted(prior_of(state), state)
+        objective = objective_under(prior_of(state), state)
         # a descent moves flat parts of the object slowly
         state = settle(objective, state, schedule.last_settling)
         if end is End.FULL_PUPIL and _chi_square(objective, state) > _chi_square(first, ended.state) + self._chance():
@@ -145,7 +145,9 @@ class Finisher:
         edges already, and would ask for still sharper ones. Faint frames show too little structure: `prior` stays.
         """
         reach = _reach(objective)
-        if self.change.each < self.schedule.faint or prior.adapted_to(state.image, reach) is prior:
+        if self.change.each < self.schedule.faint:
+            return prior
+        if prior.adapted_to(state.image, reach) is prior:  # a prior without regard for structure needs no settling
             return prior
         settled = settle(objective.with_changes(prior=prior), state, self.schedule.last_settling)
         return prior.adapted_to(settled.image, reach)
