@@ -10,6 +10,7 @@ from torchmask.grid import Grid
 from torchmask.restoration import model_error
 from torchmask.restoration.aberrations import turbulent_basis
 from torchmask.restoration.candidates import Candidates
+from torchmask.restoration.change import Change
 from torchmask.restoration.checkpoint import Ending, Progress, Status
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.frames import FrameStack
@@ -134,7 +135,7 @@ def test_the_likelier_of_two_starts_is_kept(explain):
     assert judge.compare(objective, worse, ending(0.5 * found)).best is not worse
 
 
-def test_faint_frames_get_several_starts_though_they_are_explained(explain):
+def test_faint_frames_get_several_starts_though_they_are_explained(explain, monkeypatch):
     """However many bring nothing better, which their chi-square does not tell; in bright frames it does."""
     objective, state = explain(noise=0.003)
     ending, schedule = Ending(state, Status.CONVERGED), Schedule(faint_starts=4, starts=9, in_vain=2)
@@ -148,6 +149,10 @@ def test_faint_frames_get_several_starts_though_they_are_explained(explain):
 
     assert [last_start(End.INTEGRATION, in_vain) for in_vain in (0, 2)] == [4, 4]
     assert [last_start(End.LAST_DESCENT, in_vain) for in_vain in (0, 2)] == [9, 1]
+    monkeypatch.setattr(Change, "is_scarce", True)
+    for shown, most in ((0.49, 1), (0.51, 4)):  # where light is scarce an integration comes to the same from any
+        monkeypatch.setattr(Change, "shown", shown)
+        assert last_start(End.INTEGRATION, 0) == most
 
 
 def test_a_start_in_faint_frames_is_given_up_where_it_costs_much_more(explain):

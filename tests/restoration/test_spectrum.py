@@ -14,7 +14,14 @@ from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.slopes import gradient, rate_of_descent, rate_of_slopes
-from torchmask.restoration.spectrum import Power, power_of_slopes, rate_at_end, rate_in_search, shows_gentle_slopes
+from torchmask.restoration.spectrum import (
+    Power,
+    power_of_slopes,
+    rate_at_end,
+    rate_in_noise,
+    rate_in_search,
+    shows_gentle_slopes,
+)
 from torchmask.restoration.state import State
 from torchmask.restoration.variation import TotalVariation
 
@@ -54,6 +61,12 @@ def seen(five_holes):
         return objective, State(image, z, calibration)
 
     return make
+
+
+def at_rate(seen, rate):
+    """An object whose slopes have this rate."""
+    objective, state = seen(0)
+    return objective, replace(state, image=state.image * rate_of_slopes(state.image) / rate)
 
 
 def below_cutoff(objective, image):
@@ -192,6 +205,67 @@ def test_the_rate_of_a_search_is_that_of_its_object_unless_it_follows_noise(seen
         for gentle, expected in ((False, min(own, 1.0)), (True, 1.5 if own < 0.82 else min(own, 1.0))):
             monkeypatch.setattr(spectrum, "shows_gentle_slopes", lambda *given, answer=gentle: answer)
             assert rate_in_search(objective, found, change) == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("rate", "light", "expected"),
+    [
+        (0.8, 39.0, 0.8),
+        (0.8, 41.0, 1.025),
+        (0.8, 60.0, 1.5),
+        (0.8, 80.0, 2.0),
+        (0.8, 1e4, 2.0),
+        (2.5, 1e4, 2.5),
+        (0.1, 60.0, 1.5),
+    ],
+)
+def test_gentle_slopes_have_a_higher_rate_the_more_light_has_bent_them(rate, light, expected, seen):
+    """Up to 2 and never a lower one, however steep those found are; others are taken as they are."""
+    objective, state = at_rate(seen, rate)
+    change = Change(light / 20, 20, 4096)
+    assert rate_in_noise(objective, state, change, gentle=True) == pytest.approx(expected, rel=1e-9)
+    assert rate_in_noise(objective, state, change, gentle=False) == pytest.approx(rate, rel=1e-9)
+
+
+@pytest.mark.parametrize("n_pixels", [4096, 16384])
+@pytest.mark.parametrize("n_frames", [2, 10, 200])
+@pytest.mark.parametrize(
+    ("beyond_noise", "factor"), [(2400, 1.0), (2049, 1.0), (1638.4, 0.8), (819.2, 0.4), (400, 0.25), (-400, 0.25)]
+)
+def test_in_frames_of_hardly_more_than_noise_slopes_are_steeper(
+    beyond_noise, factor, n_frames, n_pixels, seen, monkeypatch
+):
+    """However many there are, and however fine their pixels. Those that frames call steep, of a rate below a half even
+    with one standard error more, have at most a rate of 0.14."""
+    change = Change(beyond_noise / n_pixels + 1 - 1 / n_frames, n_frames, n_pixels)
+    assert change.is_scarce == (factor < 1)
+    for rate in (0.05, 0.3, 1.6):
+        objective, state = at_rate(seen, rate)
+        total = float(torch.hypot(*gradient(state.image)).sum())
+        for of_frames, steep in ((0.49, True), (0.51, False)):
+            power = Power(3 * total / of_frames / math.exp(0.7), 0.7)
+            monkeypatch.setattr(spectrum, "power_of_slopes", lambda *given, power=power: power)
+            expected = rate if factor == 1 else min(rate, 0.14) if steep else rate * factor
+            assert rate_in_noise(objective, state, change, gentle=False) == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_single_frame_does_not_tell_how_much_frames_change(seen):
+    assert rate_in_noise(*at_rate(seen, 0.7), Change(0.0, 1, 4096), gentle=False) == pytest.approx(0.7, rel=1e-9)
+
+
+def test_a_blank_object_has_no_rate(seen):
+    objective, state = seen(0)
+    blank = replace(state, image=torch.zeros_like(state.image))
+    assert rate_in_noise(objective, blank, Change(1.0, 8, 4096), gentle=False) == 0
+
+
+def test_faint_frames_tell_satellites_from_balls_by_the_power_they_show(seen):
+    """An object that its search has blurred, whose own slopes are gentle, has the rate of steep ones if it is steep."""
+    for amplitude, noise, steep in ((1000.0, 6.0, True), (50.0, 0.3, False)):
+        objective, state = seen(0, amplitude=amplitude, noise=noise)
+        blurred = replace(state, image=state.image * rate_of_slopes(state.image) / 1.2)
+        found = rate_in_noise(objective, blurred, Change(0.95, 8, 4096), gentle=False)
+        assert found == pytest.approx(0.14 if steep else 1.2 * 0.25, rel=1e-9)
 
 
 @pytest.mark.parametrize("full", [False, True])

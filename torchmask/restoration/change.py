@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+_SHOWN = 2048.0  # chi-square of a frame beyond noise below which it shows too little to tell slopes
+
 
 class Change(NamedTuple):
     """The change from frame to frame, beside noise and in all.
@@ -40,3 +42,13 @@ class Change(NamedTuple):
         However fine the pixels, it is what a frame shows of its aberrations.
         """
         return (self.each - (1 - 1 / self.n_frames)) * self.n_pixels
+
+    @property
+    def shown(self) -> float:
+        """What a frame shows beyond noise, over what it needs to tell slopes."""
+        return self.beyond_noise / _SHOWN
+
+    @property
+    def is_scarce(self) -> bool:
+        """Whether frames change by hardly more than their noise, which a single one does not tell."""
+        return self.n_frames > 1 and self.shown < 1

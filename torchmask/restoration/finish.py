@@ -32,8 +32,8 @@ from torchmask.restoration.priors import ObjectPrior
 from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.retrieval import retrieve_lost_frames
 from torchmask.restoration.schedule import Schedule
-from torchmask.restoration.slopes import rate_in_noise, rate_of_descent, rate_of_slopes
-from torchmask.restoration.spectrum import is_too_steep, rate_at_end, shows_gentle_slopes
+from torchmask.restoration.slopes import rate_of_descent, rate_of_slopes
+from torchmask.restoration.spectrum import is_too_steep, rate_at_end, rate_in_noise, shows_gentle_slopes
 from torchmask.restoration.state import State
 from torchmask.restoration.traits import End, Traits
 
@@ -69,7 +69,8 @@ class Finisher:
             known = {"seed": self.traits.seed, "follow_r0": self.traits.r0_is_open}
             gentle = shows_gentle_slopes(objective, ended.state, self.change)
             astray = gentle and is_too_steep(objective, ended.state)
-            prior = self._suited(prior, ended.state, gentle=gentle)
+            rate = rate_in_noise(objective, ended.state, self.change, gentle=gentle)
+            prior = prior.suited_to(rate) if rate > 0 else prior
             if end.descends:  # what a search finds in faint frames shows too little of the object
                 prior = prior.adapted_to(ended.state.image, _reach(objective))
             objective = objective.with_changes(prior=prior)
@@ -132,11 +133,6 @@ class Finisher:
             return first
         ended.state = state
         return objective
-
-    def _suited(self, prior: ObjectPrior, state: State, *, gentle: bool) -> ObjectPrior:
-        """Return the prior at the scale of the object, as far as it has slopes."""
-        rate = rate_in_noise(state.image, self.change, gentle=gentle)
-        return prior.suited_to(rate) if rate > 0 else prior
 
     def _adapted(self, prior: ObjectPrior, objective: MyopicObjective, state: State) -> ObjectPrior:
         """Return the prior that suits the structure of the object.

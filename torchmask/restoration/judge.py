@@ -18,6 +18,7 @@ from torchmask.restoration.state import State
 from torchmask.restoration.traits import End, Traits
 from torchmask.restoration.verdict import Finding, FrameFits, Tolerance, Verdict, judge
 
+_ENOUGH = 0.5  # part of what tells slopes below which all starts led to the same: not at 1 and above
 _LACKS = 3  # times the last decrease: by 2 to 4 times that two starts fell when they went on
 
 
@@ -51,6 +52,7 @@ class Judge:
         self.end: End = end
         # common pistons of three holes are a tilt
         self.has_twins: bool = not traits.many_minima and setting.still.n_subapertures > 3
+        self.one_is_enough: bool = stack.change.is_scarce and stack.change.shown < _ENOUGH
         self.contrast: float = stack.contrast
         self.noise: FrameNoise = stack.noise_of_frames
         self.tolerance: Tolerance = Tolerance(schedule.model_errors, schedule.chance, least)
@@ -105,11 +107,14 @@ class Judge:
         return Comparison(best, verdict, after, advances, alike)
 
     def most_starts(self, verdict: Verdict) -> int:
-        """Return the maximum number of starts if this is the verdict on the best."""
+        """Return the maximum number of starts if this is the verdict on the best.
+
+        Where light is scarce an integration comes to the same from any, so one that explains the frames is enough.
+        """
         if verdict.finding is Finding.NOT_EXPLAINED:
             return self.schedule.starts
         if verdict.explained and self.end is End.INTEGRATION:
-            return self.schedule.faint_starts
+            return 1 if self.one_is_enough else self.schedule.faint_starts
         return self.schedule.starts if self._twins_may_improve(verdict) else 1
 
     def wants_another(self, verdict: Verdict, progress: Progress) -> bool:

@@ -17,7 +17,7 @@ from torchmask.restoration.change import Change
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.projected_lbfgs import minimize_bounded
 from torchmask.restoration.schedule import Schedule
-from torchmask.restoration.slopes import gradient, rate_in_light, rate_of_descent, rate_of_slopes, shown
+from torchmask.restoration.slopes import gradient, rate_in_light, rate_of_descent, rate_of_slopes
 from torchmask.restoration.state import State
 
 _ITERATIONS = 100
@@ -28,6 +28,8 @@ _DOUBT = 2.0  # standard errors of which slopes have the benefit there: a ball o
 _GENTLE_FAINT = 0.22  # limit by faint frames, one error less: 0.03 to 0.17 of satellites, 0.28 on of balls
 _OF_NOISE = 0.82  # rate found of gentle slopes below which an object follows noise: 0.3 to 0.78 of asteroids that do
 _TOO_STEEP = 1.5  # times those of frames, one error less: 0.6 to 1.1 of what heat harms or leaves, 1.6 to 41 of others
+_SMALLEST = 0.25  # factor by which slopes in scarce light are taken to be steeper, at least: down to 0.125 tried
+_STEEP = 0.14  # the highest rate of those that are steep there: 0.09 to 0.25 tried
 _VAGUE = 100.0  # error of a logarithm above which nothing is known
 
 
@@ -70,6 +72,24 @@ def rate_in_search(objective: MyopicObjective, state: State, change: Change) -> 
     rate = rate_of_slopes(state.image)
     follows_noise = 0 < rate < _OF_NOISE and shows_gentle_slopes(objective, state, change)
     return rate_in_light(change) if follows_noise else min(rate, 1.0)
+
+
+def rate_in_noise(objective: MyopicObjective, state: State, change: Change, *, gentle: bool) -> float:
+    """Return the rate of slopes that an integration suits, whose object was found together with uncertain aberrations.
+
+    These bend to the noise of their frames, and an object that follows it has slopes that are steeper than the true
+    ones. What the fit gains by that grows with the light, so from a light of 40 on slopes that are `gentle` have at
+    least the rate light / 40, up to 2. Where frames change by hardly more than their noise, on the other hand, the
+    prior has smoothed what it has found, and would smooth it the more. Below a chi-square of 2048 beyond noise, in a
+    frame, the rate is at most 0.14 if the frames say that slopes are steep, of a rate below a half by more than one
+    standard error; else it falls in proportion, down to a quarter. A single frame does not tell. The limits are
+    empirical.
+    """
+    rate, least = rate_of_slopes(state.image), rate_in_light(change)
+    if change.is_scarce:
+        are_steep = 3 * _sum_of_slopes(state) < _GENTLE * power_of_slopes(objective, state).off_by(1)
+        return min(rate, _STEEP) if are_steep else rate * max(change.shown, _SMALLEST)
+    return max(rate, least) if gentle and least > 1 else rate
 
 
 def rate_at_end(objective: MyopicObjective, state: State, change: Change, *, full: bool) -> float:
@@ -160,7 +180,7 @@ def _sum_of_slopes(state: State) -> float:
 
 def _tell(change: Change) -> bool:
     """Return whether frames tell slopes at all."""
-    return change.n_frames > 1 and shown(change) >= 1
+    return change.n_frames > 1 and not change.is_scarce
 
 
 def _are_gentle(total: float, power: Power, change: Change) -> bool:
