@@ -153,6 +153,11 @@ def test_faint_frames_get_several_starts_though_they_are_explained(explain, monk
     for shown, most in ((0.49, 1), (0.51, 4)):  # where light is scarce an integration comes to the same from any
         monkeypatch.setattr(Change, "shown", shown)
         assert last_start(End.INTEGRATION, 0) == most
+    monkeypatch.setattr(Change, "shown", 0.49)
+    judge = Judge(Setting.of(objective), stack_of(objective), TRAITS, schedule, End.INTEGRATION)
+    missed = judge.verdict(objective, Ending(replace(state, z=0 * state.z), Status.CONVERGED))
+    assert missed.finding is Finding.NOT_EXPLAINED
+    assert judge.most_starts(missed) == 9
 
 
 def test_a_start_in_faint_frames_is_given_up_where_it_costs_much_more(explain):

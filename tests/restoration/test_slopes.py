@@ -1,4 +1,4 @@
-"""The scale of an object that its slopes tell, and what noise makes of it."""
+"""The scale of an object that its slopes tell, and the light that its frames have."""
 
 import pytest
 import torch
@@ -6,13 +6,6 @@ from torch import nn
 
 from torchmask.restoration.change import Change
 from torchmask.restoration.slopes import rate_in_light, rate_of_slopes
-
-
-def point_of(rate):
-    """An object whose slopes have this rate: of one pixel, with two slopes and one across."""
-    point = torch.zeros(8, 8, dtype=torch.float64)
-    point[3, 3] = 3 * (2 + 2**0.5) / (4 * rate)
-    return point
 
 
 def test_a_rate_is_that_of_the_slopes_wherever_they_are():

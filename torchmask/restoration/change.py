@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-_SHOWN = 2048.0  # chi-square of a frame beyond noise below which it shows too little to tell slopes
+_SHOWN = 2048.0  # chi-square of a frame beyond noise below which the slopes found are those of the prior
 
 
 class Change(NamedTuple):
@@ -45,7 +45,7 @@ class Change(NamedTuple):
 
     @property
     def shown(self) -> float:
-        """What a frame shows beyond noise, over what it needs to tell slopes."""
+        """What a frame shows beyond noise, over what it has to show for the slopes found to be believed."""
         return self.beyond_noise / _SHOWN
 
     @property

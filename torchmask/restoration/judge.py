@@ -18,7 +18,7 @@ from torchmask.restoration.state import State
 from torchmask.restoration.traits import End, Traits
 from torchmask.restoration.verdict import Finding, FrameFits, Tolerance, Verdict, judge
 
-_ENOUGH = 0.5  # part of what tells slopes below which all starts led to the same: not at 1 and above
+_ENOUGH = 0.5  # of `Change.shown`: up to 0.95 no later start was kept, at 1.04 one was
 _LACKS = 3  # times the last decrease: by 2 to 4 times that two starts fell when they went on
 
 
@@ -109,7 +109,7 @@ class Judge:
     def most_starts(self, verdict: Verdict) -> int:
         """Return the maximum number of starts if this is the verdict on the best.
 
-        Where light is scarce an integration comes to the same from any, so one that explains the frames is enough.
+        In the faintest frames one that explains them is enough: later ones do not differ enough to be kept.
         """
         if verdict.finding is Finding.NOT_EXPLAINED:
             return self.schedule.starts

@@ -90,7 +90,7 @@ class MyopicDeconvolution:
         False: leave out 1/2 ||z||^2; z are then the Zernike coefficients themselves.
     max_iterations : int
         Maximum number over all starts, each of at most 1000. A full pupil gets three, or one if phases are retrieved.
-        A mask gets up to nine, as long as there may be a better one; six if its frames are faint, but explained.
+        A mask gets up to nine, while there may be a better one; six or one if its frames are faint, but explained.
     tolerance : float
         A start has converged when 100 iterations gain less than this part of the cost (see `Schedule.nearly_at_rest`).
     minimizer : Minimizer

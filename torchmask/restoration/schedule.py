@@ -69,7 +69,8 @@ class Schedule:
     cooling : a mask whose frames are explained and show gentle slopes, and are not faint, starts once from the best
         object heated, after so many rounds in which the noise falls; 0: it does not
     heat : factor of the variance of the noise from which it falls then
-    faint_starts : maximum number of starts of a mask whose faint frames are explained, of which the likeliest is kept
+    faint_starts : maximum number of starts of a mask whose faint frames are explained, of which the likeliest is kept;
+        below a chi-square of 1024 beyond noise in a frame one is enough
     likelier : cost by which a later start in faint frames has to be lower to replace an earlier one
     glance : number of iterations after which a start from a twin, or any later start in faint frames, may be given up
     promising : where the best start so far does not explain the frames, a twin is given up unless its excess chi-square

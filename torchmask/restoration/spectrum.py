@@ -28,8 +28,9 @@ _DOUBT = 2.0  # standard errors of which slopes have the benefit there: a ball o
 _GENTLE_FAINT = 0.22  # limit by faint frames, one error less: 0.03 to 0.17 of satellites, 0.28 on of balls
 _OF_NOISE = 0.82  # rate found of gentle slopes below which an object follows noise: 0.3 to 0.78 of asteroids that do
 _TOO_STEEP = 1.5  # times those of frames, one error less: 0.6 to 1.1 of what heat harms or leaves, 1.6 to 41 of others
-_SMALLEST = 0.25  # factor by which slopes in scarce light are taken to be steeper, at least: down to 0.125 tried
-_STEEP = 0.14  # the highest rate of those that are steep there: 0.09 to 0.25 tried
+_SMALLEST = 0.25  # the smallest factor on the rate found in scarce light: down to 0.125 tried
+_STEEP = 0.14  # the highest rate of slopes that are steep there: 0.09 to 0.25 tried
+_TELLING = math.log(3)  # error of a logarithm from which on scarce frames do not tell steep slopes: up to 13 is seen
 _VAGUE = 100.0  # error of a logarithm above which nothing is known
 
 
@@ -80,15 +81,15 @@ def rate_in_noise(objective: MyopicObjective, state: State, change: Change, *, g
     These bend to the noise of their frames, and an object that follows it has slopes that are steeper than the true
     ones. What the fit gains by that grows with the light, so from a light of 40 on slopes that are `gentle` have at
     least the rate light / 40, up to 2. Where frames change by hardly more than their noise, on the other hand, the
-    prior has smoothed what it has found, and would smooth it the more. Below a chi-square of 2048 beyond noise, in a
-    frame, the rate is at most 0.14 if the frames say that slopes are steep, of a rate below a half by more than one
-    standard error; else it falls in proportion, down to a quarter. A single frame does not tell. The limits are
-    empirical.
+    prior has smoothed what it has found, and would smooth it the more. So below a chi-square of 2048 beyond noise, in a
+    frame, the rate is at most 0.14 if the frames show steep slopes. Else it falls in proportion, down to a quarter, but
+    no further than to 0.14. Slopes are steep there if the rate that the frames show, less one standard error, is below
+    a half, and the error below a factor of three. A single frame does not tell. The limits are empirical.
     """
     rate, least = rate_of_slopes(state.image), rate_in_light(change)
     if change.is_scarce:
-        are_steep = 3 * _sum_of_slopes(state) < _GENTLE * power_of_slopes(objective, state).off_by(1)
-        return min(rate, _STEEP) if are_steep else rate * max(change.shown, _SMALLEST)
+        steep = min(rate, _STEEP)
+        return steep if _show_steep_slopes(objective, state) else max(steep, rate * max(change.shown, _SMALLEST))
     return max(rate, least) if gentle and least > 1 else rate
 
 
@@ -178,8 +179,14 @@ def _sum_of_slopes(state: State) -> float:
     return float(torch.hypot(*gradient(state.image)).sum())
 
 
+def _show_steep_slopes(objective: MyopicObjective, state: State) -> bool:
+    """Return whether scarce frames show that slopes are steep; see `rate_in_noise`."""
+    power = power_of_slopes(objective, state)
+    return power.error < _TELLING and 3 * _sum_of_slopes(state) < _GENTLE * power.off_by(1)
+
+
 def _tell(change: Change) -> bool:
-    """Return whether frames tell slopes at all."""
+    """Return whether frames tell that slopes are gentle."""
     return change.n_frames > 1 and not change.is_scarce
 
 
