@@ -150,7 +150,7 @@ def test_faint_frames_get_several_starts_though_they_are_explained(explain, monk
     assert [last_start(End.INTEGRATION, in_vain) for in_vain in (0, 2)] == [4, 4]
     assert [last_start(End.LAST_DESCENT, in_vain) for in_vain in (0, 2)] == [9, 1]
     monkeypatch.setattr(Change, "is_scarce", True)
-    for shown, most in ((0.49, 1), (0.51, 4)):  # where light is scarce an integration comes to the same from any
+    for shown, most in ((0.49, 1), (0.51, 4)):  # where light is scarce no later one is kept
         monkeypatch.setattr(Change, "shown", shown)
         assert last_start(End.INTEGRATION, 0) == most
     monkeypatch.setattr(Change, "shown", 0.49)
