@@ -50,6 +50,33 @@ def test_a_restoration_in_inference_mode_is_the_same(restoring, observation):
     assert torch.equal(found, expected)
 
 
+@pytest.mark.parametrize(
+    ("max_iterations", "exposure", "enter"), [(4000, 0.0, True), (4000, 1.0, True), (3, 0.0, False), (3, 1.0, False)]
+)
+def test_modes_that_are_asked_for_enter_after_a_faint_search(max_iterations, exposure, enter, observation):
+    """The search is that of six modes; one that is cut short leaves the others at zero."""
+    course = {"segment": 5, "sharp_after": 5, "start_iterations": 10, "escapes": 0, "faint_starts": 1, "starts": 1}
+    schedule = Schedule(faint=math.inf, rounds=2, moves=2, **course)
+
+    def restore(n_modes, **kwargs):
+        options = {"schedule": schedule, "max_iterations": max_iterations, "exposure_tau0": exposure}
+        method = MyopicDeconvolution(observation.aperture, observation.grid, n_modes, **options)
+        return method.restore(observation.frames, **kwargs)
+
+    records = []
+    six, ten = restore(6), restore(10, callback=records.append, n_samples=2)
+    assert torch.equal(ten.cost, six.cost)
+    shown = [record.arrays["coefficients"] for record in records if record.stage == "restoration" and record.arrays]
+    assert {coefficients.shape[-1] for coefficients in shown} == {6}
+    shape = (len(observation.frames), observation.aperture.n_subapertures, 10)
+    assert ten.coefficients.shape == shape
+    assert ten.coefficients_std.shape == shape[1:]
+    assert (ten.motion is not None) == (exposure > 0)
+    further = ten.coefficients[..., 6:].abs()
+    rounding = 1e-9
+    assert bool((further > rounding).all() if enter else (further < rounding).all())
+
+
 def test_nothing_but_the_frames_is_needed(observe):
     """Over 16 seeds the error is 1.068 times that with turbulence and noise known, and r0 is 0.980 of the true one.
 

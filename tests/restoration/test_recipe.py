@@ -12,7 +12,7 @@ from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.band import Band
 from torchmask.optics.zernike import zernike_basis
 from torchmask.restoration.aberrations import turbulent_basis
-from torchmask.restoration.recipe import FULL_MODES, ModelRecipe
+from torchmask.restoration.recipe import FULL_MODES, MASK_MODES, ModelRecipe
 
 GRID = Grid.nyquist(1.0, 550e-9, 32)
 HERE = [[0.0, 0.3], [0.3, -0.2], [-0.3, -0.15]]
@@ -119,3 +119,28 @@ def test_a_pixel_scale_in_another_unit_is_told_before_the_holes_are_sampled():
     """Milliarcseconds for arcseconds: each hole had some 10^7 samples then."""
     with pytest.raises(ValueError, match="undersamples an aperture"):
         recipe(grid=replace(GRID, pixel_scale=1e30 * GRID.pixel_scale))
+
+
+@pytest.mark.parametrize(
+    ("options", "blind", "first", "then"),
+    [
+        ({"frame_modes": 10}, True, MASK_MODES, 10),
+        ({"frame_modes": 10}, False, 10, 10),  # they begin with aberrations that are known, or were found before
+        ({"frame_modes": 10, "whitened": False}, True, 10, 10),
+        ({"frame_modes": 10, "static_modes": 15}, True, MASK_MODES, 10),
+        ({"frame_modes": MASK_MODES, "last_modes": 28}, True, MASK_MODES, MASK_MODES),  # as nobody asks for more
+        ({"frame_modes": 3}, True, 3, 3),
+    ],
+)
+def test_a_faint_search_has_at_most_six_modes(options, blind, first, then):
+    made = recipe(grid=Grid.nyquist(1.0, 550e-9, 48), **options)
+    faint = made.for_frames(blind=blind, faint=True)
+    assert (faint.frame_modes, faint.last_modes) == (first, then)
+    assert replace(faint, frame_modes=made.frame_modes, last_modes=made.last_modes) == made
+    assert (faint.finer_basis() is None) == (first == then)
+    assert made.for_frames(blind=blind, faint=False) is made
+
+
+def test_a_full_pupil_has_all_its_modes_however_faint():
+    made = recipe(FullAperture(1.0), frame_modes=10, last_modes=15)
+    assert made.for_frames(blind=True, faint=True) is made

@@ -72,6 +72,12 @@ class Setting:
             return state
         return self._in_modes(state, Modes.FINER)
 
+    def in_all_modes(self, state: State, seed: int) -> State:
+        """Return the state in the basis `finer`, in motion if aberrations change; the state itself if there is none."""
+        if self.finer is None or self.finer() is None:
+            return state
+        return self.in_finer_modes(self.in_motion(state, seed))
+
     def in_first_modes(self, state: State) -> State:
         """Return the state with the part of its aberrations that the modes of the search can represent."""
         if state.modes is not Modes.FINER:

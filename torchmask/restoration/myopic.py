@@ -27,7 +27,7 @@ from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.parallel import each_on_a_core
 from torchmask.restoration.priors import ObjectPrior
 from torchmask.restoration.projected_lbfgs import Minimizer, ProjectedLBFGS
-from torchmask.restoration.recipe import FULL_MODES, ModelRecipe
+from torchmask.restoration.recipe import FULL_MODES, MASK_MODES, ModelRecipe
 from torchmask.restoration.result import RestorationResult
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.solver import Solver
@@ -45,8 +45,7 @@ class MyopicDeconvolution:
         1/2 sum_t || (g_t window(h_t(a_t) * o) + b_t - y_t) / sigma ||^2  +  prior(o)  +  1/2 ||z||^2
 
     starting from the clipped mean frame, with the best-fitting background b_t. `torchmask.restoration.solver` describes
-    the algorithm: how it updates the noise sigma and the transmissions g_t, and how it escapes from local minima.
-    `torchmask.restoration.finish` describes the end, which for a mask depends on how faint the frames are.
+    the algorithm, and `torchmask.restoration.finish` its end, which for a mask depends on how faint the frames are.
 
     Parameters
     ----------
@@ -55,8 +54,8 @@ class MyopicDeconvolution:
     grid : Grid
         Grid of the frames.
     n_modes : int, optional
-        Number of Zernike modes per sub-aperture, from Noll index 1. None: 231 for a full pupil, 6 for a mask. The last
-        descent, if there is one, then has more (`Schedule.last_modes`), of which the result holds these first ones.
+        Number of Zernike modes of each sub-aperture in the result. None: 231 for a full pupil, 6 for a mask; a last
+        descent then has more (`Schedule.last_modes`). In faint frames of a mask those after 6 enter after the search.
     r0 : float, optional
         Fried parameter of the turbulence [m]. None: it is estimated from the restored aberrations.
     outer_scale : float, optional
@@ -69,8 +68,8 @@ class MyopicDeconvolution:
         Relative flux at each wavelength, any positive numbers. None: equal.
     static_modes : int
         Number of Zernike modes per sub-aperture, Noll 1 to static_modes, of aberrations common to all frames (of the
-        telescope), besides the `n_modes` of each frame. Their prior is turbulence with r0 equal to the sub-aperture
-        diameter. Coefficients are the sum of both, with max(n_modes, static_modes) modes.
+        telescope), with r0 the sub-aperture diameter in their prior, besides the `n_modes` of each frame. Coefficients
+        are the sum of both, with max(n_modes, static_modes) modes.
     background : Background, float or tensor
         Uniform light that does not come from the object, see `Background`; or the known background [electrons per
         pixel], a number or a tensor that broadcasts to the frames. Its photon noise is taken into account.
@@ -149,14 +148,13 @@ class MyopicDeconvolution:
         check_numbers(readout_noise, max_iterations, tolerance)
         if wavelengths is None and weights is not None:
             raise ValueError("weights are given without wavelengths: give both")
-        self.many_minima: bool = aperture.n_subapertures == 1
-        self.known_r0: bool = r0 is not None
+        self.many_minima, self.known_r0 = aperture.n_subapertures == 1, r0 is not None
         self.schedule: Schedule = schedule or Schedule()
         self.recipe: ModelRecipe = ModelRecipe(
             aperture,
             grid,
             Band.of([grid.wavelength] if wavelengths is None else wavelengths, weights),
-            frame_modes=(FULL_MODES if self.many_minima else 6) if n_modes is None else n_modes,
+            frame_modes=(FULL_MODES if self.many_minima else MASK_MODES) if n_modes is None else n_modes,
             last_modes=self.schedule.most_modes(self.many_minima) if n_modes is None else 0,
             static_modes=static_modes,
             # The holes of a mask are usually about r0 wide; a full pupil that needs a restoration spans several r0.
@@ -169,8 +167,7 @@ class MyopicDeconvolution:
             device=device,
         )
         self.refinement: Refinement = Refinement.of(refine_geometry, aperture)
-        self.readout_noise: float | None = readout_noise
-        self.background: Background | float | Tensor = background
+        self.readout_noise, self.background = readout_noise, background
         self.max_iterations, self.tolerance = max_iterations, tolerance
         self.prior: ObjectPrior = as_prior(TotalVariation() if prior is None else prior)
         self.minimizer: Minimizer = minimizer or ProjectedLBFGS()
@@ -263,13 +260,16 @@ class MyopicDeconvolution:
         stack = self._stack(frames, valid, errors)
         (look := look_at_mask(stack.frames, self.recipe.aperture, self.recipe.grid)).warn(stacklevel=2)
         known = Known.of(coefficients, covariance, known_object)
-        model = self.model if known.covariance is None else self.recipe.estimated_model(known.covariance)
+        blind, faint = known.nothing and start is None, stack.change.each < self.schedule.faint
+        recipe = self.recipe.for_frames(blind=blind, faint=faint)
+        model = self.model if recipe.frame_modes == self.recipe.frame_modes else recipe.turbulent_model()
+        model = model if known.covariance is None else recipe.estimated_model(known.covariance)
         model, stack = model.beside(stack.free), stack.to(model.dtype, model.device)
         with torch.inference_mode(False), each_on_a_core(model.device) as parallel:
             objective = MyopicObjective(
                 model, stack.frames, stack.precision, self.prior, free=known.free, parallel=parallel
             )
-            traits, later = self._traits(known, seed), self.recipe.later_bases(model.aberrations, blind=known.nothing)
+            traits, later = self._traits(known, seed), recipe.later_bases(model.aberrations, blind=known.nothing)
             solver = Solver(objective, stack, traits, self.schedule, self.minimizer, callback, *later)
             settings = (replace(traits, max_iterations=0, tolerance=0.0), self.minimizer, self.schedule)
             check_prior(self.prior, model.window.embed(stack.frames.mean(0).clamp(min=0)).double())
