@@ -31,7 +31,7 @@ class Setting:
     told : the mask as the user describes it
     still : basis of the aberrations of snapshots
     moving : the same basis with changes during the exposure; None: frames are snapshots
-    finer : makes the basis with more modes, and with the same changes, for the last descent; None: there are no more
+    finer : makes the basis with more modes, and with the same changes, for after the search; None: there are no more
     """
 
     told: Aperture
@@ -72,11 +72,14 @@ class Setting:
             return state
         return self._in_modes(state, Modes.FINER)
 
-    def in_all_modes(self, state: State, seed: int) -> State:
-        """Return the state in the basis `finer`, in motion if aberrations change; the state itself if there is none."""
+    def in_all_modes(self, state: State) -> State:
+        """Return the state in the basis `finer`; the state itself if there is none. A change that it awaits is zero."""
         if self.finer is None or self.finer() is None:
             return state
-        return self.in_finer_modes(self.in_motion(state, seed))
+        if self.awaits_motion(state):
+            still = state.z.new_zeros(len(state.z), self._n_changes)
+            state = replace(state, z=self._widened(state.z, still), modes=Modes.MOVING)
+        return self._in_modes(state, Modes.FINER)
 
     def in_first_modes(self, state: State) -> State:
         """Return the state with the part of its aberrations that the modes of the search can represent."""

@@ -55,7 +55,7 @@ class MyopicDeconvolution:
         Grid of the frames.
     n_modes : int, optional
         Number of Zernike modes of each sub-aperture in the result. None: 231 for a full pupil, 6 for a mask; a last
-        descent then has more (`Schedule.last_modes`). In faint frames of a mask those after 6 enter after the search.
+        descent then has more (`Schedule.last_modes`). A blind search in faint frames of a mask has the first 6 at most.
     r0 : float, optional
         Fried parameter of the turbulence [m]. None: it is estimated from the restored aberrations.
     outer_scale : float, optional
@@ -260,11 +260,11 @@ class MyopicDeconvolution:
         stack = self._stack(frames, valid, errors)
         (look := look_at_mask(stack.frames, self.recipe.aperture, self.recipe.grid)).warn(stacklevel=2)
         known = Known.of(coefficients, covariance, known_object)
+        stack = stack.to(self._model.dtype, self._model.device)
         blind, faint = known.nothing and start is None, stack.change.each < self.schedule.faint
         recipe = self.recipe.for_frames(blind=blind, faint=faint)
         model = self.model if recipe.frame_modes == self.recipe.frame_modes else recipe.turbulent_model()
-        model = model if known.covariance is None else recipe.estimated_model(known.covariance)
-        model, stack = model.beside(stack.free), stack.to(model.dtype, model.device)
+        model = (model if known.covariance is None else recipe.estimated_model(known.covariance)).beside(stack.free)
         with torch.inference_mode(False), each_on_a_core(model.device) as parallel:
             objective = MyopicObjective(
                 model, stack.frames, stack.precision, self.prior, free=known.free, parallel=parallel

@@ -70,7 +70,7 @@ class Solver:
     moving : AberrationBasis, optional
         Aberrations that change during a frame. None: frames are snapshots.
     finer : callable, optional
-        Makes the aberrations with more modes for the last descent. None: there are no more.
+        Makes the aberrations with more modes for after the search. None: there are no more.
     """
 
     def __init__(
@@ -123,7 +123,7 @@ class Solver:
         if len(ended.explained) > 1 and ended.finer is None:
             average_starts(self.objective, ended, self.schedule, self.minimizer, self.callback)
         if self.end is End.INTEGRATION:  # modes that are asked for, but that a search in faint frames does without
-            ended.state = self.setting.in_all_modes(ended.state, self.traits.seed)
+            ended.state = self.setting.in_all_modes(ended.state)
             self._place(ended.state)
         if self.end is not End.NONE and (ended.starts > 1 or not cut_short):
             how = (self.schedule, self.minimizer, self.callback, self.traits, save_nothing if cut_short else save)

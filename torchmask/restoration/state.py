@@ -18,7 +18,7 @@ class Modes(Enum):
 
     STILL = "those of snapshots"
     MOVING = "the same, which change during the exposure"
-    FINER = "more of them, for the last descent"
+    FINER = "more of them, after the search"
 
 
 @dataclass(frozen=True)
