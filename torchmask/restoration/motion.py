@@ -68,13 +68,11 @@ class Setting:
 
     def in_finer_modes(self, state: State) -> State:
         """Return the state in the basis `finer`, with the same aberrations; the state itself if there is none."""
-        if self.finer is None or self.awaits_motion(state) or self.finer() is None:
-            return state
-        return self._in_modes(state, Modes.FINER)
+        return state if self.awaits_motion(state) or not self._has_finer else self._in_modes(state, Modes.FINER)
 
     def in_all_modes(self, state: State) -> State:
         """Return the state in the basis `finer`; the state itself if there is none. A change that it awaits is zero."""
-        if self.finer is None or self.finer() is None:
+        if not self._has_finer:
             return state
         if self.awaits_motion(state):
             still = state.z.new_zeros(len(state.z), self._n_changes)
@@ -102,6 +100,10 @@ class Setting:
                 centre = self._widened(centre, centre.new_zeros(len(centre), self._n_changes))
         model = model.through(model.pupil.aperture, basis.to(model.device))
         return objective.with_changes(model=model, centre=centre)
+
+    @property
+    def _has_finer(self) -> bool:
+        return self.finer is not None and self.finer() is not None
 
     @property
     def _n_changes(self) -> int:

@@ -54,7 +54,7 @@ class MyopicDeconvolution:
     grid : Grid
         Grid of the frames.
     n_modes : int, optional
-        Number of Zernike modes of each sub-aperture in the result. None: 231 for a full pupil, 6 for a mask; a last
+        Number of Zernike modes per sub-aperture, from Noll index 1. None: 231 for a full pupil, 6 for a mask; a last
         descent then has more (`Schedule.last_modes`). A blind search in faint frames of a mask has the first 6 at most.
     r0 : float, optional
         Fried parameter of the turbulence [m]. None: it is estimated from the restored aberrations.
