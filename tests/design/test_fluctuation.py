@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from exact_turbulence import drawn_powers, perfect_power
 from scipy.integrate import quad
 from scipy.special import expn
 from scipy.stats import gamma
@@ -95,6 +96,33 @@ def test_the_mean_error_of_random_pistons_is_predicted(n_photons):
     error = float(drawn.std()) / math.sqrt(n_draws)
     # the skewness of a Gamma distribution, which two equal pairs lack, is of the relative order 2 V / (K P^2) = 1 / K
     assert term == pytest.approx(float(drawn.mean()), abs=3 * error + term / n_frames)
+
+
+@pytest.mark.parametrize("n_photons", [1e5, 1e7])
+def test_the_mean_error_of_exposures_is_predicted_to_one_percent(n_photons):
+    """The promise for masks under turbulence, here of holes of 0.8 r0: what 10 exposures cost above their mean |OTF|^2.
+
+    That mean is of the draws themselves, 1000 from the exact covariance, so that their samples make no difference.
+    """
+    n_frames, seeing = 10, Seeing(0.25, 20.0)
+    draws = {"n_draws": 1000, "oversampling": 3, "generator": torch.Generator().manual_seed(0)}
+    power = torch.cat(list(drawn_powers(REDUNDANT, GRID, seeing, **draws)))
+    criterion = TurbulentMSE(
+        GRID, PowerLawPSD(1.5, n_photons), NoisePSD(n_photons), n_frames, seeing.r0, seeing.outer_scale
+    )
+    seen = perfect_power(REDUNDANT, GRID, oversampling=3) > 0.02 / 5**2  # the promise is for what the mask transmits
+    criterion.object_psd[~seen] *= 1e-12
+    criterion.load_state_dict(criterion.state_dict())  # it keeps what follows from them
+    noise, mean = criterion.noise_psd / n_frames, power.mean(0)
+    ratio, stacks = noise / criterion.object_psd, power.unflatten(0, (-1, n_frames)).mean(1)
+    # the errors less their first order in |OTF|^2, which is 0 on average
+    errors = (noise / (stacks + ratio) + noise * (stacks - mean) / (mean + ratio) ** 2).mean((-2, -1))
+    drawn, scatter = float(errors.mean()), float(errors.std()) / math.sqrt(len(errors))
+    term = float(criterion.jensen_term(REDUNDANT))
+    # the mean of all draws fluctuates too, a hundredth as much
+    predicted = float((noise / (mean + ratio)).mean()) + term * (1 - n_frames / len(power))
+    assert predicted == pytest.approx(drawn, abs=0.01 * drawn + 3 * scatter)
+    assert term > 0.02 * drawn + 3 * scatter  # so that what leaves it out is seen
 
 
 def test_without_r0_the_term_is_that_of_pistons():

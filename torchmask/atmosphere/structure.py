@@ -70,8 +70,8 @@ class StructureFunction:
         # The offset, a billionth of r0 squared, keeps the derivative finite at 0. As few passes over arrays as can be.
         squared = torch.addcmul(x.new_tensor(1e-18 * self.r0**2), x, x).addcmul_(y, y)
         if math.isinf(self.outer_scale):
-            scale = x.new_tensor(math.log(STRUCTURE_CONSTANT) - 5 / 3 * math.log(self.r0))
-            return torch.add(scale, squared.log(), alpha=5 / 6).exp_()  # a power takes twice as long
+            scale = x.new_tensor(math.log2(STRUCTURE_CONSTANT) - 5 / 3 * math.log2(self.r0))
+            return torch.add(scale, squared.log2(), alpha=5 / 6).exp2_()  # a power takes twice as long
         unit = squared.mul_(1 / self.r0**2)
         longest = min(self.reach, _SATURATED * self.outer_scale)
         root = torch.exp(unit.clamp(max=(longest / self.r0) ** 2).log() / 6)  # (r / r0)^(1/3)

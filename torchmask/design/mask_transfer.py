@@ -9,7 +9,7 @@ pairs of holes whose baselines nearly agree (`torchmask.design.lens_pairs`, `tor
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property, partial
+from functools import cached_property, partial, reduce
 
 import torch
 from torch import Tensor
@@ -79,7 +79,7 @@ class MaskTransfer:
 
     def _transfer(self, centers: Tensor) -> Tensor:
         lenses = self.patches(centers)
-        power = (lenses.kept**2).sum(0)
+        power = reduce(torch.add, [mode * mode for mode in lenses.kept])
         power[:, 0] *= centers.shape[1] / 2  # every patch counts twice in the end, at nu and at -nu
         alone = self.plane.summed(lenses.index, power)
         together = alone.addcmul_(self.pairs(lenses, centers), self.far)

@@ -91,12 +91,14 @@ class PairCoherence:
         Lenses have the baselines `first` and `second` (E, 2) and middles a `separation` (E, 2) apart; the baselines
         are `step` (E, 2) apart, all in m.
         """
-        nodes = torch.arange(n, dtype=first.dtype, device=first.device) - (n - 1) / 2
-        nodes = torch.stack(torch.meshgrid(nodes, nodes, indexing="xy"), -1)
-        first, second, separation, step = (one[:, None, None] for one in (first, second, separation, step))
-        parts = torch.broadcast_tensors((first + second) / 2 + step * nodes, first, second, separation)
-        found = by_chunks(self._over_far, torch.stack(parts, -2).flatten(0, 2), _CHUNK.on(step.device))
-        return found.view(-1, n, n)
+        node = torch.arange(n, dtype=first.dtype, device=first.device) - (n - 1) / 2
+        nodes = torch.stack(torch.meshgrid(node, node, indexing="xy")).flatten(1)[..., None]  # (2, n * n, 1)
+        first, second, separation, step = (one.T[:, None] for one in (first, second, separation, step))
+        parts = torch.broadcast_tensors(torch.addcmul((first + second) / 2, nodes, step), first, second, separation)
+        # coordinate by coordinate in memory
+        places = torch.stack(parts).flatten(2).permute(2, 0, 1)
+        found = by_chunks(self._over_far, places, _CHUNK.on(step.device))
+        return found.view(n * n, -1).T.unflatten(1, (n, n))
 
     def _over_far(self, places: Tensor) -> Tensor:
         """Return the coherence (Q,) over `far` at baselines of two lenses, by `places` (Q, 4, 2) [m].
@@ -124,9 +126,10 @@ class PairCoherence:
 
     def _axes(self, x: Tensor, y: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Return x and y (Q,) of the two axes in which `_POINTS` count, for two lenses at the places (x, y) (2, Q)."""
-        xx, xy, yy = (parts.sum(0) + drift for parts, drift in zip(self._moments(x, y), self.drift, strict=True))
+        moments = zip(self._moments(x, y), self.drift, strict=True)
+        xx, xy, yy = (torch.add(one, other).add_(drift) for (one, other), drift in moments)
         # the symmetric square root: a mask that is turned by 90 degrees has the same points
-        root = torch.sqrt((xx * yy - xy**2).clamp(min=1e-6 * self.variance**2))
+        root = torch.sqrt(torch.addcmul(xx * yy, xy, xy, value=-1).clamp(min=1e-6 * self.variance**2))
         trace = torch.sqrt(xx + yy + 2 * root)
         skew = xy / trace
         return [((xx + root) / trace, skew), (skew, (yy + root) / trace)]
@@ -158,10 +161,11 @@ class PairCoherence:
         the hole's diameter.
         """
         x, y = x / self.reach, y / self.reach
-        square = torch.addcmul(x * x, y, y) + 1e-4
+        square = torch.addcmul(x.new_tensor(1e-4), x, x).addcmul_(y, y)
         r = torch.sqrt(square)
-        inside = (1 - r).clamp(min=0.03)  # no lens: it has no weight either
-        height, width = inside * (1 + 0.6 * r), inside * inside * (1 - 0.1 * r)
+        inside = torch.rsub(r, 1).clamp(min=0.03)  # no lens: it has no weight either
+        height, width = torch.addcmul(inside, inside, r, value=0.6), inside * inside
+        width = torch.addcmul(width, width, r, value=-0.1)
         narrow, base = (width - height) * (self.variance / square), height * self.variance
         along, across = narrow * x, narrow * y
         return torch.addcmul(base, along, x), along * y, torch.addcmul(base, across, y)
