@@ -6,8 +6,9 @@
 
 A filter of even transmission collects light in proportion to its width, while the path differences of the turbulence
 blur the fringes of its wavelengths, and each wavelength has baselines of its own. Mask and full pupil are restored by
-the library's defaults, which are told the band as three wavelengths. Pixels are small enough for the shortest
-wavelength of the widest filter. --n-photons is the light in a tenth of the wavelength.
+the library's defaults, which are told the band as five wavelengths, as `torchmask restore` is; the light has nine.
+Pixels are small enough for the shortest wavelength of the widest filter. --n-photons is the light in a tenth of the
+wavelength.
 """
 
 from __future__ import annotations

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 WIND = 10.0  # [m/s]; only the exposure over tau0 matters
+N_SIMULATED, N_TOLD = 9, 5  # wavelengths of a band: neighbours of nine in the widest lie nearer than a hole is wide
 SIZE = 0.5  # of the scene over the field of view
 _MEAN = 0.683  # confidence of the bars: one standard error
 
@@ -112,14 +113,14 @@ def measure(task: Mapping[str, Any]) -> dict[str, Any]:
     width = task.get("band", 0.0) * WAVELENGTH
     conditions = Conditions(
         exposure_time=task.get("exposure", 0.0) * layers.tau0(WAVELENGTH),
-        band=Band.top_hat(WAVELENGTH, width, 5) if width else None,
+        band=Band.top_hat(WAVELENGTH, width, N_SIMULATED) if width else None,
     )
     observation = simulate_observation(
         *(scene, aperture, grid, LayeredPhase(layers, WAVELENGTH, task["outer_scale"] * DIAMETER)),
         *(Detector(task["readout_noise"]), task["n_frames"], torch.Generator().manual_seed(task["seed"])),
         conditions=conditions,
     )
-    told = Band.top_hat(WAVELENGTH, width, 3) if width else Band.of([WAVELENGTH])
+    told = Band.top_hat(WAVELENGTH, width, N_TOLD) if width else Band.of([WAVELENGTH])
     published = {"aberration_prior": False, "background": Background.NONE, "schedule": Schedule.plain()}
     method = MyopicDeconvolution(
         *(aperture, grid, task.get("modes")),

@@ -9,7 +9,9 @@ import torch
 from torchmask.cli.main import main
 from torchmask.cli.program import NOT_EXPLAINED
 from torchmask.design.manufacture import load_mask, mask_wavelength
-from torchmask.grid import Grid
+from torchmask.grid import ARCSEC, Grid
+from torchmask.instrument.instrument import Instrument
+from torchmask.instrument.parts import Camera, Site, Source, Telescope
 from torchmask.observation import Observation
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.detector import Detector
@@ -36,7 +38,20 @@ def star(tmp_path):
 
 
 def test_the_mask_where_it_lies_is_written(star, tmp_path, capsys):
-    assert main(["calibrate", str(star), "--out", str(tmp_path / "run")]) == 0
+    instrument = Instrument(
+        telescope=Telescope(diameter=1.0),
+        source=Source(magnitude=2.0, size=0.1),
+        site=Site(r0=0.3, wind=5.0),
+        camera=Camera(n_pixels=64, readout_noise=1.0, pixel_scale=GRID.pixel_scale / ARCSEC),
+        wavelength=GRID.wavelength,
+        width=20e-9,
+        exposure=3e-3,
+        n_frames=1,
+    )
+    instrument.save(tmp_path / "plan.json")
+    told = ["--instrument", str(tmp_path / "plan.json"), "--out", str(tmp_path / "run")]
+    assert main(["calibrate", str(star), *told]) == 0
+    assert Instrument.load(tmp_path / "run/instrument.json") == instrument
     numbers = json.loads((tmp_path / "run" / "calibration.json").read_text())
     assert abs(numbers["rotation"] - 0.02) < 4 * numbers["errors"]["rotation"] + 1e-4
     assert numbers["frame_numbers"] == [3]  # as the file has them

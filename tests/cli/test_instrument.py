@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import shutil
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,7 @@ import yaml
 from torchmask.cli import design, plan, rank, restore
 from torchmask.cli.main import main
 from torchmask.cli.options import MaskOptions, load_aperture
-from torchmask.cli.program import parse
+from torchmask.cli.program import NOT_EXPLAINED, parse
 from torchmask.cli.stacks import StackOptions, read_stack
 from torchmask.design.manufacture import load_mask, mask_wavelength
 from torchmask.design.observed import instrument_criterion
@@ -268,3 +269,15 @@ def test_files_that_are_no_instrument_are_refused(command, folder, capsys):
     (folder / "config.yaml").write_text(f"command: {command}\n")
     assert main([command, *told]) == 1
     assert "give one" in capsys.readouterr().err
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")  # of frames that are random numbers
+@pytest.mark.parametrize("n_stacks", [1, 2])
+def test_a_restoration_keeps_the_instrument_that_it_was_told(n_stacks, folder, recorded):
+    files = [str(*stack_of(folder))] * n_stacks
+    if n_stacks == 2:
+        shutil.copyfile(files[0], folder / "other.npz")
+        files[1] = str(folder / "other.npz")
+    told = ["--instrument", str(folder / "instrument.json"), "--out", str(folder / "run"), "--max-iterations", "2"]
+    assert main(["restore", *files, *told]) == NOT_EXPLAINED
+    assert Instrument.load(folder / "run/instrument.json") == recorded

@@ -50,6 +50,7 @@ def run(options: Options) -> None:
     require_one_pixel(options, options.estimate_pixel)
     seen = read_stack(options.stacks, options)
     with new_run("calibrate", options) as output:
+        output.keep_instrument(options.known_instrument())
         found = calibrate_on(seen, options.estimate_pixel, options.n_modes, output.callback)
         write_calibration(output, found, options.stacks, seen.grid.wavelength)
 

@@ -155,6 +155,7 @@ def restore_one(files: Sequence[Path], options: Options, star: MaskCalibration |
     method = deconvolution(observation, options)
     observables = measure_frames(observation, options, known_sky(options))
     with new_run("restore", options) as output:
+        output.keep_instrument(options.known_instrument())
         state = output.directory / CHECKPOINT
         if checkpoint is not None:
             shutil.copyfile(checkpoint, state)
@@ -199,6 +200,7 @@ def restore_several(stacks: Mapping[str, Sequence[Path]], options: Options, star
     if not observations:
         raise _failed(failures, len(stacks))
     with new_run("restore", options) as output:
+        output.keep_instrument(options.known_instrument())
         names, seen = list(observations), list(observations.values())
         if star is not None and options.star is not None:
             write_calibration(output, star, [options.star], seen[0].grid.wavelength)
