@@ -25,6 +25,9 @@ from trade import Trade, figure, predictions
 from torchmask.cli.program import run_script
 from torchmask.cli.run import new_run
 
+N_SIMULATED = 9  # wavelengths of the light: more than are told, so that what these leave out costs something
+N_TOLD = 5  # those of `torchmask restore`
+
 
 @dataclass(frozen=True, kw_only=True)
 class Options(ObservingOptions):
@@ -54,10 +57,8 @@ def run(options: Options) -> None:
     with new_run("band", options) as output:
         finer = math.ceil(100 / (1 - widest / 2)) / 100
         # at a fixed source
-        settings = [
-            {"band": width, "n_photons": options.n_photons * width / 0.1, "oversampling": finer}
-            for width in options.widths
-        ]
+        common = {"oversampling": finer, "n_simulated": N_SIMULATED, "n_told": N_TOLD}
+        settings = [common | {"band": width, "n_photons": options.n_photons * width / 0.1} for width in options.widths]
         rows = observe(options, "band", settings, output.callback)
         trade = Trade(
             key="band",

@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 WIND = 10.0  # [m/s]; only the exposure over tau0 matters
-N_SIMULATED, N_TOLD = 9, 5  # wavelengths of a band: neighbours of nine in the widest lie nearer than a hole is wide
 SIZE = 0.5  # of the scene over the field of view
 _MEAN = 0.683  # confidence of the bars: one standard error
 
@@ -101,8 +100,8 @@ def measure(task: Mapping[str, Any]) -> dict[str, Any]:
     """Simulate under the conditions of the task, restore by the library's defaults, and score.
 
     A task may say `layers` (heights [m] and their shares of the turbulence), `exposure` [tau0] and `band` [width over
-    wavelength]. The restoration is told the band; the rest it must bear. With `modes` it is the method as first
-    published, with so many modes for each hole, or of the full pupil.
+    wavelength], of `n_simulated` wavelengths. The restoration is told the band, as `n_told` wavelengths; the rest it
+    must bear. With `modes` it is the method as first published, with so many modes for each hole, or of the full pupil.
     """
     aperture, mask = instrument(task), instrument({**task, "instrument": "mask"})
     grid = Grid.nyquist(DIAMETER, WAVELENGTH, task["n_pixels"], task.get("oversampling", 1.0))
@@ -113,14 +112,14 @@ def measure(task: Mapping[str, Any]) -> dict[str, Any]:
     width = task.get("band", 0.0) * WAVELENGTH
     conditions = Conditions(
         exposure_time=task.get("exposure", 0.0) * layers.tau0(WAVELENGTH),
-        band=Band.top_hat(WAVELENGTH, width, N_SIMULATED) if width else None,
+        band=Band.top_hat(WAVELENGTH, width, task["n_simulated"]) if width else None,
     )
     observation = simulate_observation(
         *(scene, aperture, grid, LayeredPhase(layers, WAVELENGTH, task["outer_scale"] * DIAMETER)),
         *(Detector(task["readout_noise"]), task["n_frames"], torch.Generator().manual_seed(task["seed"])),
         conditions=conditions,
     )
-    told = Band.top_hat(WAVELENGTH, width, N_TOLD) if width else Band.of([WAVELENGTH])
+    told = Band.top_hat(WAVELENGTH, width, task["n_told"]) if width else Band.of([WAVELENGTH])
     published = {"aberration_prior": False, "background": Background.NONE, "schedule": Schedule.plain()}
     method = MyopicDeconvolution(
         *(aperture, grid, task.get("modes")),

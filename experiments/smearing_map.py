@@ -64,6 +64,7 @@ from torchmask.simulation.exposures import simulate_observation
 WIND = 10.0  # in m/s; only T / tau0 counts
 FIRST = 100  # draw: scenes and turbulence are others than those of `success_map`, `exposure` and `band`
 OVERSAMPLING = 1.25  # of all bands
+N_SIMULATED, N_TOLD = 5, 3  # wavelengths of a band, of the light and in the restoration
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,7 +102,7 @@ def observe(task: Mapping[str, Any]) -> Observation:
         torch.Generator().manual_seed(task["draw"]),
         conditions=Conditions(
             exposure_time=task["exposure"] * layers.tau0(WAVELENGTH),
-            band=Band.top_hat(WAVELENGTH, width, 5) if width else None,
+            band=Band.top_hat(WAVELENGTH, width, N_SIMULATED) if width else None,
         ),
     )
 
@@ -110,7 +111,7 @@ def measure(task: Mapping[str, Any]) -> dict[str, Any]:
     """Restore, and score."""
     observation = observe(task)
     width = task["width"] * WAVELENGTH
-    told = Band.top_hat(WAVELENGTH, width, 3) if width else Band.of([WAVELENGTH])
+    told = Band.top_hat(WAVELENGTH, width, N_TOLD) if width else Band.of([WAVELENGTH])
     method = MyopicDeconvolution(
         *(observation.aperture, observation.grid),
         readout_noise=READOUT_NOISE,

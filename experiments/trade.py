@@ -14,7 +14,7 @@ import torch
 from mask_vs_full import instrument
 from mask_vs_full_options import DIAMETER, WAVELENGTH
 from mask_vs_full_report import INSTRUMENTS
-from observing import N_SIMULATED, SIZE, WIND, ObservingOptions, curves, optimum, scores, shared
+from observing import SIZE, WIND, ObservingOptions, curves, optimum, scores, shared
 
 from torchmask.atmosphere.seeing import Seeing
 from torchmask.design.sweep import run_tasks
@@ -121,7 +121,11 @@ def criterion_of(task: Mapping[str, Any], photons: float) -> TurbulentMSE:
     side, r0 = task["n_pixels"], DIAMETER / task["d_over_r0"]
     grid = Grid.nyquist(DIAMETER, WAVELENGTH, 2 * side, task.get("oversampling", 1.0))
     exposure = task.get("exposure", 0.0) * Seeing(r0, wind=WIND).tau0
-    band = Band.top_hat(WAVELENGTH, task["band"] * WAVELENGTH, N_SIMULATED) if "band" in task else Band.of([WAVELENGTH])
+    band = (
+        Band.top_hat(WAVELENGTH, task["band"] * WAVELENGTH, task["n_simulated"])
+        if "band" in task
+        else Band.of([WAVELENGTH])
+    )
     signal = PowerLawPSD(1.5, photons, 1 / (SIZE * side))(grid)
     nu_y, nu_x = grid.frequencies(signal.dtype)
     signal[torch.hypot(nu_y, nu_x) >= grid.cutoff(DIAMETER)] *= _NOTHING  # no score counts what lies beyond

@@ -77,7 +77,8 @@ def test_a_predicted_score_is_that_of_the_criterion_for_the_same_light(monkeypat
 
     monkeypatch.setattr(trade, "TurbulentMSE", note)  # its tables would take seconds
     task = {"centers": centers, "subaperture_diameter": 0.2, "n_pixels": 16, "d_over_r0": 3.0, "outer_scale": 20.0}
-    task |= {"readout_noise": 1.5, "n_frames": 4, "n_photons": 1e5, "exposure": 0.5, "band": 0.1, "instrument": "mask"}
+    task |= {"readout_noise": 1.5, "n_frames": 4, "n_photons": 1e5, "exposure": 0.5, "band": 0.1, "n_simulated": 4}
+    task["instrument"] = "mask"
     psds = PowerLawPSD(1.5, 1e5, 1 / 8), NoisePSD(1e5, 1.5, 16**2)
     criterion = AsymptoticMSE(Grid.nyquist(1.0, 550e-9, 32), *psds, 4)
     floor = criterion.relative_floor(1.0)
@@ -89,7 +90,7 @@ def test_a_predicted_score_is_that_of_the_criterion_for_the_same_light(monkeypat
     assert instants == (r0, outer_scale, 0.0, 0.0, (550e-9,), (1.0,))
     assert (r0, outer_scale, wind) == (1 / 3, 20.0, observing.WIND)
     assert exposure == pytest.approx(0.5 * 0.314 * r0 / wind, rel=1e-3)  # tau0 = 0.314 r0 / wind
-    assert (wavelengths, shares) == (Band.top_hat(550e-9, 55e-9, 5).wavelengths, Band.top_hat(550e-9, 55e-9, 5).shares)
+    assert (wavelengths, shares) == (Band.top_hat(550e-9, 55e-9, 4).wavelengths, Band.top_hat(550e-9, 55e-9, 4).shares)
 
 
 def test_a_blind_prediction_is_what_a_plan_makes_of_instants():

@@ -1,13 +1,15 @@
 """The power of fringes against closed forms: the pattern of a mask, its share, and how that share scatters."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 from torchmask.grid import Grid
-from torchmask.interferometry.fringe_power import FringePower, _smoothed, expected_power, likeness
+from torchmask.interferometry.fringe_power import FringePower, _smoothed, expected_power, fringe_wavelengths, likeness
 from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.band import Band
 from torchmask.optics.geometry import MaskGeometry
 
 GRID = Grid.nyquist(1.0, 550e-9, 64)
@@ -33,6 +35,24 @@ def test_expected_power_is_the_sum_of_the_patches_of_all_pairs():
                 shift = (place.flip(-1) - centers[m] + centers[n]) * GRID.period
                 total += mask.shape.otf(shift, mask.subaperture_diameter) ** 2
     torch.testing.assert_close(expected_power(mask, GRID)[nu[:, None], nu], total)
+
+
+def test_the_power_of_a_band_is_the_mean_over_its_wavelengths():
+    parts = [expected_power(MASK, replace(GRID, wavelength=wavelength)) for wavelength in (500e-9, 600e-9)]
+    torch.testing.assert_close(expected_power(MASK, GRID, [500e-9, 600e-9]), (parts[0] + parts[1]) / 2)
+
+
+@pytest.mark.parametrize("width", [0.05, 0.2, 0.8])
+def test_the_fringes_of_neighbouring_wavelengths_are_half_a_hole_apart_at_most(width):
+    band = Band.top_hat(550e-9, width * 550e-9)
+    ends = [1 / band.shortest, 1 / max(band.wavelengths)]
+    apart = float(MASK.extent) * 550e-9 * (ends[0] - ends[1]) / MASK.subaperture_diameter  # of both ends, in holes
+    found = [1 / wavelength for wavelength in fringe_wavelengths(MASK, GRID, band)]
+    assert len(found) == (0 if apart <= 0.5 else math.ceil(2 * apart))
+    if found:
+        steps = torch.tensor(found).diff() * float(MASK.extent) * 550e-9 / MASK.subaperture_diameter
+        assert float(steps.max()) <= 0.5 * (1 + 1e-5)  # of float32
+        assert sum(found) / len(found) == pytest.approx(sum(ends) / 2, rel=1e-9)
 
 
 def test_smoothing_is_what_a_hann_window_does_to_white_noise():

@@ -14,10 +14,12 @@ from torchmask.interferometry.calibration import calibrate_mask
 from torchmask.interferometry.fringe_power import FringePower
 from torchmask.interferometry.which_mask import ORIENTATIONS, MaskLook, look_at_mask
 from torchmask.optics.aperture import FullAperture, SparseAperture
+from torchmask.optics.band import Band
 from torchmask.optics.detector import Detector
 from torchmask.optics.geometry import MaskGeometry
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.verdict import Verdict
+from torchmask.simulation.conditions import Conditions
 from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import make_scene
 
@@ -101,6 +103,22 @@ def test_a_share_below_zero_contradicts_no_mask():
     share, error = power.match(mask)
     assert share + 2 * error < 0.6  # the least that the right mask has
     assert look_at_mask(frames, mask, grid) == MaskLook()
+
+
+@pytest.mark.parametrize("width", [0.2, 0.8])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_fringes_of_a_band_are_those_of_all_its_wavelengths(width, seed):
+    """The light has more wavelengths than are told. The pattern of one accuses the right mask of seed 2 at 0.8."""
+    mask = SparseAperture.random(14, 1.0, 0.12, torch.Generator().manual_seed(seed))
+    grid, light = Grid.nyquist(1.0, 550e-9, 64, oversampling=1.7), Band.top_hat(550e-9, width * 550e-9, 9)
+    turbulence, generator = TurbulencePhase(r0=1 / 4, outer_scale=20.0), torch.Generator().manual_seed(5)
+    seen = make_scene((64, 64), n_photons=1e6).double(), mask, grid, turbulence, Detector(1.5), 8, generator
+    frames = simulate_observation(*seen, conditions=Conditions(band=light)).frames
+    band = Band.top_hat(550e-9, width * 550e-9)
+    assert look_at_mask(frames, mask, grid, band) == MaskLook()
+    assert (look_at_mask(frames, mask, grid) == MaskLook()) == ((width, seed) != (0.8, 2))
+    turned = MaskGeometry(0.3).apply(mask)
+    assert "not those of the mask" in look_at_mask(frames, turned, grid, band).contradiction
 
 
 def test_what_a_symmetric_mask_cannot_show_is_said(frames):

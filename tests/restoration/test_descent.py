@@ -1,14 +1,16 @@
 """One descent: its scales, its bounds, its budget and what it tells its listener."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 
 from torchmask.restoration.aberrations import AberrationBasis
-from torchmask.restoration.descent import descend, scales
+from torchmask.restoration.descent import descend, place_scale, scales
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.objective import Free
+from torchmask.restoration.placement import placed_as, smallest_magnification
 from torchmask.restoration.projected_lbfgs import Minimum, ProjectedLBFGS
 
 
@@ -70,6 +72,24 @@ def test_what_is_known_stays(free, explained):
     kept, moved = ("z", "image") if free is Free.OBJECT else ("image", "z")
     torch.testing.assert_close(getattr(found, kept), getattr(begun, kept), rtol=1e-13, atol=0)
     assert not torch.allclose(getattr(found, moved), getattr(begun, moved))
+
+
+@pytest.mark.parametrize("shrinkage", [0.01, 5.0])
+def test_a_mask_shrinks_no_further_than_its_holes_can_be_sampled(shrinkage, explained):
+    """The minimiser has no upper bounds; where it goes beyond, the descent ends at the limit."""
+    objective, state = explained
+    objective = objective.with_changes(free=objective.free | Free.PLACE)
+    unit = place_scale(objective, state)
+
+    def beyond(cost, start, lower, **_):
+        end = torch.cat([start[:-2], torch.tensor([0.02, shrinkage], dtype=start.dtype) / unit])
+        return Minimum(end, cost(start)[0], 1, 1, True, "far away")
+
+    found = descend(objective, state, 1, beyond, lambda *_: None)
+    least = smallest_magnification(objective.model)
+    assert found.geometry.rotation == pytest.approx(0.02, rel=1e-9)
+    assert found.geometry.magnification == pytest.approx(max(math.exp(-shrinkage), least), rel=1e-12)
+    placed_as(objective, objective.model.pupil.aperture, found.geometry)  # its holes can be sampled
 
 
 def test_a_minimizer_sees_one_vector_with_the_object_above_zero(explained):

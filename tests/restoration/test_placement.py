@@ -26,6 +26,7 @@ from torchmask.restoration.placement import (
     moved,
     placed_as,
     slopes_of_frames,
+    smallest_magnification,
 )
 from torchmask.restoration.posterior import place_deviations
 from torchmask.restoration.result import RestorationResult
@@ -114,6 +115,18 @@ def test_a_mask_grows_no_further_than_the_pixels_sample():
     band = Band.of([500e-9, 550e-9])
     model = ExposureModel(mask, Grid.nyquist(1.0, 550e-9, 32, oversampling=1.2), 3, band)
     assert largest_magnification(model) == pytest.approx(1.2 * 500 / 550)
+
+
+@pytest.mark.parametrize("band", [None, Band.of([500e-9, 600e-9])])
+@pytest.mark.parametrize("diameter", [0.2, 0.16])
+def test_a_mask_shrinks_until_its_holes_are_two_samples_wide(band, diameter):
+    mask = SparseAperture([[0.4, 0.0], [-0.4, 0.0], [0.0, 0.3]], diameter, 1.0)
+    model = ExposureModel(mask, Grid.nyquist(1.1, 550e-9, 32, oversampling=1.2), 3, band)
+    least = smallest_magnification(model)
+    assert least < 1
+    model.through(MaskGeometry(0.1, least, least).apply(mask))
+    with pytest.raises(ValueError, match="at least 2 are needed"):
+        model.through(MaskGeometry(0.1, 0.99999 * least, 0.99999 * least).apply(mask))
 
 
 @pytest.mark.parametrize("step", [(2e-3, 0.0), (0.0, 2e-3), (-1e-3, 1.5e-3)])

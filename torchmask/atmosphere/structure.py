@@ -68,10 +68,12 @@ class StructureFunction:
     def at(self, x: Tensor, y: Tensor) -> Tensor:
         """Return the structure function (...) at displacements (x, y) (...) [m]."""
         # The offset, a billionth of r0 squared, keeps the derivative finite at 0. As few passes over arrays as can be.
-        squared = torch.addcmul(x.new_tensor(1e-18 * self.r0**2), x, x).addcmul_(y, y)
+        squared = torch.addcmul(x.new_full((), 1e-18 * self.r0**2), x, x).addcmul_(y, y)
         if math.isinf(self.outer_scale):
-            scale = x.new_tensor(math.log2(STRUCTURE_CONSTANT) - 5 / 3 * math.log2(self.r0))
-            return torch.add(scale, squared.log2(), alpha=5 / 6).exp2_()  # a power takes twice as long
+            scale = x.new_full((), math.log2(STRUCTURE_CONSTANT) - 5 / 3 * math.log2(self.r0))
+            return torch.add(
+                scale, squared.log2(), alpha=5 / 6
+            ).exp2_()  # a power takes twice as long, and so does exp_
         unit = squared.mul_(1 / self.r0**2)
         longest = min(self.reach, _SATURATED * self.outer_scale)
         root = torch.exp(unit.clamp(max=(longest / self.r0) ** 2).log() / 6)  # (r / r0)^(1/3)

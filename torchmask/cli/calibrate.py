@@ -26,8 +26,8 @@ class Options(StackOptions, RunOptions):
     """Measure rotation, magnification and mirroring of a mask on short exposures of a star or pinhole.
 
     The exposures are an .npz file or FITS files, of one star through the mask, in any turbulence. FITS files need
-    --mask. Writes mask.json, the mask with its measured geometry, for --mask of `torchmask restore`, and
-    calibration.json with all estimates and their errors to a new folder.
+    --mask. Writes mask.json, the mask with its measured geometry, for --mask of `torchmask restore`, calibration.json
+    with all estimates and their errors, and what --instrument says to a new folder.
     """
 
     stacks: tyro.conf.Positional[tuple[Path, ...]] = ()

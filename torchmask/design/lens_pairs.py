@@ -65,10 +65,10 @@ class LensPairs:
         nodes = middle.new_zeros(n_slots, 9)
         rich = largest > _RICH
         for some, n in ((rich, 3), (~rich, 1)):
-            of = some.nonzero()[:, 0]
-            places = (part.index_select(0, of) for part in (first, second, separation, step))
+            which = some.nonzero()[:, 0]
+            places = (part.index_select(0, which) for part in (first, second, separation, step))
             found = self.coherence.around(*places, n=n).flatten(1)
-            nodes = nodes.index_add(0, entries.slot.index_select(0, of), found.expand(-1, 9))
+            nodes = nodes.index_add(0, entries.slot.index_select(0, which), found.expand(-1, 9))
         one = torch.zeros_like(entries.slot[:n_slots])
         one[entries.slot] = torch.arange(len(largest), device=one.device)  # an entry of each slot
         pairs = Entries(*(part[one] for part in entries))
@@ -84,17 +84,16 @@ class LensPairs:
     def _select(self, lenses: Lenses, centers: Tensor) -> tuple[Entries, Tensor]:
         """Return the pairs that share something, and about the most that each gives anywhere."""
         n, count = centers.shape[1], lenses.baseline.shape[1]
+        one, other = torch.triu_indices(count, count, device=centers.device)
         x, y = (lenses.baseline * self.pixel).unbind(-1)
         limit, found = (2 * self.geometry.reach) ** 2, []
-        both = torch.ones(count, count, dtype=torch.bool, device=centers.device).triu()
         # lenses at baseline 0 are their own opposites: what they share with another's opposite, they share with it
-        opposite = both.clone()
-        opposite[0] = False
-        for sign, allowed in ((1, both.triu(1)), (-1, opposite)):
-            dx, dy = self._between([sign * part[:, :, None] for part in (x, y)], [part[:, None] for part in (x, y)])
-            near = torch.addcmul(dx * dx, dy, dy) < limit
-            mask, i, j = near.logical_and_(allowed).nonzero().unbind(-1)
-            found.append((mask, mask * count + i, mask * count + j, torch.full_like(mask, sign)))
+        for sign, allowed in ((1, one < other), (-1, one > 0)):
+            i, j = one[allowed], other[allowed]
+            first, second = ([part.index_select(1, lens) for part in (x, y)] for lens in (i, j))
+            dx, dy = self._between([sign * part for part in first], second)
+            mask, pair = (dx * dx + dy * dy < limit).nonzero().unbind(-1)
+            found.append((mask, mask * count + i[pair], mask * count + j[pair], torch.full_like(mask, sign)))
         columns = [torch.cat(parts) for parts in zip(*found, strict=True)]
         columns.append(torch.arange(len(columns[0]), device=centers.device))
         central = columns[1] % count == 0
@@ -102,9 +101,9 @@ class LensPairs:
         mask, first, second, sign, slot = (column.index_select(0, order) for column in columns)
         entries = Entries(mask, first, second, sign, mask * n + torch.arange(len(mask), device=mask.device) % n, slot)
         largest = self._largest(*self._places(entries, lenses, centers))
-        counts = (largest > _SMALLEST).nonzero()[:, 0]
-        entries = Entries(*(column.index_select(0, counts) for column in entries))
-        return entries._replace(slot=torch.unique(entries.slot, return_inverse=True)[1]), largest[counts]
+        kept = (largest > _SMALLEST).nonzero()[:, 0]
+        entries = Entries(*(column.index_select(0, kept) for column in entries))
+        return entries._replace(slot=torch.unique(entries.slot, return_inverse=True)[1]), largest[kept]
 
     def _places(self, entries: Entries, lenses: Lenses, centers: Tensor) -> list[Tensor]:
         """Return the baselines of both lenses of each entry and the separation of their middles, (E, 2) [m]."""

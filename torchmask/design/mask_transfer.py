@@ -79,7 +79,7 @@ class MaskTransfer:
 
     def _transfer(self, centers: Tensor) -> Tensor:
         lenses = self.patches(centers)
-        power = reduce(torch.add, [mode * mode for mode in lenses.kept])
+        power = reduce(torch.add, (mode * mode for mode in lenses.kept))  # one mode is not copied, as a sum would
         power[:, 0] *= centers.shape[1] / 2  # every patch counts twice in the end, at nu and at -nu
         alone = self.plane.summed(lenses.index, power)
         together = alone.addcmul_(self.pairs(lenses, centers), self.far)

@@ -95,7 +95,7 @@ class PairCoherence:
         nodes = torch.stack(torch.meshgrid(node, node, indexing="xy")).flatten(1)[..., None]  # (2, n * n, 1)
         first, second, separation, step = (one.T[:, None] for one in (first, second, separation, step))
         parts = torch.broadcast_tensors(torch.addcmul((first + second) / 2, nodes, step), first, second, separation)
-        # coordinate by coordinate in memory
+        # each coordinate in one piece, as `_over_far` takes them
         places = torch.stack(parts).flatten(2).permute(2, 0, 1)
         found = by_chunks(self._over_far, places, _CHUNK.on(step.device))
         return found.view(n * n, -1).T.unflatten(1, (n, n))
@@ -161,9 +161,9 @@ class PairCoherence:
         the hole's diameter.
         """
         x, y = x / self.reach, y / self.reach
-        square = torch.addcmul(x.new_tensor(1e-4), x, x).addcmul_(y, y)
+        square = torch.addcmul(x.new_full((), 1e-4), x, x).addcmul_(y, y)
         r = torch.sqrt(square)
-        inside = torch.rsub(r, 1).clamp(min=0.03)  # no lens: it has no weight either
+        inside = (1 - r).clamp(min=0.03)  # no lens: it has no weight either
         height, width = torch.addcmul(inside, inside, r, value=0.6), inside * inside
         width = torch.addcmul(width, width, r, value=-0.1)
         narrow, base = (width - height) * (self.variance / square), height * self.variance

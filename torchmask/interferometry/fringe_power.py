@@ -6,7 +6,8 @@ Fringes have power only at the baselines of the mask, whatever the object, the p
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.band import Band
 from torchmask.optics.phasor import phasor
 
 _AT_A_TIME = 32  # frames
@@ -26,7 +28,7 @@ class Match(NamedTuple):
     """How much of a mask's pattern the power of fringes shows.
 
     share : 1 if the pattern is that of the mask, 0 if it has nothing to do with it; in frames of extended objects the
-        right mask has 0.5 to 1, see docs/method.md
+        right mask has 0.5 to 1, in wide bands up to 1.4, see docs/method.md
     error : standard error of the share
     """
 
@@ -43,6 +45,7 @@ class FringePower:
     grid : grid of the frames
     chosen : (H, W) bool, the F frequencies, in FFT order
     rings : (F,) number of the ring of similar frequencies to which each belongs
+    wavelengths : of the light [m], with equal shares of it; none: that of the grid
     """
 
     power: Tensor
@@ -50,9 +53,12 @@ class FringePower:
     grid: Grid
     chosen: Tensor
     rings: Tensor
+    wavelengths: Sequence[float] = ()
 
     @classmethod
-    def of(cls, frames: Tensor, aperture: SparseAperture, grid: Grid) -> FringePower | None:
+    def of(
+        cls, frames: Tensor, aperture: SparseAperture, grid: Grid, wavelengths: Sequence[float] = ()
+    ) -> FringePower | None:
         """Return the power of frames (T, H, W), weighted by a Hann window; None if too few frequencies are left.
 
         Frames may be on any device; the power, and what is compared with it, is on that of the aperture.
@@ -73,7 +79,7 @@ class FringePower:
         if int(beyond.sum()) < _LEAST or int(chosen.sum()) < _LEAST:
             return None
         rings = (radius[chosen] * (max(grid.shape) / _RING)).round().long()
-        return cls(power[chosen], float(power[beyond].mean()), grid, chosen, rings)
+        return cls(power[chosen], float(power[beyond].mean()), grid, chosen, rings, wavelengths)
 
     def match(self, aperture: SparseAperture) -> Match:
         """Return how much of the pattern of a mask the power shows.
@@ -82,7 +88,7 @@ class FringePower:
         of similar frequencies: an object and turbulence change the power from ring to ring. It scatters as if each of
         the N (N - 1) baselines were one independent measurement.
         """
-        pattern = _smoothed(expected_power(aperture, self.grid))[self.chosen].clamp(min=0)
+        pattern = _smoothed(expected_power(aperture, self.grid, self.wavelengths))[self.chosen].clamp(min=0)
         light = self._means(self.power - self.noise).clamp(min=0)
         floor = _FLOOR * light + 1e-12 * float(self.power.max())
         expected = light / self._means(pattern).clamp(min=1e-12) * pattern + self.noise + floor
@@ -106,13 +112,34 @@ class FringePower:
         return values - self._means(values)
 
 
-def likeness(one: SparseAperture, other: SparseAperture, grid: Grid) -> float:
+def fringe_wavelengths(aperture: SparseAperture, grid: Grid, band: Band) -> list[float]:
+    """Return wavelengths [m] evenly through a band, none for a narrow one.
+
+    The farthest fringes of one and the next, which are two holes wide, lie half a hole apart at most.
+    """
+    lowest, highest = 1 / max(band.wavelengths), 1 / band.shortest
+    apart = float(aperture.extent) * grid.wavelength * (highest - lowest)  # of one pair's fringes at both ends [m]
+    n = math.ceil(2 * apart / aperture.subaperture_diameter)
+    if n < 2:
+        return []
+    return [1 / (lowest + (number + 0.5) / n * (highest - lowest)) for number in range(n)]
+
+
+def likeness(one: SparseAperture, other: SparseAperture, grid: Grid, wavelengths: Sequence[float] = ()) -> float:
     """Return the correlation of the fringe power of two masks; 1 if frames cannot tell them apart."""
-    patterns = [expected_power(aperture, grid).flatten() for aperture in (one, other)]
+    patterns = [expected_power(aperture, grid, wavelengths).flatten() for aperture in (one, other)]
     return float(torch.nn.functional.cosine_similarity(*(pattern - pattern.mean() for pattern in patterns), dim=0))
 
 
-def expected_power(aperture: SparseAperture, grid: Grid) -> Tensor:
+def expected_power(aperture: SparseAperture, grid: Grid, wavelengths: Sequence[float] = ()) -> Tensor:
+    """Return the mean (H, W) of the power of all fringes over wavelengths [m]; none: that of the grid."""
+    powers = [
+        _pair_power(aperture, replace(grid, wavelength=wavelength)) for wavelength in wavelengths or [grid.wavelength]
+    ]
+    return torch.stack(powers).mean(0)
+
+
+def _pair_power(aperture: SparseAperture, grid: Grid) -> Tensor:
     """Return the sum (H, W) of |OTF|^2 over the pairs of holes, its mean for independent pistons.
 
     It is one patch convolved with all baselines, whose transform is |sum of exp(2 pi i x . nu_m)|^2 - N.

@@ -10,9 +10,10 @@ from typing import NamedTuple
 from torch import Tensor
 
 from torchmask.grid import Grid
-from torchmask.interferometry.fringe_power import FringePower, Match, likeness
+from torchmask.interferometry.fringe_power import FringePower, Match, fringe_wavelengths, likeness
 from torchmask.optics import catalog
 from torchmask.optics.aperture import Aperture, SparseAperture
+from torchmask.optics.band import Band
 from torchmask.optics.geometry import MaskGeometry
 
 ORIENTATIONS = {
@@ -45,8 +46,10 @@ class MaskLook(NamedTuple):
             warnings.warn(self.contradiction, stacklevel=stacklevel + 1)
 
 
-def look_at_mask(frames: Tensor, aperture: Aperture, grid: Grid) -> MaskLook:
+def look_at_mask(frames: Tensor, aperture: Aperture, grid: Grid, band: Band | None = None) -> MaskLook:
     """Compare the fringes of frames (T, H, W) with the mask as given, and with others if it does not fit.
+
+    Without a band their light has the wavelength of the grid.
 
     Others are its mirrored and turned orientations first, then the masks of the catalogue, and the given mask at any
     angle or at another scale. Nothing is said of a full pupil, of two holes, or where frames do not tell.
@@ -54,8 +57,9 @@ def look_at_mask(frames: Tensor, aperture: Aperture, grid: Grid) -> MaskLook:
     if not isinstance(aperture, SparseAperture) or aperture.n_subapertures < 3:
         return MaskLook()
     others = {name: geometry.apply(aperture) for name, geometry in ORIENTATIONS.items()}
-    unseen = " or ".join(name for name, other in others.items() if likeness(aperture, other, grid) > _ALIKE)
-    power = FringePower.of(frames, aperture, grid)
+    light = [] if band is None else fringe_wavelengths(aperture, grid, band)
+    unseen = " or ".join(name for name, other in others.items() if likeness(aperture, other, grid, light) > _ALIKE)
+    power = FringePower.of(frames, aperture, grid, light)
     return MaskLook("" if power is None else _contradiction(power, aperture, others), unseen)
 
 

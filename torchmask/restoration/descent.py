@@ -12,7 +12,13 @@ from torch import Tensor
 from torchmask.restoration.adjoint import curvature
 from torchmask.restoration.cuda_graphs import graphed
 from torchmask.restoration.objective import Free, MyopicObjective
-from torchmask.restoration.placement import information, largest_magnification, moved, slopes_of_frames
+from torchmask.restoration.placement import (
+    information,
+    largest_magnification,
+    moved,
+    slopes_of_frames,
+    smallest_magnification,
+)
 from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.state import State
 
@@ -75,7 +81,12 @@ def descend(
     found = minimizer(cost, start, lower, max_iterations=n_iterations, callback=after).x
     image, z = split(found)
     state = replace(state, image=image, z=z)
-    return moved(state, found[place:] * step_scale) if moves else state
+    if not moves:
+        return state
+    turn, shrinkage = found[place:] * step_scale
+    # the minimiser knows no upper bound, and a mask seldom shrinks until its holes are too few samples wide
+    most = -math.log(smallest_magnification(objective.model))
+    return moved(state, torch.stack([turn, shrinkage.clamp(max=most)]))
 
 
 def place_scale(objective: MyopicObjective, state: State) -> Tensor:

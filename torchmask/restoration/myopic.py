@@ -257,8 +257,8 @@ class MyopicDeconvolution:
         started = time.perf_counter()
         check_samples(n_samples)
         keep_freed_memory()
-        stack = self._stack(frames, valid, errors)
-        (look := look_at_mask(stack.frames, self.recipe.aperture, self.recipe.grid)).warn(stacklevel=2)
+        told, stack = self.recipe, self._stack(frames, valid, errors)
+        (look := look_at_mask(stack.frames, told.aperture, told.grid, told.band)).warn(stacklevel=2)
         known = Known.of(coefficients, covariance, known_object)
         stack = stack.to(self._model.dtype, self._model.device)
         blind, faint = known.nothing and start is None, stack.change.each < self.schedule.faint

@@ -87,6 +87,12 @@ def largest_magnification(model: ExposureModel) -> float:
     return max(1.0, 0.5 * period / model.pupil.aperture.extent)
 
 
+def smallest_magnification(model: ExposureModel) -> float:
+    """Return the magnification of the mask at which a hole spans two samples, at most 1."""
+    widest = max(model.band.wavelengths) / (model.pupil.grid.pixel_scale * min(model.pupil.grid.shape))  # step [m]
+    return min(1.0, 2 * (1 + 1e-9) * widest / model.pupil.aperture.subaperture_diameter)
+
+
 def placed_as(objective: MyopicObjective, told: Aperture, geometry: MaskGeometry) -> MyopicObjective:
     """Return the objective with the mask `told` transformed by `geometry`."""
     aperture = told if geometry == MaskGeometry() or not isinstance(told, SparseAperture) else geometry.apply(told)
