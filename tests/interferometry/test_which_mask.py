@@ -105,16 +105,21 @@ def test_a_share_below_zero_contradicts_no_mask():
     assert look_at_mask(frames, mask, grid) == MaskLook()
 
 
-@pytest.mark.parametrize("width", [0.2, 0.8])
-@pytest.mark.parametrize("seed", [1, 2])
-def test_the_fringes_of_a_band_are_those_of_all_its_wavelengths(width, seed):
-    """The light has more wavelengths than are told. The pattern of one accuses the right mask of seed 2 at 0.8."""
+def in_a_band(width, seed):
+    """A mask, frames of more wavelengths than are told, their grid and the band as told."""
     mask = SparseAperture.random(14, 1.0, 0.12, torch.Generator().manual_seed(seed))
     grid, light = Grid.nyquist(1.0, 550e-9, 64, oversampling=1.7), Band.top_hat(550e-9, width * 550e-9, 9)
     turbulence, generator = TurbulencePhase(r0=1 / 4, outer_scale=20.0), torch.Generator().manual_seed(5)
     seen = make_scene((64, 64), n_photons=1e6).double(), mask, grid, turbulence, Detector(1.5), 8, generator
     frames = simulate_observation(*seen, conditions=Conditions(band=light)).frames
-    band = Band.top_hat(550e-9, width * 550e-9)
+    return mask, frames, grid, Band.top_hat(550e-9, width * 550e-9)
+
+
+@pytest.mark.parametrize("width", [0.2, 0.8])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_fringes_of_a_band_are_those_of_all_its_wavelengths(width, seed):
+    """The pattern of one wavelength accuses the right mask of seed 2 at 0.8."""
+    mask, frames, grid, band = in_a_band(width, seed)
     assert look_at_mask(frames, mask, grid, band) == MaskLook()
     assert (look_at_mask(frames, mask, grid) == MaskLook()) == ((width, seed) != (0.8, 2))
     turned = MaskGeometry(0.3).apply(mask)
@@ -140,6 +145,22 @@ def test_a_restoration_warns_once_and_its_verdict_says_why(frames):
         result = MyopicDeconvolution(symmetric, GRID, n_modes=3, max_iterations=1).restore(frames)
     assert "the mask with x reversed makes the same fringes" in result.summary()
     assert set(MaskLook._fields) <= set(get_type_hints(Verdict))
+
+
+def test_a_restoration_compares_the_fringes_of_its_band(frames, monkeypatch):
+    told = []
+
+    def note(*arguments):
+        told.append(arguments[1:])
+        return MaskLook("another mask")
+
+    monkeypatch.setattr("torchmask.restoration.myopic.look_at_mask", note)
+    band = Band.of([500e-9, 550e-9], [1.0, 2.0])
+    finer = Grid.nyquist(1.0, 550e-9, 64, oversampling=1.2)
+    method = MyopicDeconvolution(MASK, finer, 3, wavelengths=band.wavelengths, weights=band.shares, max_iterations=1)
+    with pytest.warns(UserWarning, match="another mask"):
+        method.restore(frames)
+    assert told == [(MASK, finer, band)]
 
 
 def test_a_calibration_names_the_mask_too():
