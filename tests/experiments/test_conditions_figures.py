@@ -2,6 +2,7 @@
 
 import json
 import math
+from types import SimpleNamespace
 
 import anisoplanatism
 import band
@@ -12,6 +13,7 @@ import rival_modes
 import trade
 
 from torchmask.atmosphere.layers import Layers
+from torchmask.cli.band_options import BandOptions
 from torchmask.design.criterion import AsymptoticMSE
 from torchmask.grid import Grid
 from torchmask.optics.aperture import SparseAperture
@@ -91,6 +93,35 @@ def test_a_predicted_score_is_that_of_the_criterion_for_the_same_light(monkeypat
     assert (r0, outer_scale, wind) == (1 / 3, 20.0, observing.WIND)
     assert exposure == pytest.approx(0.5 * 0.314 * r0 / wind, rel=1e-3)  # tau0 = 0.314 r0 / wind
     assert (wavelengths, shares) == (Band.top_hat(550e-9, 55e-9, 4).wavelengths, Band.top_hat(550e-9, 55e-9, 4).shares)
+
+
+def test_the_light_of_a_band_has_more_wavelengths_than_are_told(monkeypatch):
+    seen = []
+
+    def simulate(*_, conditions, **__):
+        seen.append(conditions.band)
+        return SimpleNamespace(frames=None)
+
+    def told(*_, wavelengths, weights, **__):
+        seen.append(Band.of(wavelengths, weights))
+        raise KeyboardInterrupt  # seen enough
+
+    monkeypatch.setattr(observing, "simulate_observation", simulate)
+    monkeypatch.setattr(observing, "MyopicDeconvolution", told)
+    task = {"centers": [[-0.4, 0.0], [0.4, 0.0]], "subaperture_diameter": 0.2, "n_pixels": 16, "d_over_r0": 3.0}
+    task |= {
+        "outer_scale": 20.0,
+        "readout_noise": 1.5,
+        "n_frames": 1,
+        "n_photons": 1e5,
+        "instrument": "mask",
+        "seed": 0,
+    }
+    task |= {"band": 0.1, "n_simulated": 7, "n_told": 2, "iterations": 1}
+    with pytest.raises(KeyboardInterrupt):
+        observing.measure(task)
+    assert seen == [Band.top_hat(550e-9, 55e-9, 7), Band.top_hat(550e-9, 55e-9, 2)]
+    assert band.N_SIMULATED > band.N_TOLD == BandOptions.n_wavelengths
 
 
 def test_a_blind_prediction_is_what_a_plan_makes_of_instants():

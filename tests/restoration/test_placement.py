@@ -125,6 +125,11 @@ def test_a_mask_shrinks_until_its_holes_are_two_samples_wide(band, diameter):
     least = smallest_magnification(model)
     assert least < 1
     model.through(MaskGeometry(0.1, least, least).apply(mask))
+    smallest = SparseAperture(mask.centers, least * diameter, 1.0)
+    limit = ExposureModel(smallest, model.window.grid, 3, band)
+    assert smallest_magnification(limit) == pytest.approx(1.0, rel=1e-12)
+    for turn in torch.linspace(-0.1, 0.1, 41).tolist():  # which rounds the diameter
+        limit.through(MaskGeometry(turn, 1 - 1e-15, 1 - 1e-15).apply(smallest))
     with pytest.raises(ValueError, match="at least 2 are needed"):
         model.through(MaskGeometry(0.1, 0.99999 * least, 0.99999 * least).apply(mask))
 

@@ -71,9 +71,8 @@ class StructureFunction:
         squared = torch.addcmul(x.new_full((), 1e-18 * self.r0**2), x, x).addcmul_(y, y)
         if math.isinf(self.outer_scale):
             scale = x.new_full((), math.log2(STRUCTURE_CONSTANT) - 5 / 3 * math.log2(self.r0))
-            return torch.add(
-                scale, squared.log2(), alpha=5 / 6
-            ).exp2_()  # a power takes twice as long, and so does exp_
+            # a power takes twice as long, and exp_ longer than exp2_
+            return torch.add(scale, squared.log2(), alpha=5 / 6).exp2_()
         unit = squared.mul_(1 / self.r0**2)
         longest = min(self.reach, _SATURATED * self.outer_scale)
         root = torch.exp(unit.clamp(max=(longest / self.r0) ** 2).log() / 6)  # (r / r0)^(1/3)

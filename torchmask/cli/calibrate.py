@@ -27,7 +27,7 @@ class Options(StackOptions, RunOptions):
 
     The exposures are an .npz file or FITS files, of one star through the mask, in any turbulence. FITS files need
     --mask. Writes mask.json, the mask with its measured geometry, for --mask of `torchmask restore`, calibration.json
-    with all estimates and their errors, and what --instrument says to a new folder.
+    with all estimates and their errors, and with --instrument instrument.json, to a new folder.
     """
 
     stacks: tyro.conf.Positional[tuple[Path, ...]] = ()

@@ -51,9 +51,9 @@ class Options(BandOptions, StackOptions, OIFITSOptions, WorkerOptions, RunOption
     A stack is an .npz file, such as `torchmask simulate` writes, or a FITS cube; several are restored in parallel and
     independently. With --join all FITS files, cubes or images of one filter and orientation, form one stack. FITS files
     need --mask. The command writes restored.fits (with the sky coordinates of the input, and the settings in HISTORY),
-    restored.npz, figures, metrics.json, config.yaml, the log and what --instrument says to a new folder, or for several
-    stacks to a subfolder for each. The last line says whether the restoration explains the frames; the exit status is 3
-    if it does not.
+    restored.npz, figures, metrics.json, config.yaml, the log and, with --instrument, instrument.json to a new folder,
+    or for several stacks to a subfolder for each. The last line says whether the restoration explains the frames; the
+    exit status is 3 if it does not.
     """
 
     stacks: tyro.conf.Positional[tuple[Path, ...]] = ()

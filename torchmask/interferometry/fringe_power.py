@@ -22,13 +22,14 @@ _AT_A_TIME = 32  # frames
 _RING = 2  # width of a ring of spatial frequencies, in units of their spacing
 _FLOOR = 0.03  # of the mean power of a ring: light between the fringes that the pattern lacks, as of a cut-out's border
 _LEAST = 8  # frequencies needed to tell anything
+_LIT = 0.1  # of the largest share: wavelengths with less hardly show, as power goes by its square
 
 
 class Match(NamedTuple):
     """How much of a mask's pattern the power of fringes shows.
 
     share : 1 if the pattern is that of the mask, 0 if it has nothing to do with it; in frames of extended objects the
-        right mask has 0.5 to 1, in wide bands up to 1.4, see docs/method.md
+        right mask has 0.5 to 1.2, see docs/method.md
     error : standard error of the share
     """
 
@@ -73,8 +74,9 @@ class FringePower:
             still = (part - part.mean((1, 2), keepdim=True)) * window[0][:, None] * window[1]
             power += (torch.fft.fft2(still).abs() ** 2).sum(0) / len(frames)
         power = power.to(radius.device)
-        reach = grid.cutoff(aperture.extent)
-        chosen = (radius > grid.cutoff(aperture.outer_diameter)) & (radius <= reach) & (power > 0)
+        bluest = replace(grid, wavelength=min(wavelengths or [grid.wavelength]))
+        reach = bluest.cutoff(aperture.extent)
+        chosen = (radius > bluest.cutoff(aperture.outer_diameter)) & (radius <= reach) & (power > 0)
         beyond = radius > max(reach, 0.5)  # the corners hold no light of a larger mask either
         if int(beyond.sum()) < _LEAST or int(chosen.sum()) < _LEAST:
             return None
@@ -113,16 +115,15 @@ class FringePower:
 
 
 def fringe_wavelengths(aperture: SparseAperture, grid: Grid, band: Band) -> list[float]:
-    """Return wavelengths [m] evenly through a band, none for a narrow one.
+    """Return wavelengths [m] evenly through the part of a band that has light; its middle for a narrow one.
 
     The farthest fringes of one and the next, which are two holes wide, lie half a hole apart at most.
     """
-    lowest, highest = 1 / max(band.wavelengths), 1 / band.shortest
-    apart = float(aperture.extent) * grid.wavelength * (highest - lowest)  # of one pair's fringes at both ends [m]
-    n = math.ceil(2 * apart / aperture.subaperture_diameter)
-    if n < 2:
-        return []
-    return [1 / (lowest + (number + 0.5) / n * (highest - lowest)) for number in range(n)]
+    least = _LIT * max(band.shares)
+    lit = [1 / wavelength for wavelength, share in zip(band.wavelengths, band.shares, strict=True) if share >= least]
+    apart = float(aperture.extent) * grid.wavelength * (max(lit) - min(lit))  # of one pair's fringes at both ends [m]
+    n = max(1, math.ceil(2 * apart / aperture.subaperture_diameter))
+    return [1 / (min(lit) + (number + 0.5) / n * (max(lit) - min(lit))) for number in range(n)]
 
 
 def likeness(one: SparseAperture, other: SparseAperture, grid: Grid, wavelengths: Sequence[float] = ()) -> float:

@@ -126,7 +126,7 @@ def sample_holes(
         raise ValueError(f"oversampling is {oversampling}: it must be a whole number of at least 1")
     raster = (grid.shape[0] * finer, grid.shape[1] * finer)
     step = (grid.period / raster[0], grid.period / raster[1])
-    if diameter < 2 * max(step):
+    if diameter * (1 + 1e-9) < 2 * max(step):  # more than rounding, as of a mask that was turned
         wider = 2 * max(step) / diameter
         or_finer = "" if oversampling is None else f" or oversampling of at least {math.ceil(finer * wider)}"
         raise ValueError(

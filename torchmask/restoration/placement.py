@@ -90,7 +90,7 @@ def largest_magnification(model: ExposureModel) -> float:
 def smallest_magnification(model: ExposureModel) -> float:
     """Return the magnification of the mask at which a hole spans two samples, at most 1."""
     widest = max(model.band.wavelengths) / (model.pupil.grid.pixel_scale * min(model.pupil.grid.shape))  # step [m]
-    return min(1.0, 2 * (1 + 1e-9) * widest / model.pupil.aperture.subaperture_diameter)
+    return min(1.0, 2 * widest / model.pupil.aperture.subaperture_diameter)
 
 
 def placed_as(objective: MyopicObjective, told: Aperture, geometry: MaskGeometry) -> MyopicObjective:
