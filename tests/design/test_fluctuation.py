@@ -102,7 +102,7 @@ def test_the_mean_error_of_random_pistons_is_predicted(n_photons):
 def test_the_mean_error_of_exposures_is_predicted_to_one_percent(n_photons):
     """The promise for the error of 10 exposures through masks under turbulence, here with holes of 0.8 r0.
 
-    That mean is of the draws themselves, 1000 from the exact covariance, so that their samples make no difference.
+    The mean of |OTF|^2 is that of the draws, 1000 from the exact covariance, so that the pupil's raster does not count.
     """
     n_frames, seeing = 10, Seeing(0.25, 20.0)
     draws = {"n_draws": 1000, "oversampling": 3, "generator": torch.Generator().manual_seed(0)}

@@ -109,15 +109,8 @@ def test_the_light_of_a_band_has_more_wavelengths_than_are_told(monkeypatch):
     monkeypatch.setattr(observing, "simulate_observation", simulate)
     monkeypatch.setattr(observing, "MyopicDeconvolution", told)
     task = {"centers": [[-0.4, 0.0], [0.4, 0.0]], "subaperture_diameter": 0.2, "n_pixels": 16, "d_over_r0": 3.0}
-    task |= {
-        "outer_scale": 20.0,
-        "readout_noise": 1.5,
-        "n_frames": 1,
-        "n_photons": 1e5,
-        "instrument": "mask",
-        "seed": 0,
-    }
-    task |= {"band": 0.1, "n_simulated": 7, "n_told": 2, "iterations": 1}
+    task |= {"outer_scale": 20.0, "readout_noise": 1.5, "n_frames": 1, "n_photons": 1e5, "instrument": "mask"}
+    task |= {"band": 0.1, "n_simulated": 7, "n_told": 2, "iterations": 1, "seed": 0}
     with pytest.raises(KeyboardInterrupt):
         observing.measure(task)
     assert seen == [Band.top_hat(550e-9, 55e-9, 7), Band.top_hat(550e-9, 55e-9, 2)]

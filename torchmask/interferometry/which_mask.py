@@ -49,10 +49,9 @@ class MaskLook(NamedTuple):
 def look_at_mask(frames: Tensor, aperture: Aperture, grid: Grid, band: Band | None = None) -> MaskLook:
     """Compare the fringes of frames (T, H, W) with the mask as given, and with others if it does not fit.
 
-    Without a band their light has the wavelength of the grid.
-
     Others are its mirrored and turned orientations first, then the masks of the catalogue, and the given mask at any
-    angle or at another scale. Nothing is said of a full pupil, of two holes, or where frames do not tell.
+    angle or at another scale. Nothing is said of a full pupil, of two holes, or where frames do not tell. Without a
+    band the light has the wavelength of the grid.
     """
     if not isinstance(aperture, SparseAperture) or aperture.n_subapertures < 3:
         return MaskLook()
