@@ -118,7 +118,6 @@ def measure(task: Mapping[str, Any]) -> dict[str, Any]:
         wavelengths=told.wavelengths,
         weights=told.shares,
         max_iterations=task["iterations"],
-        dtype=torch.float32,
     )
     blind = method.restore(observation.frames)
     return {

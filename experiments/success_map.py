@@ -107,7 +107,6 @@ def measure(task: Mapping[str, Any]) -> dict[str, Any]:
         *(observation.aperture, observation.grid),
         readout_noise=READOUT_NOISE,
         max_iterations=task["iterations"],
-        dtype=torch.float32,
     )
     blind = method.restore(observation.frames)
     return {
@@ -131,7 +130,6 @@ def measure_given(task: Mapping[str, Any]) -> dict[str, Any]:
         readout_noise=READOUT_NOISE,
         aberration_prior=False,  # no prior weighs aberrations that are known
         max_iterations=task["iterations"],
-        dtype=torch.float32,
     )
     restored = method.restore(observation.frames, coefficients=fit_modes(observation, n_modes))
     return {"known": score(observation, restored.object)}

@@ -143,7 +143,7 @@ def test_frames_that_no_aberration_explains_do_little_harm():
     Over 12 seeds it is 1.132 times, with a standard deviation of 0.095: one may be off by three of them,
     with the standard error of the 12 included. Squared weights, which cost a tenth at 1e8 photons, kept it lower.
     """
-    patient, seen = method(max_iterations=600), observe(n_frames=10)
+    patient, seen = method(max_iterations=1000), observe(n_frames=10)  # enough for a last descent of both
     short = seen.frames[:4]
     smeared = torch.stack([seen.frames[4:7].mean(0), seen.frames[7:].mean(0)])
     alone, together = (patient.restore(frames).object for frames in (short, torch.cat([short, smeared])))

@@ -1,13 +1,14 @@
 """The memory of the descent, both ways to keep it, against the BFGS matrix by its own recursion."""
 
 import math
+from functools import partial
 
 import pytest
 import torch
 
 from torchmask.restoration.corrections import GraphedCorrections, UpdatedCorrections, make_corrections
 
-WAYS = [UpdatedCorrections, GraphedCorrections]
+WAYS = [partial(UpdatedCorrections, dtype=torch.float64), GraphedCorrections]
 
 
 def curved(n):
@@ -87,19 +88,24 @@ def test_pairs_without_curvature_are_not_kept(way, factor):
     require_solutions(memory, [], 2)
 
 
-def test_both_ways_take_float32():
+@pytest.mark.parametrize("vectors", [torch.float32, torch.float64])
+def test_pairs_in_float32(vectors):
     """Solutions differ by the rounding of sums over 500 variables, times the condition of a Hessian of 1e3."""
     n = 500
     solutions = []
-    for way in WAYS:
-        memory = way(4, torch.zeros(n))
-        feed(memory, curved(n).float(), 6)
-        solutions.append(memory.solve(draw(n, seed=6).float(), is_free(n, 1)))
-    assert solutions[0].dtype == torch.float32
+    for memory in (
+        UpdatedCorrections(4, torch.zeros(n, dtype=vectors), torch.float32),
+        GraphedCorrections(4, torch.zeros(n, dtype=vectors)),
+    ):
+        feed(memory, curved(n).to(vectors), 6)
+        solutions.append(memory.solve(draw(n, seed=6).to(vectors), is_free(n, 1)))
+    assert solutions[0].dtype == vectors
     error = (solutions[1] - solutions[0]).norm() / solutions[0].norm()
     assert float(error) < 1e3 * n**0.5 * torch.finfo(torch.float32).eps
 
 
 def test_a_processor_has_its_products_updated():
-    assert isinstance(make_corrections(3, torch.zeros(2)), UpdatedCorrections)
+    memory = make_corrections(3, torch.zeros(2, dtype=torch.float64))
+    assert isinstance(memory, UpdatedCorrections)
+    assert memory.solve(torch.ones(2).double(), torch.ones(2) > 0).dtype == torch.float64
     assert isinstance(make_corrections(3, torch.zeros(2, device="meta")), GraphedCorrections)

@@ -37,9 +37,20 @@ def test_beats_the_mean_frame_and_explains_the_data(observation, restored):
     # Between the photons on the frames and those of the scene: about 6 % fall beside the field, which the model keeps.
     assert float(observation.frames.sum((1, 2)).mean()) * 0.99 < float(restored.object.sum())
     assert float(restored.object.sum()) < 1.01 * float(observation.object.sum())
-    assert torch.allclose(
-        restored.model + restored.residuals * restored.noise, observation.frames, rtol=1e-9, atol=1e-6
-    )
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_model_and_residuals_add_up_to_the_frames(dtype, observation, restoring):
+    result = restoring(max_iterations=3, dtype=dtype).restore(observation.frames)
+    assert result.model.dtype == result.residuals.dtype == dtype
+    made = (result.model + result.residuals * result.noise).double()
+    rounding = 4 * torch.finfo(dtype).eps * float(observation.frames.max())  # of a product, two sums and the noise
+    torch.testing.assert_close(made, observation.frames, rtol=0.0, atol=rounding)
+
+
+def test_the_model_is_in_single_precision_unless_asked_otherwise(restoring, restored):
+    assert restoring().model.dtype == restored.model.dtype == torch.float32
+    assert restored.object.dtype == restored.coefficients.dtype == restored.cost.dtype == torch.float64
 
 
 def test_a_restoration_in_inference_mode_is_the_same(restoring, observation):
@@ -61,6 +72,7 @@ def test_modes_that_are_asked_for_enter_after_a_faint_search(max_iterations, exp
 
     def restore(n_modes, **kwargs):
         options = {"schedule": schedule, "max_iterations": max_iterations, "exposure_tau0": exposure}
+        options["dtype"] = torch.float64  # for the comparison of chi-squares
         method = MyopicDeconvolution(observation.aperture, observation.grid, n_modes, **options)
         return method.restore(observation.frames, **kwargs)
 
@@ -168,10 +180,11 @@ def test_adding_a_frame_costs_a_fraction(observation, observe, restored, restori
         method.restore(more[:3], start=restored)
 
 
-def test_float32_goes_on_where_float64_was(observation, restored, restoring):
-    result = restoring(dtype=torch.float32).restore(observation.frames, start=restored)
-    assert result.model.dtype == torch.float32
-    assert errors(observation, result.object)[0] == pytest.approx(errors(observation, restored.object)[0], rel=0.02)
+def test_either_data_type_goes_on_where_the_other_was(observation, restored, restoring):
+    double = restoring(dtype=torch.float64).restore(observation.frames, start=restored)
+    single = restoring(dtype=torch.float32).restore(observation.frames, start=double)
+    for result in (double, single):
+        assert errors(observation, result.object)[0] == pytest.approx(errors(observation, restored.object)[0], rel=0.02)
 
 
 def test_dead_pixels_are_left_out(observation, restored, restoring):

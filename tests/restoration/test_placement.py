@@ -180,9 +180,7 @@ def turned(observe, five_holes):
     """Frames through a mask that lies otherwise than told, and their restorations."""
     seen = observe(TRUE.apply(five_holes), n_photons=3e6)
     restored = {
-        refine: MyopicDeconvolution(five_holes, seen.grid, 10, refine_geometry=refine, dtype=torch.float32).restore(
-            seen.frames
-        )
+        refine: MyopicDeconvolution(five_holes, seen.grid, 10, refine_geometry=refine).restore(seen.frames)
         for refine in (None, False)
     }
     return seen, restored

@@ -177,7 +177,7 @@ def test_about_two_thirds_of_bright_pixels_lie_within_one_sigma(photons):
     scene = make_scene(grid.shape, photons, SceneOptions(size=0.5))
     turbulence, generator = TurbulencePhase(1 / 7, 20.0), torch.Generator().manual_seed(0)
     seen = simulate_observation(scene, apertures, grid, turbulence, Detector(1.5), 10, generator)
-    result = MyopicDeconvolution(apertures, grid, dtype=torch.float32).restore(seen.frames, n_samples=8)
+    result = MyopicDeconvolution(apertures, grid).restore(seen.frames, n_samples=8)
     assert 0.5 < inside(seen, result) < 0.85
 
 

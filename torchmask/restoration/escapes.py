@@ -114,10 +114,11 @@ def centre_on_pixels(objective: MyopicObjective, state: State, schedule: Schedul
     stay = best = settle((0.0, 0.0))
     place = (0.0, 0.0)
     for step in schedule.pixel_steps:
-        for dy, dx in ((step, 0.0), (-step, 0.0), (0.0, step), (0.0, -step)):
-            offset = (place[0] + dy, place[1] + dx)
-            if (trial := settle(offset))[0] < best[0]:
-                best, place = trial, offset
+        for dy, dx in ((step, 0.0), (0.0, step)):
+            offsets = [(place[0] + sign * dy, place[1] + sign * dx) for sign in (1, -1)]
+            for offset, trial in zip(offsets, objective.parallel(settle, offsets), strict=True):
+                if trial[0] < best[0]:
+                    best, place = trial, offset
     z = state.z - tilt(objective.model, place).to(state.z)
     change = (state.z - objective.centre) ** 2 - (z - objective.centre) ** 2
     held = 0.5 * float((objective.aberration_weight(state.calibration, state.z) * change).sum())

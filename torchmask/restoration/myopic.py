@@ -97,7 +97,7 @@ class MyopicDeconvolution:
     schedule : Schedule
         Numbers that control the course of the restoration.
     dtype : torch.dtype
-        Data type of the model; float32 takes half the time. Object, aberrations and cost are always float64.
+        Data type of the model; float64 doubles the time. Object, aberrations and cost are always float64.
 
     Raises
     ------
@@ -142,7 +142,7 @@ class MyopicDeconvolution:
         tolerance: float = 1e-4,
         minimizer: Minimizer | None = None,
         schedule: Schedule | None = None,
-        dtype: torch.dtype = torch.float64,
+        dtype: torch.dtype = torch.float32,
         device: torch.device | str | None = None,
     ) -> None:
         check_numbers(readout_noise, max_iterations, tolerance)
