@@ -145,9 +145,9 @@ def moved_away(objective, state, offset):
     [
         ((0.0, -0.2), (0, 0)),
         ((-0.4, 0.2), (0, 0)),
-        ((0.4, 0.0), (1, 0)),  # as near as (0, 0), and as good, for the steps are 0.4 and 0.2
+        ((0.4, 0.0), (0, 0)),  # 0.4 further on it would be at 0.8, and then at (1, 0), which is as good
         ((0.6, -0.4), (1, 0)),
-        ((-0.2, -0.6), (0, 0)),
+        ((-0.2, -0.6), (0, -1)),
     ],
 )
 def test_an_object_off_its_pixels_comes_back_to_them(offset, whole, explained):
