@@ -96,6 +96,7 @@ def plain_lbfgs(observation: Observation, effort: Effort) -> Iterator[Candidate]
             observation.readout_noise,
             background=Background.NONE,
             prior=TotalVariation(weight),
+            dtype=torch.float64,  # as SciPy's own
         )
         image = _descend(method.objective(observation.frames), unit, corrections, iterations)
         text = f"{n_modes} modes, mu = {weight:g}, {iterations} iterations, {corrections} corrections, unit {unit:g}"

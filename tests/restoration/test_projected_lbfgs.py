@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import Bounds, minimize
 
+from torchmask.restoration.corrections import UpdatedCorrections
 from torchmask.restoration.projected_lbfgs import ProjectedLBFGS, minimize_bounded
 from torchmask.restoration.variation import TotalVariation
 
@@ -148,3 +149,26 @@ def test_the_number_of_corrections_is_passed_on():
     assert torch.equal(many.x, minimize_bounded(cost, start, lower, max_iterations=60, n_corrections=20).x)
     assert torch.equal(few.x, minimize_bounded(cost, start, lower, max_iterations=60, n_corrections=1).x)
     assert many.value < few.value
+
+
+def test_pairs_without_a_solution_are_forgotten(monkeypatch):
+    """Where their equations are singular, the direction is NaN: the cost is not asked there."""
+    cost, hessian, linear = bowl(seed=0, n=8)
+    solve, failures, seen = UpdatedCorrections.solve, [], []
+
+    def fails_once(memory, gradient, free):
+        if len(memory) == 3 and not failures:
+            failures.append(True)
+            return gradient * math.nan
+        return solve(memory, gradient, free)
+
+    def watched(x):
+        seen.append(bool(torch.isfinite(x).all()))
+        return cost(x)
+
+    monkeypatch.setattr(UpdatedCorrections, "solve", fails_once)
+    start = torch.zeros(8, dtype=torch.float64)
+    found = minimize_bounded(watched, start, torch.full_like(start, -math.inf), max_iterations=200)
+    assert failures
+    assert all(seen)
+    torch.testing.assert_close(found.x, torch.linalg.solve(hessian, linear), rtol=1e-5, atol=1e-6)

@@ -125,6 +125,7 @@ def centre_on_pixels(objective: MyopicObjective, state: State, schedule: Schedul
     return replace(state, image=best[1], z=z) if stay[0] - best[0] + held > 0 else state
 
 
+@torch.no_grad()  # needed here too, as no_grad applies to one thread only
 def settle_object(
     centre: Tensor, gradient: Tensor, power: Tensor, prior: ObjectPrior, max_iterations: int
 ) -> tuple[float, Tensor]:

@@ -97,7 +97,7 @@ class MyopicDeconvolution:
     schedule : Schedule
         Numbers that control the course of the restoration.
     dtype : torch.dtype
-        Data type of the model; float64 doubles the time. Object, aberrations and cost are always float64.
+        Data type of the model; float64 takes up to twice as long. Object, aberrations and cost are always float64.
 
     Raises
     ------

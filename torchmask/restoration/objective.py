@@ -88,7 +88,7 @@ class MyopicObjective(nn.Module):
     prior_copies : int
         Factor on the object's prior, for `frames` that contain every frame so many times.
     parallel : callable
-        Function like `map`, which is applied to a few frames at a time.
+        Function like `map`, which is applied to a few frames, or positions of the object, at a time.
 
     Examples
     --------

@@ -136,7 +136,7 @@ def minimize_bounded(
             trial = torch.maximum(x + step * direction, lower)
             moved = trial - x
             slope = float(gradient @ moved)
-            if slope >= 0:
+            if not slope < 0:  # nor if it is NaN, as of pairs that have no solution
                 break
             new_value, new_gradient = cost(trial)
             evaluations += 1

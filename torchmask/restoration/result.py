@@ -50,6 +50,8 @@ class RestorationResult(Brief):
     motion : (T, N, J) change of the coefficients while a frame lasts [rad rms]; None where frames are snapshots
     frame_numbers : number of each frame, by which summary and verdict name it; 0 to T - 1 by default
 
+    Model, residuals and chi_square have the data type of the method's model, all else is float64.
+
     Examples
     --------
     >>> import tempfile
