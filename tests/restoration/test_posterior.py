@@ -59,7 +59,7 @@ def test_deviations_of_even_objects_shrink_with_the_share_of_even_pixels(side, s
     image[8 : 8 + side, 6 : 6 + side] = scale
     share = (1 - 1 / side) ** 2
     for pedestal in (0.0, 0.05 * scale):
-        assert evenness(image + pedestal) == pytest.approx(math.exp(-2 * share**2), rel=1e-12)
+        assert evenness(image + pedestal) == pytest.approx(math.exp(-3.5 * share**2), rel=1e-12)
 
 
 def test_deviations_of_objects_without_even_pixels_stay():
@@ -229,18 +229,37 @@ def test_deviations_are_kept_and_asked_for(tmp_path, five_holes):
 
 @pytest.mark.parametrize("noisy", [False, True])
 def test_the_prior_has_the_variance_of_the_gradients(noisy):
-    """Seen perfectly: 1 / 18. Not seen at all: an object has half as many pixels as gradients, so 1 / prior is lost."""
+    """Seen perfectly: 1 / 36. Not seen at all, nothing changes it: its mean is even, and all of 1 / prior is lost."""
     generator = torch.Generator().manual_seed(0)
     image = 3.0 * torch.randn(96, 96, dtype=torch.float64, generator=generator)  # gradients of variance 2 x 9
     power = torch.full((96, 49), 1e-12 if noisy else 1e12, dtype=torch.float64)
-    prior = _gradient_prior(power, image, 8.0, generator)
+    prior = _gradient_prior(power, image, torch.zeros_like(image), 8.0, generator)
     # A Gaussian of 8 pixels averages over 4 pi 8^2 = 804 of them; neighbouring gradients are correlated by 1/2.
     scatter = 2 / math.sqrt(804)
-    expected = 2 / 36
-    for _ in range(3 if noisy else 0):
-        expected = 2 / (36 + 1 / expected)
-    assert float(prior.mean()) == pytest.approx(expected, rel=scatter)
-    assert float(prior.std()) < scatter * expected
+    scatter = math.hypot(scatter, math.sqrt(8 / 6) * scatter) if noisy else scatter  # of eight rounds of six samples
+    assert float(prior.mean()) == pytest.approx(1 / 36, rel=scatter)
+    assert float(prior.std()) < scatter / 36
+
+
+@pytest.mark.parametrize("smoothing", [0.1, 10.0])
+def test_the_prior_is_that_of_the_object_whatever_it_was_restored_by(smoothing):
+    """A Gaussian object in noise beyond which nothing is seen above 0.45 cycles per pixel, restored with another prior.
+
+    The likeliest prior has the statistical error of the frequencies seen, 2 / n for n of them, where noise is low.
+    """
+    side, cutoff, true = 96, 0.45, 0.3
+    generator = torch.Generator().manual_seed(0)
+    nu = torch.fft.fftfreq(side, dtype=torch.float64)
+    nu_y, nu_x = nu[:, None], nu[None, : side // 2 + 1].abs()
+    smoothness = 4 * ((math.pi * nu_y).sin() ** 2 + (math.pi * nu_x).sin() ** 2)
+    power = 30.0 * (nu_y**2 + nu_x**2 < cutoff**2)
+    white = torch.randn(2, side, side, dtype=torch.float64, generator=generator)
+    truth = _filter(white[0], (true * smoothness.clamp(min=smoothness[0, 1])).rsqrt())
+    seen = truth + white[1] / math.sqrt(30.0)
+    restored = _filter(seen, power / (power + smoothing * true * smoothness))
+    prior = _gradient_prior(power, restored, _filter(restored - seen, power), 8.0, generator)
+    n_seen = math.pi * cutoff**2 * side**2
+    assert float(1 / (1 / prior).mean()) == pytest.approx(true, rel=4 * math.sqrt(2 / n_seen))
 
 
 def test_bias_leads_to_the_mean_of_the_posterior():

@@ -3,11 +3,11 @@
 The cost is approximated as quadratic around the restoration, with the Gauss-Newton Hessian of the misfit in object and
 aberrations jointly, so that each includes the uncertainty of the other. Total variation has no useful curvature: it is
 nearly infinite in flat parts and zero across edges. It is replaced by the Gaussian prior that the restored object
-suggests: independent gradients, whose variance is their local mean square, including the part lost in the restoration
-(by expectation maximisation).
+suggests: gradients whose local variance is the likeliest for the frames (by expectation maximisation).
 
-That overstates the errors of even objects, such as blocks, which total variation is made for and whose parts it finds
-as even as they are: `evenness` tells by how much, a rule found by trial.
+That overstates errors, as objects are positive and have more edges and even parts than a Gaussian one: by a factor that
+was found by trial, and by more where they are even, such as blocks, which total variation is made for and whose parts
+it finds as even as they are: `evenness` tells by how much, a rule found by trial too.
 
 A sample of the posterior is the solution of the quadratic problem with perturbed data and priors (Papandreou & Yuille,
 Adv. Neural Inf. Process. Syst. 23, 1858, 2010), by conjugate gradients.
@@ -31,11 +31,12 @@ from torchmask.restoration.state import State
 from torchmask.restoration.structure import smooth
 
 _REACH = 0.7  # smoothing of the gradients' variance [1 / cut-off]: 0.5 to 1.4 tried, see docs/tried.md
-_ROUNDS, _FEW = 3, 6  # rounds and samples of expectation maximisation; few suffice, as they are smoothed
+_ROUNDS, _FEW = 8, 6  # rounds and samples of expectation maximisation; few suffice, as they are smoothed
 _LEAST = 1e-6  # of the largest value: minimum, for a finite prior in dark parts and a finite scale of all aberrations
 _FLAT = 0.1  # of the gradients' root mean square: a pixel with less is even
 _BRIGHT = 0.1  # of the peak: pixels that are asked
-_EVEN = 2.0  # by how much errors are smaller, in the logarithm, if all light is in such: 1 to 5 tried
+_EVEN = 3.5  # by how much errors are smaller, in the logarithm, if all light is in such: 1 to 5 tried
+_NOT_GAUSSIAN = 0.7  # factor of all errors of the object: 0.6 to 1 tried
 _BATCH = 8  # samples drawn at once, each of which takes the memory of several stacks
 _ITERATIONS = 50  # of conjugate gradients: variances below the cut-off are then within 3 % of their limit
 
@@ -46,25 +47,26 @@ def standard_deviations(
     """Return standard deviations (H', W') of the object below `cutoff` [cycles/pixel], and samples of the aberrations.
 
     The `n_samples` samples (S, T, K) scatter around zero as the truth does around `state`; what is not free does not
-    vary. The variance of the object is smoothed by the width of its prior, so that few samples suffice. `photon_share`
-    is the fraction of the noise variance that is photon noise, which is larger in bright pixels.
+    vary. The variance of the object is smoothed by the width of its prior, so that few samples suffice, and that of a
+    Gaussian object multiplied by 0.7^2, which was found by trial (docs/tried.md). `photon_share` is the fraction of the
+    noise variance that is photon noise, which is larger in bright pixels.
     """
     generator = torch.Generator().manual_seed(0)
     reach = _REACH / cutoff
     slope, power = objective.object_quadratic(state.image, state.z, state.calibration)
-    prior = _gradient_prior(power, state.image, reach, generator)
+    prior = _gradient_prior(power, state.image, slope, reach, generator)
     sizes = [min(_BATCH, n_samples - start) for start in range(0, n_samples, _BATCH)]
     drawn = [_sample(objective, state, power, prior, photon_share, size, generator) for size in sizes]
     objects, aberrations = (torch.cat(part) for part in zip(*drawn, strict=True))
     off = lowpass(_bias(state.image, slope, power, prior), cutoff).square() if Free.OBJECT in objective.free else 0.0
     variance = smooth(lowpass(objects, cutoff).square().mean(0) + off, reach)
-    return variance.clamp(min=0).sqrt(), aberrations
+    return _NOT_GAUSSIAN * variance.clamp(min=0).sqrt(), aberrations
 
 
 def evenness(image: Tensor) -> float:
     """Return the factor, at most 1, by which to multiply `standard_deviations` of an object as even as `image`.
 
-    It is exp(-2 q^2), where q is the share of the light in even pixels, whose gradient is below a tenth of its root
+    It is exp(-3.5 q^2), where q is the share of the light in even pixels, whose gradient is below a tenth of its root
     mean square, by light, of all pixels above a tenth of the peak. The rule was found by trial (docs/tried.md). It does
     not hold where light is faint, as the prior makes any object even there.
     """
@@ -81,8 +83,8 @@ def place_deviations(objective: MyopicObjective, state: State, cutoff: float) ->
     Changes of the frames that object and aberrations can imitate carry no information on the mask (Schur complement).
     """
     generator = torch.Generator().manual_seed(0)
-    _, power = objective.object_quadratic(state.image, state.z, state.calibration)
-    prior = _gradient_prior(power, state.image, _REACH / cutoff, generator)
+    slope, power = objective.object_quadratic(state.image, state.z, state.calibration)
+    prior = _gradient_prior(power, state.image, slope, _REACH / cutoff, generator)
     joint = JointHessian(objective, state, power, prior, generator)
     slopes = slopes_of_frames(objective.model, state.image, state.z)
     imitated = joint.tangent.forward(*joint.solve(*joint.tangent.adjoint(joint.precision * slopes)))
@@ -90,16 +92,22 @@ def place_deviations(objective: MyopicObjective, state: State, cutoff: float) ->
     return torch.linalg.inv((told + told.T) / 2).diagonal().sqrt()
 
 
-def _gradient_prior(power: Tensor, image: Tensor, reach: float, generator: torch.Generator) -> Tensor:
-    """Return the inverse variance (H', W') of each component of the object's gradient, smoothed by `reach` pixels."""
+def _gradient_prior(power: Tensor, image: Tensor, slope: Tensor, reach: float, generator: torch.Generator) -> Tensor:
+    """Return the inverse variance (H', W') of the object's gradients, smoothed by `reach` pixels.
+
+    It is the likeliest for the frames: expectation maximisation needs the mean square of the gradients under the
+    posterior, that of its mean and what is lost in it. They are 1 / prior where that is even, since the two components
+    of a pixel's gradient have one degree of freedom.
+    """
     known = _energy(image)
     least = _LEAST * float(known.max())
-    prior = 2 / smooth(known, reach).clamp(min=least)
+    prior = 1 / smooth(known, reach).clamp(min=least)
     for _ in range(_ROUNDS):
+        known = _energy(image + _bias(image, slope, power, prior))
         drawn = _filter(_white((_FEW, *image.shape), image, generator), power.sqrt())
         drawn = drawn + _prior_noise(prior, _FEW, generator)
         lost = _energy(_solve_for_object(power, prior, drawn)).mean(0)
-        prior = 2 / smooth(known + lost, reach).clamp(min=least)
+        prior = 1 / smooth(known + lost, reach).clamp(min=least)
     return prior
 
 
