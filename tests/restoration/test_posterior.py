@@ -243,23 +243,23 @@ def test_the_prior_has_the_variance_of_the_gradients(noisy):
 
 @pytest.mark.parametrize("smoothing", [0.1, 10.0])
 def test_the_prior_is_that_of_the_object_whatever_it_was_restored_by(smoothing):
-    """A Gaussian object in noise beyond which nothing is seen above 0.45 cycles per pixel, restored with another prior.
+    """A Gaussian object in noise, of which nothing is seen above 0.45 cycles per pixel, restored with another prior.
 
-    The likeliest prior has the statistical error of the frequencies seen, 2 / n for n of them, where noise is low.
+    The likeliest prior has a relative error of (2 / sum w^2)^(1/2), with the share w of data in each frequency.
     """
-    side, cutoff, true = 96, 0.45, 0.3
+    side, cutoff, true, precision = 96, 0.45, 0.3, 8.0
     generator = torch.Generator().manual_seed(0)
     nu = torch.fft.fftfreq(side, dtype=torch.float64)
     nu_y, nu_x = nu[:, None], nu[None, : side // 2 + 1].abs()
     smoothness = 4 * ((math.pi * nu_y).sin() ** 2 + (math.pi * nu_x).sin() ** 2)
-    power = 30.0 * (nu_y**2 + nu_x**2 < cutoff**2)
+    power = precision * (nu_y**2 + nu_x**2 < cutoff**2)
     white = torch.randn(2, side, side, dtype=torch.float64, generator=generator)
     truth = _filter(white[0], (true * smoothness.clamp(min=smoothness[0, 1])).rsqrt())
-    seen = truth + white[1] / math.sqrt(30.0)
+    seen = truth + white[1] / math.sqrt(precision)
     restored = _filter(seen, power / (power + smoothing * true * smoothness))
     prior = _gradient_prior(power, restored, _filter(restored - seen, power), 8.0, generator)
-    n_seen = math.pi * cutoff**2 * side**2
-    assert float(1 / (1 / prior).mean()) == pytest.approx(true, rel=4 * math.sqrt(2 / n_seen))
+    share = 2 * (power / (power + true * smoothness)).square().sum()  # the half-plane twice
+    assert float(1 / (1 / prior).mean()) == pytest.approx(true, rel=4 * math.sqrt(2 / float(share)))
 
 
 def test_bias_leads_to_the_mean_of_the_posterior():
