@@ -3,11 +3,12 @@
 The cost is approximated as quadratic around the restoration, with the Gauss-Newton Hessian of the misfit in object and
 aberrations jointly, so that each includes the uncertainty of the other. Total variation has no useful curvature: it is
 nearly infinite in flat parts and zero across edges. It is replaced by the Gaussian prior that the restored object
-suggests: gradients whose local variance is the likeliest for the frames (by expectation maximisation).
+suggests: gradients whose local variance is about the likeliest for the frames (by expectation maximisation).
 
-That overstates errors, as objects are positive and have more edges and even parts than a Gaussian one: by a factor that
-was found by trial, and by more where they are even, such as blocks, which total variation is made for and whose parts
-it finds as even as they are: `evenness` tells by how much, a rule found by trial too.
+That overstates errors, as objects are positive and have more edges and even parts than a Gaussian one. So inverse
+variances are a few times the likeliest, by a factor found by trial. Errors are smaller still where objects are even,
+such as blocks, which total variation is made for and whose parts it finds as even as they are: `evenness` tells by how
+much, a rule found by trial too.
 
 A sample of the posterior is the solution of the quadratic problem with perturbed data and priors (Papandreou & Yuille,
 Adv. Neural Inf. Process. Syst. 23, 1858, 2010), by conjugate gradients.
@@ -36,7 +37,7 @@ _LEAST = 1e-6  # of the largest value: minimum, for a finite prior in dark parts
 _FLAT = 0.1  # of the gradients' root mean square: a pixel with less is even
 _BRIGHT = 0.1  # of the peak: pixels that are asked
 _EVEN = 3.5  # by how much errors are smaller, in the logarithm, if all light is in such: 1 to 5 tried
-_NOT_GAUSSIAN = 0.7  # factor of all errors of the object: 0.6 to 1 tried
+_TIGHTER = 2.5  # factor of the likeliest inverse variance, for errors of the object: 1 to 3 tried
 _BATCH = 8  # samples drawn at once, each of which takes the memory of several stacks
 _ITERATIONS = 50  # of conjugate gradients: variances below the cut-off are then within 3 % of their limit
 
@@ -47,20 +48,19 @@ def standard_deviations(
     """Return standard deviations (H', W') of the object below `cutoff` [cycles/pixel], and samples of the aberrations.
 
     The `n_samples` samples (S, T, K) scatter around zero as the truth does around `state`; what is not free does not
-    vary. The variance of the object is smoothed by the width of its prior, so that few samples suffice, and that of a
-    Gaussian object multiplied by 0.7^2, which was found by trial (docs/tried.md). `photon_share` is the fraction of the
-    noise variance that is photon noise, which is larger in bright pixels.
+    vary. The variance of the object is smoothed by the width of its prior, so that few samples suffice. `photon_share`
+    is the fraction of the noise variance that is photon noise, which is larger in bright pixels.
     """
     generator = torch.Generator().manual_seed(0)
     reach = _REACH / cutoff
     slope, power = objective.object_quadratic(state.image, state.z, state.calibration)
-    prior = _gradient_prior(power, state.image, slope, reach, generator)
+    prior = _TIGHTER * _gradient_prior(power, state.image, slope, reach, generator)
     sizes = [min(_BATCH, n_samples - start) for start in range(0, n_samples, _BATCH)]
     drawn = [_sample(objective, state, power, prior, photon_share, size, generator) for size in sizes]
     objects, aberrations = (torch.cat(part) for part in zip(*drawn, strict=True))
     off = lowpass(_bias(state.image, slope, power, prior), cutoff).square() if Free.OBJECT in objective.free else 0.0
     variance = smooth(lowpass(objects, cutoff).square().mean(0) + off, reach)
-    return _NOT_GAUSSIAN * variance.clamp(min=0).sqrt(), aberrations
+    return variance.clamp(min=0).sqrt(), aberrations
 
 
 def evenness(image: Tensor) -> float:
@@ -93,21 +93,22 @@ def place_deviations(objective: MyopicObjective, state: State, cutoff: float) ->
 
 
 def _gradient_prior(power: Tensor, image: Tensor, slope: Tensor, reach: float, generator: torch.Generator) -> Tensor:
-    """Return the inverse variance (H', W') of the object's gradients, smoothed by `reach` pixels.
+    """Return the inverse variance (H', W') of the object's gradients, smoothed by `reach` pixels in every round.
 
-    It is the likeliest for the frames: expectation maximisation needs the mean square of the gradients under the
-    posterior, that of its mean and what is lost in it. They are 1 / prior where that is even, since the two components
-    of a pixel's gradient have one degree of freedom.
+    It is about the likeliest for known PSFs: expectation maximisation needs the mean square of the gradients under the
+    posterior, that of its mean and what is lost in it. Where a prior is even, their mean square is 1 / prior, not
+    2 / prior, since the two components of a pixel's gradient have one degree of freedom.
     """
     known = _energy(image)
     least = _LEAST * float(known.max())
     prior = 1 / smooth(known, reach).clamp(min=least)
     for _ in range(_ROUNDS):
-        known = _energy(image + _bias(image, slope, power, prior))
         drawn = _filter(_white((_FEW, *image.shape), image, generator), power.sqrt())
         drawn = drawn + _prior_noise(prior, _FEW, generator)
-        lost = _energy(_solve_for_object(power, prior, drawn)).mean(0)
-        prior = 1 / smooth(known + lost, reach).clamp(min=least)
+        towards_mean = -(slope + _curvature(image, prior))
+        bias, *lost = _solve_for_object(power, prior, torch.cat([towards_mean[None], drawn]))
+        energy = _energy(image + bias) + _energy(torch.stack(lost)).mean(0)
+        prior = 1 / smooth(energy, reach).clamp(min=least)
     return prior
 
 
