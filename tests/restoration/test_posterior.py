@@ -236,7 +236,6 @@ def test_the_prior_has_the_variance_of_the_gradients(noisy):
     prior = _gradient_prior(power, image, torch.zeros_like(image), 8.0, generator)
     # A Gaussian of 8 pixels averages over 4 pi 8^2 = 804 of them; neighbouring gradients are correlated by 1/2.
     scatter = 2 / math.sqrt(804)
-    scatter = math.hypot(scatter, math.sqrt(8 / 6) * scatter) if noisy else scatter  # of eight rounds of six samples
     assert float(prior.mean()) == pytest.approx(1 / 36, rel=scatter)
     assert float(prior.std()) < scatter / 36
 
