@@ -294,6 +294,81 @@ def test_twins_of_an_explained_mask_follow_until_two_are_in_vain(explained, monk
     assert [next(n for n, end in enumerate(ends) if end is state) for state in begun] == [0, 1, 1, 3, 4, 5, 5]
 
 
+@pytest.fixture(scope="module")
+def in_a_band(explain, five_holes, five_hole_basis):
+    grid = Grid.nyquist(1.0, 550e-9, 32, oversampling=1.5)
+    return explain(ExposureModel(five_holes, grid, five_hole_basis, Band.top_hat(600e-9, 100e-9, 3)))
+
+
+@pytest.mark.parametrize(("explained", "kinds"), [(True, "dddd"), (False, "ddddtdtr")])
+def test_in_a_band_each_better_start_is_followed_by_one_from_its_group_delays(explained, kinds, in_a_band, monkeypatch):
+    """Until one is in vain. Where the frames are not explained, others follow, as without a band."""
+    objective, truth = in_a_band
+    scales = iter([0.85, 0.9, 0.92, 0.7, 0.95, 0.7, 0.7, 0.7])  # of the true aberrations; the first start has 0.8
+    begun, ends = [], []
+
+    def delay(objective, state, inflation, minimizer):
+        begun.append(("d", state))
+        return replace(truth, z=next(scales) * truth.z), 17
+
+    def twin(objective, state, inflation, seed):
+        begun.append(("t", state))
+        return replace(truth, z=next(scales) * truth.z)
+
+    def other(objective, state, traits, schedule, seed):
+        begun.append(("r", state))
+        return Candidates(replace(truth, z=next(scales) * truth.z), 1)
+
+    def stay(self, progress):
+        progress.costs.append(1.0)
+        progress.status = Status.CONVERGED
+        ends.append(progress.state)
+
+    monkeypatch.setattr(restarts, "start_from_delays", delay)
+    monkeypatch.setattr(restarts, "twin_of", twin)
+    monkeypatch.setattr(restarts, "first_candidates", other)
+    monkeypatch.setattr(Solver, "_advance", stay)
+    # a start that costs less than the best by anything is better, as long as the frames are explained
+    doubt = {"doubtful": math.inf, "chance": math.inf} if explained else ALL_MISSED
+    schedule = Schedule(sharp_after=0, in_vain=5, better=0.0, nearly_at_rest=0.0, starts=9, cooling=0, **doubt)
+    first = Progress(Candidates(replace(truth, z=0.8 * truth.z), 1))
+    progress = solver_of(objective, schedule=schedule).run(first, True, lambda _: None)
+    assert "".join(kind for kind, _ in begun) == kinds
+    of_best = zip(begun, (0, 1, 2, 3, 3, 5, 5, 5), strict=False)
+    assert all(state is ends[n] for (kind, state), n in of_best if kind != "r")
+    assert progress.n_evaluations == 17 * kinds.count("d")
+    assert progress.state is ends[3 if explained else 5]
+
+
+@pytest.mark.parametrize(
+    ("band", "chance", "changes", "n_first"),
+    [
+        (True, -1e9, {}, 10),
+        (True, math.inf, {}, 15),  # it explains the frames
+        (False, -1e9, {}, 15),
+        (True, -1e9, {"starts": 1}, 15),
+        (True, -1e9, {"max_iterations": 29}, 15),  # not enough are left for another
+    ],
+)
+def test_in_a_band_a_first_start_ends_once_its_object_is_sharp_unless_it_explains_the_frames(
+    band, chance, changes, n_first, in_a_band, explained, monkeypatch
+):
+    seen = []
+
+    def judge_start(self, objective, progress):
+        seen.append(progress.iterations)
+
+    monkeypatch.setattr(restarts.Restarts, "judge_start", judge_start)
+    brief = {"segment": 5, "sharp_after": 5, "escapes": 0, "start_iterations": 15, "glance": 20, "cooling": 0}
+    limit = {"max_iterations": changes.pop("max_iterations", 1000)}
+    schedule = Schedule(**brief | {"chance": chance} | changes)
+    objective = in_a_band[0] if band else explained[0]
+    solver = solver_of(objective, schedule=schedule, **limit)
+    progress = solver.run(solver.begin(Known(), None), True, lambda _: None)
+    assert progress.status is Status.START_LIMIT
+    assert seen == [n_first]
+
+
 @pytest.mark.parametrize(("gentle", "cooling", "kinds"), [(True, 30, "tth"), (False, 30, "tt"), (True, 0, "tt")])
 def test_an_explained_object_of_gentle_slopes_is_heated_once(gentle, cooling, kinds, explained, monkeypatch):
     """The best one, when twins are in vain. Its evaluations count, and it has its own seed."""

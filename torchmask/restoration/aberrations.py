@@ -34,6 +34,9 @@ class AberrationBasis(nn.Module):
     motion : (N J, K) tensor, optional
         Matrix [rad] that gives the change of the coefficients from the beginning to the end of a frame. None: frames
         are snapshots.
+    offsets : (N, K) tensor, optional
+        Matrix [rad] of phases of whole sub-apertures that are the same at every wavelength, which no path difference
+        is. None: there are none.
 
     Examples
     --------
@@ -44,11 +47,20 @@ class AberrationBasis(nn.Module):
 
     mixing: Tensor
     motion: Tensor | None
+    offsets: Tensor | None
 
-    def __init__(self, mixing: Tensor, n_modes: int, n_common: int = 0, motion: Tensor | None = None) -> None:
+    def __init__(
+        self,
+        mixing: Tensor,
+        n_modes: int,
+        n_common: int = 0,
+        motion: Tensor | None = None,
+        offsets: Tensor | None = None,
+    ) -> None:
         super().__init__()
         self.register_buffer("mixing", mixing)
         self.register_buffer("motion", motion)
+        self.register_buffer("offsets", offsets)
         self.n_modes: int = n_modes
         self.n_common: int = n_common
 
@@ -87,6 +99,22 @@ class AberrationBasis(nn.Module):
         mixing = torch.cat([own, torch.zeros_like(motion), common], dim=1)
         moving = torch.cat([torch.zeros_like(own), motion, torch.zeros_like(common)], dim=1)
         return AberrationBasis(mixing, self.n_modes, self.n_common, moving)
+
+    def with_offsets(self) -> AberrationBasis:
+        """Return the basis with N more parameters of each frame: phases of its sub-apertures [waves of any wavelength].
+
+        They stand between the frame's other parameters and the common ones.
+        """
+
+        def widened(matrix: Tensor, new: Tensor) -> Tensor:
+            own, common = matrix.tensor_split([self.n_own], dim=1)
+            return torch.cat([own, new, common], dim=1)
+
+        n, none = self.n_subapertures, self.mixing.new_zeros(len(self.mixing), self.n_subapertures)
+        wave = 2 * math.pi * torch.eye(n, dtype=none.dtype, device=none.device)
+        motion = None if self.motion is None else widened(self.motion, none)
+        offsets = widened(none.new_zeros(n, self.n_parameters), wave)
+        return AberrationBasis(widened(self.mixing, none), self.n_modes, self.n_common, motion, offsets)
 
     def coefficients(self, z: Tensor) -> Tensor:
         """Return Zernike coefficients (..., N, J) [rad rms] of the parameters (..., K), in the middle of the frame."""

@@ -52,6 +52,8 @@ class Judge:
         self.end: End = end
         # common pistons of three holes are a tilt
         self.has_twins: bool = not traits.many_minima and setting.still.n_subapertures > 3
+        is_mask = not traits.many_minima and setting.still.n_subapertures > 1
+        self.has_delays: bool = is_mask and len(setting.band.wavelengths) > 1
         self.one_is_enough: bool = stack.change.is_scarce and stack.change.shown < _ENOUGH
         self.contrast: float = stack.contrast
         self.noise: FrameNoise = stack.noise_of_frames
@@ -124,6 +126,8 @@ class Judge:
             return len(progress.explained) < self.schedule.averaged and left >= self.schedule.start_iterations
         if progress.alike or progress.starts >= self.most_starts(verdict):
             return False
+        if self.has_delays and verdict.explained and progress.in_vain:
+            return False  # its pistons are at the group delays, which leaves no twin to look for
         is_sure = self._twins_may_improve(verdict) and not self._is_doubted(verdict)
         if is_sure and progress.in_vain >= self.schedule.in_vain:
             return False
@@ -133,8 +137,12 @@ class Judge:
     def may_temper(self, verdict: Verdict, progress: Progress) -> bool:
         """Return whether the best start, on which this is the verdict, may be heated, which is done once."""
         is_asked = self.schedule.cooling > 0 and self.schedule.in_vain > 0 and not progress.tempered
-        may_start = progress.starts < self.schedule.starts and self._left(progress) > self.schedule.glance
+        may_start = progress.starts < self.schedule.starts and self.has_room(progress)
         return is_asked and may_start and self._twins_may_improve(verdict)
+
+    def has_room(self, progress: Progress) -> bool:
+        """Return whether enough iterations are left for another start to show whether it is worth it."""
+        return self._left(progress) > self.schedule.glance
 
     def _left(self, progress: Progress) -> int:
         """Return how many iterations are left for all further starts."""

@@ -153,14 +153,16 @@ class SampledPupil(nn.Module):
             return values.flatten(0, 1) if with_closed else values[is_open]
 
         mixing = self.aberrations.mixing_at(instant).to(modes).unflatten(0, (len(modes), self.aberrations.n_modes))
-        mixed = kept(torch.einsum("npj,njk->npk", modes, mixing))
+        ratio = self.grid.wavelength / wavelength
+        basis = ratio * torch.einsum("npj,njk->npk", modes, mixing)
+        if self.aberrations.offsets is not None:
+            basis = basis + self.aberrations.offsets.to(basis)[:, None]
         weights = kept(samples.weights)
         # By Parseval's theorem this gives every PSF unit sum for any phase, unless holes share a cell.
         scale = weights.norm() * math.prod(grid.shape) ** 0.5
         positions = kept(samples.offsets + centers[:, None]) / grid.period
-        ratio = self.grid.wavelength / wavelength
         chromaticity = weights.new_full((len(weights),), ratio)
-        return OpenSamples(weights / scale, kept(samples.index), mixed * ratio, positions, chromaticity)
+        return OpenSamples(weights / scale, kept(samples.index), kept(basis), positions, chromaticity)
 
 
 def _forget(pupil: SampledPupil, keys: object) -> None:

@@ -8,9 +8,11 @@ from torchmask.record import Callback
 from torchmask.restoration.candidates import Candidates
 from torchmask.restoration.checkpoint import Ending, Progress, Status
 from torchmask.restoration.frames import FrameStack
+from torchmask.restoration.group_delays import start_from_delays
 from torchmask.restoration.judge import Judge
 from torchmask.restoration.motion import Setting
 from torchmask.restoration.objective import MyopicObjective
+from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.spectrum import shows_gentle_slopes
 from torchmask.restoration.starts import expected_parameters, first_candidates, first_state
@@ -18,6 +20,7 @@ from torchmask.restoration.state import Modes, State
 from torchmask.restoration.tempering import temper
 from torchmask.restoration.traits import Traits
 from torchmask.restoration.twins import twin_of
+from torchmask.restoration.verdict import Finding
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,7 @@ class Restarts:
     schedule: Schedule
     first_inflation: float
     averages: bool
+    minimizer: Minimizer
     callback: Callback | None
 
     def judge_start(self, objective: MyopicObjective, progress: Progress) -> None:
@@ -57,10 +61,28 @@ class Restarts:
         else:
             progress.state, progress.status, progress.decrease = best.state, best.status, best.decrease
 
+    def may_end_early(self, objective: MyopicObjective, progress: Progress) -> bool:
+        """Return whether the first start need not go on, since one from its group delays is better than to wait.
+
+        So it is as soon as its object is sharp, unless it explains the frames or no iterations are left for another.
+        """
+        is_sharp = progress.starts == 1 and progress.iterations > self.schedule.sharp_after
+        may_follow = self.schedule.starts > 1 and self.judge.has_room(progress)
+        if not (self.judge.has_delays and is_sharp and may_follow):
+            return False
+        return self.judge.verdict(objective, progress.ending).finding is Finding.NOT_EXPLAINED
+
     def _start_again(self, objective: MyopicObjective, progress: Progress, best: Ending) -> None:
-        """Begin from a twin of the best object, or from random aberrations."""
+        """Begin from a twin of the best object, in a band from its group delays, or from random aberrations."""
         is_twin = self.judge.is_twin(progress.starts + 1, self.judge.verdict(objective, best))
+        has_delays = self.judge.has_delays and progress.in_vain == 0  # once from each best object
         seed, state = self._begin(progress, best), best.state
+        if has_delays:
+            placed = self.setting.objective_at(objective, state)
+            first, evaluations = start_from_delays(placed, state, self.first_inflation, self.minimizer)
+            progress.candidates = Candidates(first, 1)
+            progress.n_evaluations += evaluations
+            return
         if is_twin:
             placed = self.setting.objective_at(objective, state)
             progress.candidates = Candidates(twin_of(placed, state, self.first_inflation, seed), 1)

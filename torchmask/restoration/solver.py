@@ -6,9 +6,9 @@ updated; the assumed noise falls from the residual of the mean frame to the true
 Once the object is sharp, frames and object escape from local minima, and in faint light the prior suits it; when
 nothing changes any more, each frame is weighted by how well it fits. A start ends when a segment gains nothing, or
 little if it explains the frames, or its iterations are used up. Then phases of a full pupil's bright frames are
-retrieved. Others start from random aberrations or, for a mask, from twins of the best object or from that heated, as
-long as they may find a better one (`restarts`); the best is kept, or the mean for a full pupil. The rest is told in
-`finish`.
+retrieved. Others start from random aberrations or, for a mask, from twins of the best object, in a band from its group
+delays, or from that heated, as long as they may find a better one (`restarts`); the best is kept, or the mean for a
+full pupil. The rest is told in `finish`.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ class Solver:
         self.given: ObjectPrior = objective.prior
         self.judge: Judge = Judge(self.setting, stack, traits, schedule, self.end)
         known = (self.setting, stack, self.judge, traits, schedule)
-        self.restarts: Restarts = Restarts(*known, self.first_inflation, averages, callback)
+        self.restarts: Restarts = Restarts(*known, self.first_inflation, averages, minimizer, callback)
 
     def solve(self, known: Known, start: RestorationResult | None = None, file: Checkpoint | None = None) -> Progress:
         """Run a restoration to its end, from scratch, from an earlier result or from a checkpoint."""
@@ -156,6 +156,9 @@ class Solver:
             self._suit_prior(progress)
             go_on = self._play if progress.candidates.n_each > 1 else self._advance
             go_on(progress)
+            running = progress.status is Status.RUNNING
+            if running and may_start_again and self.restarts.may_end_early(self.objective, progress):
+                progress.status = Status.START_LIMIT
             if progress.status is not Status.RUNNING:
                 among_first = progress.starts <= self.schedule.retrieved_starts
                 if self.retrieves and among_first and progress.status is not Status.ITERATION_LIMIT:

@@ -13,6 +13,7 @@ from torchmask.restoration.calibration import calibrate, share_noise_inflation
 from torchmask.restoration.candidates import Candidates, play_stage, several
 from torchmask.restoration.descent import Variables, descend
 from torchmask.restoration.frames import Array
+from torchmask.restoration.fringes import change_fringes
 from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.result import RestorationResult
@@ -215,4 +216,6 @@ def fit_new_frames(
             lambda crowded, now: share_noise_inflation(calibrate(crowded, now)),
         )
     fitted = descend(fresh, candidates.state, schedule.segment, minimizer, count)
+    fitted, tried = change_fringes(fresh, fitted)
+    spent += tried * (n_frames - n_known)
     return replace(state, z=torch.cat([state.z[:n_known], fitted.z])), spent // n_frames
