@@ -16,6 +16,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from torchmask.restoration.descent import Variables, descend
 from torchmask.restoration.escapes import settle
@@ -36,19 +37,21 @@ def start_from_delays(
     """
     basis = objective.model.aberrations
     wider = basis.with_offsets()
-    own, new = basis.n_own, basis.n_subapertures
-    z, spent = state.z.new_zeros(len(state.z), wider.n_parameters), 0
+    kept = torch.ones(wider.n_parameters, dtype=torch.bool, device=state.z.device)
+    kept[basis.n_own : wider.n_own] = False
+    spent = 0
+
+    def widened(values: Tensor) -> Tensor:
+        wide = values.new_zeros(len(values), len(kept))
+        wide[:, kept] = values
+        return wide
 
     def count(cost: float, evaluations: int, variables: Variables) -> None:
         nonlocal spent
         spent += evaluations
 
-    kept = [i for i in range(wider.n_parameters) if not own <= i < own + new]
-    z[:, kept] = state.z
-    centre = torch.zeros_like(z)
-    centre[:, kept] = objective.centre
-    model = objective.model.through(objective.model.pupil.aperture, wider)
+    model, centre = objective.model.through(objective.model.pupil.aperture, wider), widened(objective.centre)
     freed = objective.with_changes(model=model, centre=centre, free=Free.ABERRATIONS)
-    found = descend(freed, replace(state, z=z), _FITTING, minimizer, count)
+    found = descend(freed, replace(state, z=widened(state.z)), _FITTING, minimizer, count)
     delayed = replace(state, z=found.z[:, kept]).with_noise_inflation(inflation)
     return settle(objective, delayed, _SETTLING), spent

@@ -58,7 +58,8 @@ class Schedule:
     missed : for a full pupil, minimum of the allowed excess, as a fraction of the change from frame to frame
     starts : maximum number of starts, but for `averaged` and `faint_starts`
     in_vain : a mask whose frames are explained beyond doubt, and not faint, starts from twins of the best object until
-        so many starts in succession have brought nothing clearly better; 0: it starts once
+        so many starts in succession have brought nothing clearly better; 0: it starts once. In a band it starts from
+        group delays, until one such start has brought nothing, however doubtful or faint its frames are
     doubtful : an explained fit of a mask is doubted if the excess is larger than this number times that expected, and
         others are started as if it were not explained
     better : where the best start so far explains the frames of a mask, a later one that costs less is clearly better if
