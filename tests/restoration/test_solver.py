@@ -277,7 +277,7 @@ def test_twins_of_an_explained_mask_follow_until_two_are_in_vain(explained, monk
         begun.append(state)
         return replace(truth, image=next(scales) * truth.image)
 
-    def stay(self, progress):
+    def stay(self, progress, may_start_again):
         progress.costs.append(1.0)
         progress.status = Status.GIVEN_UP if len(ends) == 7 else Status.CONVERGED
         ends.append(progress.state)
@@ -295,19 +295,26 @@ def test_twins_of_an_explained_mask_follow_until_two_are_in_vain(explained, monk
 
 
 @pytest.fixture(scope="module")
-def in_a_band(explain, five_holes, five_hole_basis):
+def in_bands(explain, five_holes, five_hole_basis):
+    """Frames of a wide band, which tell group delays, and of a narrow one, which do not."""
     grid = Grid.nyquist(1.0, 550e-9, 32, oversampling=1.5)
-    return explain(ExposureModel(five_holes, grid, five_hole_basis, Band.top_hat(600e-9, 100e-9, 3)))
+    bands = {name: Band.top_hat(600e-9, width, 5) for name, width in (("wide", 200e-9), ("narrow", 50e-9))}
+    return {name: explain(ExposureModel(five_holes, grid, five_hole_basis, band)) for name, band in bands.items()}
 
 
-@pytest.mark.parametrize(("explained", "kinds"), [(True, "dddd"), (False, "ddddtdtr")])
-def test_in_a_band_each_better_start_is_followed_by_one_from_its_group_delays(explained, kinds, in_a_band, monkeypatch):
+@pytest.mark.parametrize(
+    ("band", "is_explained", "kinds"),
+    [("wide", True, "dddd"), ("wide", False, "ddddtdtr"), ("narrow", True, "ttttttt"), ("narrow", False, "tttrtttr")],
+)
+def test_each_better_start_is_followed_by_one_from_the_group_delays_that_a_band_tells(
+    band, is_explained, kinds, in_bands, monkeypatch
+):
     """Until one is in vain. Where the frames are not explained, others follow, as without a band."""
-    objective, truth = in_a_band
+    objective, truth = in_bands[band]
     scales = iter([0.85, 0.9, 0.92, 0.7, 0.95, 0.7, 0.7, 0.7])  # of the true aberrations; the first start has 0.8
     begun, ends = [], []
 
-    def delay(objective, state, inflation, minimizer):
+    def delay(objective, state, inflation, minimizer, callback):
         begun.append(("d", state))
         return replace(truth, z=next(scales) * truth.z), 17
 
@@ -319,7 +326,7 @@ def test_in_a_band_each_better_start_is_followed_by_one_from_its_group_delays(ex
         begun.append(("r", state))
         return Candidates(replace(truth, z=next(scales) * truth.z), 1)
 
-    def stay(self, progress):
+    def stay(self, progress, may_start_again):
         progress.costs.append(1.0)
         progress.status = Status.CONVERGED
         ends.append(progress.state)
@@ -329,44 +336,56 @@ def test_in_a_band_each_better_start_is_followed_by_one_from_its_group_delays(ex
     monkeypatch.setattr(restarts, "first_candidates", other)
     monkeypatch.setattr(Solver, "_advance", stay)
     # a start that costs less than the best by anything is better, as long as the frames are explained
-    doubt = {"doubtful": math.inf, "chance": math.inf} if explained else ALL_MISSED
-    schedule = Schedule(sharp_after=0, in_vain=5, better=0.0, nearly_at_rest=0.0, starts=9, cooling=0, **doubt)
+    doubt = {"doubtful": math.inf, "chance": math.inf} if is_explained else ALL_MISSED
+    schedule = Schedule(sharp_after=0, in_vain=2, better=0.0, nearly_at_rest=0.0, starts=9, cooling=0, **doubt)
     first = Progress(Candidates(replace(truth, z=0.8 * truth.z), 1))
     progress = solver_of(objective, schedule=schedule).run(first, True, lambda _: None)
     assert "".join(kind for kind, _ in begun) == kinds
     of_best = zip(begun, (0, 1, 2, 3, 3, 5, 5, 5), strict=False)
     assert all(state is ends[n] for (kind, state), n in of_best if kind != "r")
     assert progress.n_evaluations == 17 * kinds.count("d")
-    assert progress.state is ends[3 if explained else 5]
+    assert progress.state is ends[3 if kinds == "dddd" else 5]
 
 
 @pytest.mark.parametrize(
-    ("band", "chance", "changes", "n_first"),
+    ("band", "changes", "n_first"),
     [
-        (True, -1e9, {}, 10),
-        (True, math.inf, {}, 15),  # it explains the frames
-        (False, -1e9, {}, 15),
-        (True, -1e9, {"starts": 1}, 15),
-        (True, -1e9, {"max_iterations": 29}, 15),  # not enough are left for another
+        ("wide", {}, 10),
+        ("wide", {"chance": math.inf}, 15),  # it explains the frames
+        ("narrow", {}, 15),
+        ("none", {}, 15),
+        ("wide", {"starts": 1}, 15),
+        ("wide", {"in_vain": 0}, 15),
+        ("wide", {"max_iterations": 24}, 15),  # not enough are left for another
+        ("wide", {"max_iterations": 25}, 10),
+        ("wide", {"may_start_again": False}, 15),  # such as one that goes on from an earlier result
+        ("wide", {"starts_before": 1}, 15),  # it is not the first
+        ("wide", {"many_minima": True}, 15),
     ],
 )
-def test_in_a_band_a_first_start_ends_once_its_object_is_sharp_unless_it_explains_the_frames(
-    band, chance, changes, n_first, in_a_band, explained, monkeypatch
+def test_a_first_start_that_misses_the_object_ends_once_it_is_sharp_if_a_band_tells_group_delays(
+    band, changes, n_first, in_bands, explained, monkeypatch
 ):
+    """After a segment more. Elsewhere it goes on to its own end."""
     seen = []
 
     def judge_start(self, objective, progress):
         seen.append(progress.iterations)
 
     monkeypatch.setattr(restarts.Restarts, "judge_start", judge_start)
-    brief = {"segment": 5, "sharp_after": 5, "escapes": 0, "start_iterations": 15, "glance": 20, "cooling": 0}
-    limit = {"max_iterations": changes.pop("max_iterations", 1000)}
-    schedule = Schedule(**brief | {"chance": chance} | changes)
-    objective = in_a_band[0] if band else explained[0]
-    solver = solver_of(objective, schedule=schedule, **limit)
-    progress = solver.run(solver.begin(Known(), None), True, lambda _: None)
-    assert progress.status is Status.START_LIMIT
-    assert seen == [n_first]
+    monkeypatch.setattr(restarts, "tells_delays", lambda objective, state: band == "wide")
+    brief = {"segment": 5, "sharp_after": 5, "escapes": 0, "start_iterations": 15, "candidates": (), "retrievals": 0}
+    told = {"chance": -1e9, "max_iterations": 1000, "may_start_again": True, "starts_before": 0, "many_minima": False}
+    told |= changes
+    numbers = {name: told[name] for name in ("chance", "starts", "in_vain") if name in told}
+    objective = explained[0] if band == "none" else in_bands[band][0]
+    traits = {"max_iterations": told["max_iterations"], "many_minima": told["many_minima"]}
+    solver = solver_of(objective, schedule=Schedule(**brief, **numbers), **traits)
+    begun = solver.begin(Known(), None)
+    begun.starts += told["starts_before"]
+    assert solver.run(begun, told["may_start_again"], lambda _: None).status is Status.START_LIMIT
+    assert (seen or [15]) == [n_first]
+    assert bool(seen) is told["may_start_again"]
 
 
 @pytest.mark.parametrize(("gentle", "cooling", "kinds"), [(True, 30, "tth"), (False, 30, "tt"), (True, 0, "tt")])
@@ -383,7 +402,7 @@ def test_an_explained_object_of_gentle_slopes_is_heated_once(gentle, cooling, ki
         begun.append(("t", state, seed))
         return replace(truth, image=0.98 * truth.image)
 
-    def stay(self, progress):
+    def stay(self, progress, may_start_again):
         progress.costs.append(1.0)
         progress.status = Status.CONVERGED
         ends.append(progress.state)

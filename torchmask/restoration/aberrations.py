@@ -94,6 +94,7 @@ class AberrationBasis(nn.Module):
         `motion` (N J, M) [rad] is the change for one unit of each. They stand between the frame's other parameters and
         the common ones.
         """
+        assert self.offsets is None, "offsets are added after a motion"
         own, common = self.mixing.tensor_split([self.n_own], dim=1)
         motion = motion.to(own)
         mixing = torch.cat([own, torch.zeros_like(motion), common], dim=1)
@@ -103,8 +104,10 @@ class AberrationBasis(nn.Module):
     def with_offsets(self) -> AberrationBasis:
         """Return the basis with N more parameters of each frame: phases of its sub-apertures [waves of any wavelength].
 
-        They stand between the frame's other parameters and the common ones.
+        Under the prior, by which parameters are white, such a phase is one wave rms. They stand between the frame's
+        other parameters and the common ones.
         """
+        assert self.offsets is None, "the basis has offsets already"
 
         def widened(matrix: Tensor, new: Tensor) -> Tensor:
             own, common = matrix.tensor_split([self.n_own], dim=1)

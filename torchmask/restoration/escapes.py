@@ -1,11 +1,11 @@
 """Ways out of local minima that a descent does not find.
 
 Outlying frames: for a fixed object, the aberrations of a frame are a small separate problem, for which several random
-starts are cheap. Fringes: in a band, pistons may be whole waves off, which a known object shows (`fringes`). Sub-pixel
-position of the object: the frames do not constrain it, as a shift of the object and the opposite tilt of all frames
-give the same images. The prior on the object does, because edges and points that are centred on pixels have the least
-total variation and no negative side lobes. A descent hardly moves along this direction, so the best position is
-searched directly.
+starts are cheap. Fringes: in a band, pistons may be whole waves off, which shows if the object is known, or the
+aberrations nearly are (`fringes`). Sub-pixel position of the object: the frames do not constrain it, as a shift of the
+object and the opposite tilt of all frames give the same images. The prior on the object does, because edges and points
+that are centred on pixels have the least total variation and no negative side lobes. A descent hardly moves along this
+direction, so the best position is searched directly.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def escape(
     if traits.estimated or not traits.many_minima:
         seed = traits.seed + number
         state, evaluations = restart_outlier_frames(objective, state, first_inflation, schedule, minimizer, seed)
-        if Free.OBJECT not in objective.free:
+        if traits.estimated or Free.OBJECT not in objective.free:
             state, tried = change_fringes(objective, state)
             evaluations += tried
     if Free.OBJECT in objective.free:

@@ -52,8 +52,6 @@ class Judge:
         self.end: End = end
         # common pistons of three holes are a tilt
         self.has_twins: bool = not traits.many_minima and setting.still.n_subapertures > 3
-        is_mask = not traits.many_minima and setting.still.n_subapertures > 1
-        self.has_delays: bool = is_mask and len(setting.band.wavelengths) > 1
         self.one_is_enough: bool = stack.change.is_scarce and stack.change.shown < _ENOUGH
         self.contrast: float = stack.contrast
         self.noise: FrameNoise = stack.noise_of_frames
@@ -126,8 +124,6 @@ class Judge:
             return len(progress.explained) < self.schedule.averaged and left >= self.schedule.start_iterations
         if progress.alike or progress.starts >= self.most_starts(verdict):
             return False
-        if self.has_delays and verdict.explained and progress.in_vain:
-            return False  # its pistons are at the group delays, which leaves no twin to look for
         is_sure = self._twins_may_improve(verdict) and not self._is_doubted(verdict)
         if is_sure and progress.in_vain >= self.schedule.in_vain:
             return False
@@ -143,6 +139,10 @@ class Judge:
     def has_room(self, progress: Progress) -> bool:
         """Return whether enough iterations are left for another start to show whether it is worth it."""
         return self._left(progress) > self.schedule.glance
+
+    def has_room_for_all(self, progress: Progress) -> bool:
+        """Return whether enough iterations are left for all that another start may take."""
+        return self._left(progress) >= self.schedule.start_iterations
 
     def _left(self, progress: Progress) -> int:
         """Return how many iterations are left for all further starts."""

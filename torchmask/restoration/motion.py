@@ -16,7 +16,6 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchmask.optics.aperture import Aperture
-from torchmask.optics.band import Band
 from torchmask.restoration.aberrations import AberrationBasis, MakesBasis
 from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.placement import placed_as
@@ -30,14 +29,12 @@ class Setting:
     """What an objective is made for and a state may change: how the mask lies, and which aberrations there are.
 
     told : the mask as the user describes it
-    band : wavelengths of the light
     still : basis of the aberrations of snapshots
     moving : the same basis with changes during the exposure; None: frames are snapshots
     finer : makes the basis with more modes, and with the same changes, for after the search; None: there are no more
     """
 
     told: Aperture
-    band: Band
     still: AberrationBasis
     moving: AberrationBasis | None = None
     finer: MakesBasis | None = None
@@ -48,9 +45,7 @@ class Setting:
     ) -> Setting:
         """Return the setting of an objective of snapshots; known aberrations do not move and have no more modes."""
         model, is_free = objective.model, Free.ABERRATIONS in objective.free
-        return cls(
-            model.pupil.aperture, model.band, model.aberrations, moving if is_free else None, finer if is_free else None
-        )
+        return cls(model.pupil.aperture, model.aberrations, moving if is_free else None, finer if is_free else None)
 
     def awaits_motion(self, state: State) -> bool:
         """Return whether aberrations change during the exposure, and the state does not have the change yet."""

@@ -8,7 +8,7 @@ from torchmask.record import Callback
 from torchmask.restoration.candidates import Candidates
 from torchmask.restoration.checkpoint import Ending, Progress, Status
 from torchmask.restoration.frames import FrameStack
-from torchmask.restoration.group_delays import start_from_delays
+from torchmask.restoration.group_delays import start_from_delays, tells_delays
 from torchmask.restoration.judge import Judge
 from torchmask.restoration.motion import Setting
 from torchmask.restoration.objective import MyopicObjective
@@ -28,7 +28,8 @@ class Restarts:
     """Starts a restoration again as long as that may find a better object than the best so far.
 
     `averages` is whether the mean of the starts that explain the frames is wanted, as for a full pupil.
-    `first_inflation` is the noise inflation with which a start begins. `callback` is told of heated rounds.
+    `first_inflation` is the noise inflation with which a start begins. `callback` is told of rounds
+    that prepare one.
     """
 
     setting: Setting
@@ -54,35 +55,53 @@ class Restarts:
         if self.averages and found.now.explained:
             progress.explained += (progress.ending,)
         progress.in_vain = 0 if found.advances else progress.in_vain + 1
-        if self.judge.wants_another(found.verdict, progress):
-            self._start_again(objective, progress, best)
+        has_delays = self._has_delays(objective, best.state)
+        # where the pistons are at the group delays, no twin is left to look for
+        is_settled = has_delays and found.verdict.explained and progress.in_vain > 0
+        if not is_settled and self.judge.wants_another(found.verdict, progress):
+            if has_delays and progress.in_vain == 0 and self.judge.has_room(progress):
+                self._start_from_delays(objective, progress, best)
+            else:
+                self._start_again(objective, progress, best)
         elif self.judge.may_temper(found.verdict, progress) and self._is_gentle(objective, best.state):
             self._temper(objective, progress, best)
         else:
             progress.state, progress.status, progress.decrease = best.state, best.status, best.decrease
 
     def may_end_early(self, objective: MyopicObjective, progress: Progress) -> bool:
-        """Return whether the first start need not go on, since one from its group delays is better than to wait.
+        """Return whether the first start need not go on, as one from its group delays is better than waiting.
 
-        So it is as soon as its object is sharp, unless it explains the frames or no iterations are left for another.
+        That is from one segment after its object is sharp, unless it explains the frames, or the schedule wants one
+        start, or too few iterations are left for a whole one.
         """
-        is_sharp = progress.starts == 1 and progress.iterations > self.schedule.sharp_after
-        may_follow = self.schedule.starts > 1 and self.judge.has_room(progress)
-        if not (self.judge.has_delays and is_sharp and may_follow):
+        schedule = self.schedule
+        is_sharp = progress.iterations >= schedule.sharp_after + schedule.segment
+        may_follow = min(schedule.starts - 1, schedule.in_vain) > 0 and self.judge.has_room_for_all(progress)
+        if not (progress.starts == 1 and is_sharp and may_follow):
             return False
-        return self.judge.verdict(objective, progress.ending).finding is Finding.NOT_EXPLAINED
+        is_missed = self.judge.verdict(objective, progress.ending).finding is Finding.NOT_EXPLAINED
+        return is_missed and self._has_delays(objective, progress.state)
+
+    def _has_delays(self, objective: MyopicObjective, state: State) -> bool:
+        """Return whether this is a mask in a band whose frames tell group delays."""
+        is_mask = not self.traits.many_minima and self.setting.still.n_subapertures > 1
+        if not is_mask or len(objective.model.band.wavelengths) == 1:
+            return False
+        return tells_delays(self.setting.objective_at(objective, state), state)
+
+    def _start_from_delays(self, objective: MyopicObjective, progress: Progress, best: Ending) -> None:
+        """Begin from the group delays of the best object."""
+        self._begin(progress, best)
+        placed = self.setting.objective_at(objective, best.state)
+        how = (self.first_inflation, self.minimizer, self.callback)
+        state, evaluations = start_from_delays(placed, best.state, *how)
+        progress.candidates = Candidates(state, 1)
+        progress.n_evaluations += evaluations
 
     def _start_again(self, objective: MyopicObjective, progress: Progress, best: Ending) -> None:
-        """Begin from a twin of the best object, in a band from its group delays, or from random aberrations."""
+        """Begin from a twin of the best object, or from random aberrations."""
         is_twin = self.judge.is_twin(progress.starts + 1, self.judge.verdict(objective, best))
-        has_delays = self.judge.has_delays and progress.in_vain == 0  # once from each best object
         seed, state = self._begin(progress, best), best.state
-        if has_delays:
-            placed = self.setting.objective_at(objective, state)
-            first, evaluations = start_from_delays(placed, state, self.first_inflation, self.minimizer)
-            progress.candidates = Candidates(first, 1)
-            progress.n_evaluations += evaluations
-            return
         if is_twin:
             placed = self.setting.objective_at(objective, state)
             progress.candidates = Candidates(twin_of(placed, state, self.first_inflation, seed), 1)

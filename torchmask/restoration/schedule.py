@@ -45,8 +45,8 @@ class Schedule:
         the cost by less than this fraction, as the last descent goes on from there
     sharp_after : number of iterations after which the object is sharp enough to escape from local minima, and in faint
         light to choose the prior of the rest of the search
-    escapes : maximum number of escapes in one start, each of which restarts outlying frames, changes their
-        fringes in a band and shifts the object
+    escapes : maximum number of escapes in one start, each of which restarts outlying frames and shifts the
+        object, or changes fringes in a band if that is known
     first_inflation : the initial noise variance is the residual variance of the mean frame divided by this
     start_rms : rms of random initial whitened aberrations
     start_rms_unwhitened : the same in rad, for aberrations without a prior
@@ -58,15 +58,15 @@ class Schedule:
     missed : for a full pupil, minimum of the allowed excess, as a fraction of the change from frame to frame
     starts : maximum number of starts, but for `averaged` and `faint_starts`
     in_vain : a mask whose frames are explained beyond doubt, and not faint, starts from twins of the best object until
-        so many starts in succession have brought nothing clearly better; 0: it starts once. In a band it starts from
-        group delays, until one such start has brought nothing, however doubtful or faint its frames are
+        so many starts in succession have brought nothing clearly better; 0: it starts once. Where a band tells group
+        delays, a start from these follows each that is clearly better, and no twin as long as frames are explained
     doubtful : an explained fit of a mask is doubted if the excess is larger than this number times that expected, and
         others are started as if it were not explained
     better : where the best start so far explains the frames of a mask, a later one that costs less is clearly better if
         it costs less by this fraction of what the best costs beyond noise
     near : there a twin is given up if it costs more than the best by more than this fraction of the same
-    twins : where a mask's frames are faint or not explained, number of further starts from twins of its object before
-        one from random aberrations
+    twins : where a mask's frames are faint or not explained, number of further starts from twins of its object, or from
+        group delays, before one from random aberrations
     cooling : a mask whose frames are explained and show gentle slopes, and are not faint, starts once from the best
         object heated, after so many rounds in which the noise falls; 0: it does not
     heat : factor of the variance of the noise from which it falls then

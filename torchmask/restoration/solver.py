@@ -6,9 +6,9 @@ updated; the assumed noise falls from the residual of the mean frame to the true
 Once the object is sharp, frames and object escape from local minima, and in faint light the prior suits it; when
 nothing changes any more, each frame is weighted by how well it fits. A start ends when a segment gains nothing, or
 little if it explains the frames, or its iterations are used up. Then phases of a full pupil's bright frames are
-retrieved. Others start from random aberrations or, for a mask, from twins of the best object, in a band from its group
-delays, or from that heated, as long as they may find a better one (`restarts`); the best is kept, or the mean for a
-full pupil. The rest is told in `finish`.
+retrieved. Others start from random aberrations or, for a mask, from group delays, from twins of the best object or from
+this object heated, as long as they may find a better one (`restarts`); the best is kept, or the mean for a full pupil.
+The rest is told in `finish`.
 """
 
 from __future__ import annotations
@@ -154,11 +154,10 @@ class Solver:
         """Continue until the restoration ends; `save` is called after every segment."""
         while progress.status is Status.RUNNING:
             self._suit_prior(progress)
-            go_on = self._play if progress.candidates.n_each > 1 else self._advance
-            go_on(progress)
-            running = progress.status is Status.RUNNING
-            if running and may_start_again and self.restarts.may_end_early(self.objective, progress):
-                progress.status = Status.START_LIMIT
+            if progress.candidates.n_each > 1:
+                self._play(progress)
+            else:
+                self._advance(progress, may_start_again)
             if progress.status is not Status.RUNNING:
                 among_first = progress.starts <= self.schedule.retrieved_starts
                 if self.retrieves and among_first and progress.status is not Status.ITERATION_LIMIT:
@@ -210,7 +209,7 @@ class Solver:
             played = Candidates(played.state.of_frames(slice(len(self.objective.frames))), 1)
         progress.candidates = played
 
-    def _advance(self, progress: Progress) -> None:
+    def _advance(self, progress: Progress, may_start_again: bool) -> None:
         """Descend for one segment, then update what changes between two segments."""
         schedule, state, done = self.schedule, progress.state, progress.iterations
         objective = self._place(state)
@@ -227,6 +226,9 @@ class Solver:
         self._look_at_place(progress)
         if self.judge.gives_up(objective, progress):
             progress.status = Status.GIVEN_UP
+            return
+        if may_start_again and self.restarts.may_end_early(objective, progress):
+            progress.status = Status.START_LIMIT
             return
         goes_on = (limit := progress.limit(*self._limits)) is Status.RUNNING
         if goes_on and Free.ABERRATIONS in objective.free and progress.escapes < schedule.escapes:
