@@ -21,6 +21,7 @@ from torchmask.restoration.fringes import change_fringes, sides_of_lines
 from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.projected_lbfgs import ProjectedLBFGS
 from torchmask.restoration.schedule import Schedule
+from torchmask.restoration.starts import fit_new_frames
 from torchmask.restoration.traits import Refinement, Traits
 
 GRID = Grid.nyquist(1.0, 550e-9, 32, oversampling=1.5)
@@ -157,3 +158,19 @@ def test_a_descent_does_not_find_them(wide):
         ended = descend(alone, lost, 200, ProjectedLBFGS(), lambda *told: None)
         higher += int((objective.frame_costs(ended.image, ended.z, ended.calibration) > least + 1).sum())
     assert higher >= 40 - 4
+
+
+def test_new_frames_find_them_for_the_object_of_earlier_ones(wide):
+    """The last of four frames is new, and begins a wave off. The evaluations are those of one frame in four."""
+    objective, state = wide
+    lost = off(objective, state, [[0, 0, 0, 0, 0]] * 3 + [[0, 1, 0, 0, 0]])
+    fitted, spent = fit_new_frames(objective, lost, 3, None, Schedule(segment=60), ProjectedLBFGS(), 0)
+    new, alone = slice(3, 4), objective.of_frames(slice(3, 4), free=Free.ABERRATIONS)
+    right = descend(alone, state.of_frames(new), 60, ProjectedLBFGS(), lambda *told: None)
+    stays = descend(alone, lost.of_frames(new), 60, ProjectedLBFGS(), lambda *told: None)
+    found = fitted.of_frames(new)  # from which the restoration descends further
+    costs = [float(alone.frame_costs(one.image, one.z, one.calibration)) for one in (found, right, stays)]
+    assert costs[0] - costs[1] < 0.5 * (costs[2] - costs[1])  # the rest is for that descent
+    assert torch.equal(fitted.z[:3], lost.z[:3])
+    tried = 2 * (2 * len(sides_of_lines(objective.model.pupil.aperture.centers)) + 1)  # it changes in the first round
+    assert (60 + tried) // 4 <= spent <= (120 + tried) // 4
