@@ -171,3 +171,11 @@ def test_delays_are_told_by_a_wide_band_in_bright_light(five_holes, five_hole_ba
     assert errors[2] / errors[1] == pytest.approx(4, rel=0.1)  # narrow enough for the law
     assert errors[3] / errors[1] == pytest.approx(0.25, rel=1e-6)
     assert errors[4] / errors[0] == pytest.approx(4, rel=1e-6)
+
+
+def test_what_is_expected_of_the_aberrations_holds_them(wide):
+    objective, state = wide
+    known = objective.with_changes(centre=state.z)
+    held = off(objective, state, [0, 0.5, 0, 0, 0]).calibrated(aberration_weight=1e9)
+    begun, _ = start_from_delays(known, held, 30.0, ProjectedLBFGS())
+    torch.testing.assert_close(begun.z, state.z, rtol=0, atol=1e-3)  # 1e9 against a misfit of some 1e5
