@@ -13,6 +13,7 @@ from scipy.optimize import linprog
 from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture
 from torchmask.optics.band import Band
+from torchmask.restoration import escapes
 from torchmask.restoration.aberrations import turbulent_basis
 from torchmask.restoration.descent import descend
 from torchmask.restoration.escapes import escape
@@ -142,6 +143,24 @@ def test_an_escape_of_a_mask_changes_them(wide):
             continue
         torch.testing.assert_close(found.z, state.z, rtol=0, atol=1e-9)
         assert n_evaluations == change_fringes(alone, lost)[1]
+
+
+@pytest.mark.parametrize(("free", "estimated", "called"), [("object", False, 0), ("object", True, 1), ("", False, 1)])
+def test_an_escape_changes_them_unless_the_object_is_still_to_be_found(free, estimated, called, wide, monkeypatch):
+    """A wrong one would be held by fringes that suit it; estimated aberrations are near the right ones."""
+    objective, state = wide
+    calls = []
+
+    def change(objective, state):
+        calls.append(state)
+        return state, 0
+
+    monkeypatch.setattr(escapes, "change_fringes", change)
+    known = {"many_minima": False, "prior_on_aberrations": True, "r0_is_open": False, "r0": 0.25, "outer_scale": 20.0}
+    known |= {"max_iterations": 1, "tolerance": 0.0, "seed": 0, "refinement": Refinement.OFF, "estimated": estimated}
+    now = objective if free else objective.with_changes(free=Free.ABERRATIONS)
+    escape(now, state, 30.0, Traits(**known), Schedule(outlying=math.inf), ProjectedLBFGS(), 1)
+    assert len(calls) == called
 
 
 def test_a_descent_does_not_find_them(wide):
