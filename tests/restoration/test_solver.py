@@ -396,6 +396,25 @@ def test_a_first_start_that_misses_the_object_ends_once_it_is_sharp_if_a_band_te
     assert seen == [n_first] * told["may_start_again"]
 
 
+@pytest.mark.parametrize(
+    ("band", "may_start_again", "expected"), [("wide", True, 0), ("narrow", True, 1), ("wide", False, 1)]
+)
+def test_pistons_change_by_whole_waves_unless_starts_from_group_delays_follow(
+    band, may_start_again, expected, in_bands, monkeypatch
+):
+    objective, truth = in_bands[band]
+    asked = []
+
+    def leave(*how, whole_waves):
+        asked.append(whole_waves)
+        return how[1], 0
+
+    monkeypatch.setattr(solver, "escape", leave)
+    schedule = Schedule(segment=1, sharp_after=0, start_iterations=3, **NONE_MISSED)
+    solver_of(objective, schedule=schedule).run(Progress(Candidates(truth, 1)), may_start_again, lambda _: None)
+    assert asked == [bool(expected)]  # once, as nothing has changed
+
+
 @pytest.mark.parametrize(("gentle", "cooling", "kinds"), [(True, 30, "tth"), (False, 30, "tt"), (True, 0, "tt")])
 def test_an_explained_object_of_gentle_slopes_is_heated_once(gentle, cooling, kinds, explained, monkeypatch):
     """The best one, when twins are in vain. Its evaluations count, and it has its own seed."""

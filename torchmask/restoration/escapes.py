@@ -1,11 +1,10 @@
 """Ways out of local minima that a descent does not find.
 
 Outlying frames: for a fixed object, the aberrations of a frame are a small separate problem, for which several random
-starts are cheap. Fringes: in a band, pistons may be whole waves off, which shows if the object is known, or the
-aberrations nearly are (`fringes`). Sub-pixel position of the object: the frames do not constrain it, as a shift of the
-object and the opposite tilt of all frames give the same images. The prior on the object does, because edges and points
-that are centred on pixels have the least total variation and no negative side lobes. A descent hardly moves along this
-direction, so the best position is searched directly.
+starts are cheap. Fringes: in a band, pistons may be whole waves off (`fringes`). Sub-pixel position of the object: the
+frames do not constrain it, as a shift of the object and the opposite tilt of all frames give the same images. The prior
+on the object does, because edges and points that are centred on pixels have the least total variation and no negative
+side lobes. A descent hardly moves along this direction, so the best position is searched directly.
 """
 
 from __future__ import annotations
@@ -38,16 +37,19 @@ def escape(
     schedule: Schedule,
     minimizer: Minimizer,
     number: int,
+    *,
+    whole_waves: bool,
 ) -> tuple[State, int]:
     """Try all ways out, for the `number`-th time; return the state, itself if none gains, and the evaluations.
 
-    Frames of a full pupil already had many starts in the tournament, unless they started from a sensor's estimate.
+    `whole_waves` is whether pistons change by these. Frames of a full pupil already had many starts in the tournament,
+    unless they started from a sensor's estimate.
     """
     evaluations = 0
     if traits.estimated or not traits.many_minima:
         seed = traits.seed + number
         state, evaluations = restart_outlier_frames(objective, state, first_inflation, schedule, minimizer, seed)
-        if traits.estimated or Free.OBJECT not in objective.free:
+        if whole_waves:
             state, tried = change_fringes(objective, state)
             evaluations += tried
     if Free.OBJECT in objective.free:

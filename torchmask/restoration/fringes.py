@@ -1,12 +1,11 @@
-"""A way out of local minima in a band, where the object is known: pistons that are whole waves off.
+"""A way out of local minima in a band: pistons that are whole waves off.
 
 Frames of one wavelength do not show whole waves of piston; those of several do, by the contrast of their fringes. A
 descent does not move a hole, or a part of the mask, from one fringe to the next: the contrast is worse in between. Most
-often all holes on one side of a line are a wave off against the others, as if the mask were tilted. For a known object
+often all holes on one side of a line are a wave off against the others, as if the mask were tilted. For a fixed object
 the frames are separate problems, so all these changes are tried, and each frame takes the one that suits it best, as
-long as there is one. That takes no descent, and leaves a frame as it is unless another fringe suits it better. New
-frames have the object of earlier ones. An object that is still to be found may be wrong by parts of a wave, for which
-whole waves are no remedy: `group_delays` are.
+long as there is one. An object that is still to be found may be wrong by parts of a wave, and is held there by the
+fringes that suit it: where frames tell them, `group_delays` are the remedy.
 """
 
 from __future__ import annotations

@@ -55,7 +55,7 @@ class Restarts:
         if self.averages and found.now.explained:
             progress.explained += (progress.ending,)
         progress.in_vain = 0 if found.advances else progress.in_vain + 1
-        has_delays = self._has_delays(objective, best.state)
+        has_delays = self.follows_delays(objective, best.state)
         # where the pistons are at the group delays, no twin is left to look for
         is_settled = has_delays and found.verdict.explained and progress.in_vain > 0
         if not is_settled and self.judge.wants_another(found.verdict, progress):
@@ -80,10 +80,10 @@ class Restarts:
         if not (progress.starts == 1 and is_sharp and may_follow):
             return False
         is_missed = self.judge.verdict(objective, progress.ending).finding is Finding.NOT_EXPLAINED
-        return is_missed and self._has_delays(objective, progress.state)
+        return is_missed and self.follows_delays(objective, progress.state)
 
-    def _has_delays(self, objective: MyopicObjective, state: State) -> bool:
-        """Return whether this is a mask in a band whose frames tell group delays."""
+    def follows_delays(self, objective: MyopicObjective, state: State) -> bool:
+        """Return whether starts from group delays follow: a mask's, if its frames are of a band that tells them."""
         is_mask = not self.traits.many_minima and self.setting.still.n_subapertures > 1
         if not is_mask or len(objective.model.band.wavelengths) == 1:
             return False

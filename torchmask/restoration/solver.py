@@ -234,7 +234,7 @@ class Solver:
         if goes_on and Free.ABERRATIONS in objective.free and progress.escapes < schedule.escapes:
             moved_nothing = progress.iterations == done
             if moved_nothing or Free.OBJECT not in objective.free or progress.iterations >= schedule.sharp_after:
-                self._escape(progress)
+                self._escape(progress, may_start_again)
         elif at_rest and not self.setting.awaits_motion(progress.state):
             progress.status, progress.decrease = Status.CONVERGED, decrease
             return
@@ -262,9 +262,13 @@ class Solver:
         power = self.traits.fit_power if sharpen else None
         return recalibrate(objective, state, power, follow_r0=self.traits.r0_is_open)
 
-    def _escape(self, progress: Progress) -> None:
+    def _escape(self, progress: Progress, may_start_again: bool) -> None:
         progress.escapes += 1
-        state, evaluations = escape(self.objective, progress.state, self.first_inflation, *self._how, progress.escapes)
+        objective, state = self.objective, progress.state
+        how = (self.first_inflation, *self._how, progress.escapes)
+        # for an object that may be wrong, whole waves would hold what starts from group delays are to change
+        follows_delays = may_start_again and self.restarts.follows_delays(objective, state)
+        state, evaluations = escape(objective, state, *how, whole_waves=not follows_delays)
         progress.n_evaluations += evaluations
         if state is progress.state:  # nothing has changed: no further attempt
             progress.escapes = self.schedule.escapes
