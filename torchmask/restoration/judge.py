@@ -124,7 +124,7 @@ class Judge:
             return len(progress.explained) < self.schedule.averaged and left >= self.schedule.start_iterations
         if progress.alike or progress.starts >= self.most_starts(verdict):
             return False
-        is_sure = self._twins_may_improve(verdict) and not self._is_doubted(verdict)
+        is_sure = self._twins_may_improve(verdict) and not self.is_doubted(verdict)
         if is_sure and progress.in_vain >= self.schedule.in_vain:
             return False
         # one that could be spared is not begun to be cut short before most are given up
@@ -152,7 +152,7 @@ class Judge:
         """Return whether a start that explains a mask's frames may have a better twin, unless the frames are faint."""
         return verdict.explained and self.has_twins and self.end is not End.INTEGRATION
 
-    def _is_doubted(self, verdict: Verdict) -> bool:
+    def is_doubted(self, verdict: Verdict) -> bool:
         """Return whether a fit that explains the frames leaves more than is expected."""
         noise = verdict.limit - 1 - self.schedule.model_errors * verdict.model_error
         return verdict.excess - noise > self.schedule.doubtful * verdict.model_error
@@ -168,7 +168,7 @@ class Judge:
         if not may_be_rough or decrease > self.schedule.nearly_at_rest:
             return False
         verdict = self.verdict(objective, progress.ending)
-        return verdict.explained and not self._is_doubted(verdict)
+        return verdict.explained and not self.is_doubted(verdict)
 
     def is_twin(self, start: int, verdict: Verdict) -> bool:
         """Return whether the start of this number is from a twin, if this is the verdict on the best so far.

@@ -55,9 +55,10 @@ class Restarts:
         if self.averages and found.now.explained:
             progress.explained += (progress.ending,)
         progress.in_vain = 0 if found.advances else progress.in_vain + 1
-        has_delays = self.follows_delays(objective, best.state)
+        has_delays = self._tells_delays(objective, best.state)
         # where the pistons are at the group delays, no twin is left to look for
-        is_settled = has_delays and found.verdict.explained and progress.in_vain > 0
+        is_sure = found.verdict.explained and not self.judge.is_doubted(found.verdict)
+        is_settled = has_delays and is_sure and progress.in_vain > 0
         if not is_settled and self.judge.wants_another(found.verdict, progress):
             if has_delays and progress.in_vain == 0 and self.judge.has_room(progress):
                 self._start_from_delays(objective, progress, best)
@@ -74,18 +75,24 @@ class Restarts:
         That is from one segment after its object is sharp, unless it explains the frames, or the schedule wants one
         start, or too few iterations are left for a whole one.
         """
-        schedule = self.schedule
-        is_sharp = progress.iterations >= schedule.sharp_after + schedule.segment
-        may_follow = min(schedule.starts - 1, schedule.in_vain) > 0 and self.judge.has_room_for_all(progress)
-        if not (progress.starts == 1 and is_sharp and may_follow):
+        is_sharp = progress.iterations >= self.schedule.sharp_after + self.schedule.segment
+        if not (progress.starts == 1 and is_sharp and self.judge.has_room_for_all(progress)):
             return False
         is_missed = self.judge.verdict(objective, progress.ending).finding is Finding.NOT_EXPLAINED
-        return is_missed and self.follows_delays(objective, progress.state)
+        return is_missed and self.follows_delays(objective, progress)
 
-    def follows_delays(self, objective: MyopicObjective, state: State) -> bool:
-        """Return whether starts from group delays follow: a mask's, if its frames are of a band that tells them."""
-        is_mask = not self.traits.many_minima and self.setting.still.n_subapertures > 1
-        if not is_mask or len(objective.model.band.wavelengths) == 1:
+    def follows_delays(self, objective: MyopicObjective, progress: Progress) -> bool:
+        """Return whether a start from group delays may follow the present one.
+
+        The schedule has to want another, iterations have to be left for it, and the frames have to tell group delays.
+        """
+        schedule = self.schedule
+        may_follow = schedule.in_vain > 0 and progress.starts < schedule.starts and self.judge.has_room(progress)
+        return may_follow and self._tells_delays(objective, progress.state)
+
+    def _tells_delays(self, objective: MyopicObjective, state: State) -> bool:
+        """Return whether the frames of a mask that has twins are of a band that tells group delays."""
+        if not self.judge.has_twins or len(objective.model.band.wavelengths) == 1:
             return False
         return tells_delays(self.setting.objective_at(objective, state), state)
 

@@ -45,8 +45,8 @@ class Schedule:
         the cost by less than this fraction, as the last descent goes on from there
     sharp_after : number of iterations after which the object is sharp enough to escape from local minima, and in faint
         light to choose the prior of the rest of the search
-    escapes : maximum number of escapes in one start, each of which restarts outlying frames and shifts the
-        object, or changes fringes in a band if that is known
+    escapes : maximum number of escapes in one start, each of which restarts outlying frames, shifts the
+        object and, in a band where no start from group delays may follow, changes fringes
     first_inflation : the initial noise variance is the residual variance of the mean frame divided by this
     start_rms : rms of random initial whitened aberrations
     start_rms_unwhitened : the same in rad, for aberrations without a prior
@@ -59,7 +59,7 @@ class Schedule:
     starts : maximum number of starts, but for `averaged` and `faint_starts`
     in_vain : a mask whose frames are explained beyond doubt, and not faint, starts from twins of the best object until
         so many starts in succession have brought nothing clearly better; 0: it starts once. Where a band tells group
-        delays, a start from these follows each that is clearly better, and no twin as long as frames are explained
+        delays, a start from these follows each that is clearly better, and no twin if the frames are explained then
     doubtful : an explained fit of a mask is doubted if the excess is larger than this number times that expected, and
         others are started as if it were not explained
     better : where the best start so far explains the frames of a mask, a later one that costs less is clearly better if

@@ -267,7 +267,7 @@ class Solver:
         objective, state = self.objective, progress.state
         how = (self.first_inflation, *self._how, progress.escapes)
         # for an object that may be wrong, whole waves would hold what starts from group delays are to change
-        follows_delays = may_start_again and self.restarts.follows_delays(objective, state)
+        follows_delays = may_start_again and self.restarts.follows_delays(objective, progress)
         state, evaluations = escape(objective, state, *how, whole_waves=not follows_delays)
         progress.n_evaluations += evaluations
         if state is progress.state:  # nothing has changed: no further attempt
