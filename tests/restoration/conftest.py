@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import pytest
@@ -12,6 +13,7 @@ from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.grid import Grid
 from torchmask.observation import Observation
 from torchmask.optics.aperture import Aperture, SparseAperture
+from torchmask.optics.band import Band
 from torchmask.optics.detector import Detector
 from torchmask.restoration.aberrations import AberrationBasis, turbulent_basis
 from torchmask.restoration.forward import ExposureModel
@@ -158,3 +160,27 @@ def restoring(observation) -> Callable[..., MyopicDeconvolution]:
 def restored(observation, restoring) -> RestorationResult:
     """`observation`, restored by a method that knows the turbulence and the noise."""
     return restoring().restore(observation.frames)
+
+
+@pytest.fixture(scope="session")
+def in_band(five_holes) -> Callable[..., ExposureModel]:
+    """Makes the model of exposures through the five holes in a band, of a third of the wavelength unless told."""
+    grid = Grid.nyquist(1.0, 550e-9, 32, oversampling=1.5)
+    return lambda basis, width=200e-9: ExposureModel(five_holes, grid, basis, Band.top_hat(600e-9, width, 5))
+
+
+@pytest.fixture(scope="session")
+def wide(in_band, five_hole_basis, explain) -> tuple[MyopicObjective, State]:
+    """Frames in that wide band, and the state that explains them."""
+    return explain(in_band(five_hole_basis))
+
+
+@pytest.fixture(scope="session")
+def off() -> Callable[[MyopicObjective, State, list], State]:
+    """Moves pistons by waves of that band's mean wavelength, (T, N), or (N,) in all frames."""
+
+    def move(objective: MyopicObjective, state: State, waves: list) -> State:
+        pistons = 2 * math.pi * 600 / 550 * torch.tensor(waves, dtype=torch.float64)  # [rad] at the grid's wavelength
+        return replace(state, z=state.z + objective.model.aberrations.parameters_of_pistons(pistons))
+
+    return move

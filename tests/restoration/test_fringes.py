@@ -24,23 +24,6 @@ from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.starts import fit_new_frames
 from torchmask.restoration.traits import Refinement, Traits
 
-GRID = Grid.nyquist(1.0, 550e-9, 32, oversampling=1.5)
-WIDE = Band.top_hat(600e-9, 200e-9, 5)
-WAVE = 2 * math.pi * 600 / 550  # of the band's mean wavelength, in rad at the wavelength of the grid
-
-
-@pytest.fixture(scope="module")
-def wide(five_holes, five_hole_basis, explain):
-    """Frames in a band of a third of the wavelength, and the state that explains them."""
-    return explain(ExposureModel(five_holes, GRID, five_hole_basis, WIDE))
-
-
-def off(objective, state, waves):
-    """The state whose frames have pistons off by these waves (T, N)."""
-    basis = objective.model.aberrations
-    pistons = WAVE * torch.tensor(waves, dtype=torch.float64)
-    return replace(state, z=state.z + basis.parameters_of_pistons(pistons))
-
 
 def is_divided(points, side):
     """Whether a line has the points of `side` on one side and the others on the other, by linear programming."""
@@ -78,7 +61,7 @@ def test_sides_do_not_repeat_and_their_number_is_that_of_points_in_general_posit
         [[1, 1, 0, 0, 0], [0, 0, 0, 0, 0], [0, -1, -1, 0, 0], [0, 2, 0, 0, 0]],  # two holes side by side; two waves
     ],
 )
-def test_frames_find_their_fringes_again(waves, wide):
+def test_frames_find_their_fringes_again(waves, wide, off):
     objective, state = wide
     lost = off(objective, state, waves)
     costs = [objective.frame_costs(one.image, one.z, one.calibration) for one in (lost, state)]
@@ -92,7 +75,7 @@ def test_frames_find_their_fringes_again(waves, wide):
     assert n_evaluations > 0
 
 
-def test_evaluations_are_those_of_the_frames_that_move(wide, five_holes):
+def test_evaluations_are_those_of_the_frames_that_move(wide, five_holes, off):
     objective, state = wide
     n_changes = 2 * len(sides_of_lines(five_holes.centers)) + 1  # and the frame as it is
     stays, once = change_fringes(objective, state)
@@ -103,10 +86,10 @@ def test_evaluations_are_those_of_the_frames_that_move(wide, five_holes):
     assert change_fringes(objective, off(objective, state, waves.tolist()))[1] == n_changes + n_changes // len(state.z)
 
 
-def test_common_aberrations_weigh_the_same_in_every_round(wide, five_holes, explain):
+def test_common_aberrations_weigh_the_same_in_every_round(wide, five_holes, explain, off, in_band):
     """In the second round one frame is left, two waves off at first, whose prior would hold them alone."""
     basis = turbulent_basis(five_holes, 3, 6, 0.25, 20.0)
-    objective, state = explain(ExposureModel(five_holes, GRID, basis, WIDE))
+    objective, state = explain(in_band(basis))
     z = state.z.clone()
     z[:, basis.n_own :] *= 100 / z[0, basis.n_own :].norm()  # (1 - 1/4) 100^2 / 2 is more than any gain
     frames = objective.model(state.image, z)
@@ -125,11 +108,11 @@ def test_one_wavelength_does_not_show_them(explained):
 
 def test_a_full_pupil_has_none(explain):
     grid = Grid.nyquist(1.0, 550e-9, 32, oversampling=1.5)
-    objective, state = explain(ExposureModel(FullAperture(1.0), grid, 4, WIDE), n_frames=2)
+    objective, state = explain(ExposureModel(FullAperture(1.0), grid, 4, Band.top_hat(600e-9, 200e-9, 5)), n_frames=2)
     assert change_fringes(objective, state) == (state, 0)
 
 
-def test_an_escape_of_a_mask_changes_them(wide):
+def test_an_escape_of_a_mask_changes_them(wide, off):
     objective, state = wide
     lost, alone = off(objective, state, [[0, 1, 0, 0, 0]] * 4), objective.with_changes(free=Free.ABERRATIONS)
     known = {"estimated": False, "prior_on_aberrations": True, "r0_is_open": False, "r0": 0.25, "outer_scale": 20.0}
@@ -144,7 +127,7 @@ def test_an_escape_of_a_mask_changes_them(wide):
         assert n_evaluations == change_fringes(alone, lost)[1]
 
 
-def test_an_escape_leaves_them_where_they_are_not_asked_for(wide):
+def test_an_escape_leaves_them_where_they_are_not_asked_for(wide, off):
     objective, state = wide
     lost, alone = off(objective, state, [[0, 1, 0, 0, 0]] * 4), objective.with_changes(free=Free.ABERRATIONS)
     known = {"estimated": False, "prior_on_aberrations": True, "r0_is_open": False, "r0": 0.25, "outer_scale": 20.0}
@@ -153,7 +136,7 @@ def test_an_escape_leaves_them_where_they_are_not_asked_for(wide):
     assert escape(alone, lost, 30.0, *how, whole_waves=False)[0] is lost
 
 
-def test_a_descent_does_not_find_them(wide):
+def test_a_descent_does_not_find_them(wide, off):
     """Which is why they are tried: for four frames, with each hole off by a wave either way, it ends at a higher cost.
 
     By chance it finds one now and then: one of the 40 was seen, where the aberrations are those of other signs of
@@ -169,7 +152,7 @@ def test_a_descent_does_not_find_them(wide):
     assert higher >= 40 - 4
 
 
-def test_new_frames_find_them_for_the_object_of_earlier_ones(wide):
+def test_new_frames_find_them_for_the_object_of_earlier_ones(wide, off):
     """The last of four frames is new, and begins a wave off. The evaluations are those of one frame in four."""
     objective, state = wide
     lost = off(objective, state, [[0, 0, 0, 0, 0]] * 3 + [[0, 1, 0, 0, 0]])

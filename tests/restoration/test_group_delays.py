@@ -6,30 +6,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchmask.grid import Grid
-from torchmask.optics.band import Band
 from torchmask.restoration.aberrations import turbulent_basis
 from torchmask.restoration.descent import descend
-from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.group_delays import delay_errors, start_from_delays, tells_delays
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.projected_lbfgs import ProjectedLBFGS
 
-GRID = Grid.nyquist(1.0, 550e-9, 32, oversampling=1.5)
-WIDE = Band.top_hat(600e-9, 200e-9, 5)
-WAVE = 2 * math.pi * 600 / 550  # of the band's mean wavelength, in rad at the wavelength of the grid
-
-
-@pytest.fixture(scope="module")
-def wide(five_holes, five_hole_basis, explain):
-    """Frames in a band of a third of the wavelength, and the state that explains them."""
-    return explain(ExposureModel(five_holes, GRID, five_hole_basis, WIDE))
-
-
-def off(objective, state, waves):
-    """The state whose frames have pistons off by these waves (N,), the same in all of them."""
-    pistons = WAVE * torch.tensor(waves, dtype=torch.float64)
-    return replace(state, z=state.z + objective.model.aberrations.parameters_of_pistons(pistons))
+WAVE = 2 * math.pi * 600 / 550  # of the mean wavelength of the wide band, in rad at the wavelength of the grid
 
 
 def waves_off(objective, found, state):
@@ -49,19 +32,19 @@ def cost(objective, state):
 
 
 @pytest.mark.parametrize("moves", [False, True])
-def test_offsets_are_phases_of_whole_holes_alike_at_every_wavelength(moves, five_holes):
+def test_offsets_are_phases_of_whole_holes_alike_at_every_wavelength(moves, five_holes, in_band):
     """A path difference is not: it has more waves in bluer light. What was there before stays as it is."""
     basis = turbulent_basis(five_holes, 3, 6, 0.25, 20.0)
     basis = basis.in_motion(torch.ones(30, 2, dtype=torch.float64)) if moves else basis
     wider = basis.with_offsets()
     assert (wider.n_own, wider.n_common) == (basis.n_own + 5, basis.n_common)
     assert wider.instants == basis.instants
-    narrow, wide = (ExposureModel(five_holes, GRID, one, WIDE).pupil.samples() for one in (basis, wider))
+    narrow, wide = (in_band(one).pupil.samples() for one in (basis, wider))
     own = basis.n_own
     kept = torch.cat([wide.basis[:, :own], wide.basis[:, own + 5 :]], 1)
     torch.testing.assert_close(kept, narrow.basis, rtol=0, atol=1e-14)  # rounding
     new = wide.basis[:, own : own + 5]
-    holes = five_holes.centers / ExposureModel(five_holes, GRID, basis, WIDE).window.field.period
+    holes = five_holes.centers / in_band(basis).window.field.period
     nearest = torch.cdist(wide.positions / wide.chromaticity[:, None], holes).argmin(1)
     expected = 2 * math.pi * torch.nn.functional.one_hot(nearest, 5).double()
     torch.testing.assert_close(new, expected, rtol=0, atol=0)
@@ -69,7 +52,7 @@ def test_offsets_are_phases_of_whole_holes_alike_at_every_wavelength(moves, five
 
 
 @pytest.mark.parametrize("waves", [[0, 1, 0, 0, 0], [0, 0.5, 0, -0.5, 0], [0.3, 0.5, -0.2, -0.4, 0]])
-def test_pistons_find_the_fringes_that_a_descent_misses(waves, wide):
+def test_pistons_find_the_fringes_that_a_descent_misses(waves, wide, off):
     """Whole waves and parts of one, the same in all frames, which the object takes over as far as it can."""
     objective, state = wide
     lost = descended(objective, descended(objective, off(objective, state, waves)))
@@ -93,7 +76,7 @@ def test_right_pistons_stay(wide):
     assert float(waves_off(objective, found, state).abs().max()) < 0.05
 
 
-def test_a_search_for_delays_reports_every_iteration(wide):
+def test_a_search_for_delays_reports_every_iteration(wide, off):
     objective, state = wide
     records = []
     start_from_delays(objective, off(objective, state, [0, 0.5, 0, 0, 0]), 30.0, ProjectedLBFGS(), records.append)
@@ -101,10 +84,10 @@ def test_a_search_for_delays_reports_every_iteration(wide):
     assert records[-1].scalars["cost"] < records[0].scalars["cost"] - 10
 
 
-def test_common_aberrations_stay_common(five_holes, explain):
+def test_common_aberrations_stay_common(five_holes, explain, off, in_band):
     """Each frame's own are found, held by a prior around what is expected."""
     basis = turbulent_basis(five_holes, 3, 6, 0.25, 20.0)
-    objective, state = explain(ExposureModel(five_holes, GRID, basis, WIDE))
+    objective, state = explain(in_band(basis))
     objective = objective.with_changes(centre=state.z)
     lost = off(objective, state, [0, 1, 0, 0, 0])
     begun, _ = start_from_delays(objective, lost, 30.0, ProjectedLBFGS())
@@ -114,11 +97,11 @@ def test_common_aberrations_stay_common(five_holes, explain):
 
 
 @pytest.mark.parametrize("moves", [False, True])
-def test_float32_and_frames_that_last_find_them_too(moves, five_holes, five_hole_basis, explain):
+def test_float32_and_frames_that_last_find_them_too(moves, five_hole_basis, explain, off, in_band):
     basis = five_hole_basis
     if moves:
         basis = basis.in_motion(0.1 * basis.mixing[:, :4])
-    objective, state = explain(ExposureModel(five_holes, GRID, basis, WIDE))
+    objective, state = explain(in_band(basis))
     single = objective.model.single(), objective.frames.float(), objective.precision.float(), objective.prior
     objective = MyopicObjective(*single)
     lost = off(objective, state, [0, 1, 0, -1, 0])
@@ -159,12 +142,11 @@ def test_errors_of_delays_are_cramer_rao_bounds(wide):
     torch.testing.assert_close(inflated, found, rtol=1e-12, atol=0)
 
 
-def test_delays_are_told_by_a_wide_band_in_bright_light(five_holes, five_hole_basis, explain):
+def test_delays_are_told_by_a_wide_band_in_bright_light(in_band, five_hole_basis, explain):
     """Contrast changes with the square of the delay times the width, so errors go with noise over width squared."""
     said, errors = [], []
     for width, noise in ((200e-9, 0.03), (100e-9, 0.03), (50e-9, 0.03), (100e-9, 0.0075), (200e-9, 0.12)):
-        band = Band.top_hat(600e-9, width, 5)
-        objective, state = explain(ExposureModel(five_holes, GRID, five_hole_basis, band), noise=noise)
+        objective, state = explain(in_band(five_hole_basis, width), noise=noise)
         said.append(tells_delays(objective, state))
         errors.append(float(delay_errors(objective, state).median()))
     assert said == [True, False, False, True, False]
@@ -173,7 +155,7 @@ def test_delays_are_told_by_a_wide_band_in_bright_light(five_holes, five_hole_ba
     assert errors[4] / errors[0] == pytest.approx(4, rel=1e-6)
 
 
-def test_what_is_expected_of_the_aberrations_holds_them(wide):
+def test_what_is_expected_of_the_aberrations_holds_them(wide, off):
     objective, state = wide
     known = objective.with_changes(centre=state.z)
     held = off(objective, state, [0, 0.5, 0, 0, 0]).calibrated(aberration_weight=1e9)

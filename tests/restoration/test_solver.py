@@ -295,11 +295,9 @@ def test_twins_of_an_explained_mask_follow_until_two_are_in_vain(explained, monk
 
 
 @pytest.fixture(scope="module")
-def in_bands(explain, five_holes, five_hole_basis):
+def in_bands(wide, in_band, explain, five_hole_basis):
     """Frames of a wide band, which tell group delays, and of a narrow one, which do not."""
-    grid = Grid.nyquist(1.0, 550e-9, 32, oversampling=1.5)
-    bands = {name: Band.top_hat(600e-9, width, 5) for name, width in (("wide", 200e-9), ("narrow", 50e-9))}
-    return {name: explain(ExposureModel(five_holes, grid, five_hole_basis, band)) for name, band in bands.items()}
+    return {"wide": wide, "narrow": explain(in_band(five_hole_basis, 50e-9))}
 
 
 @pytest.mark.parametrize(

@@ -47,8 +47,8 @@ def delay_errors(objective: MyopicObjective, state: State) -> Tensor:
     as given.
     """
     freed, widen = _freed(objective)
-    model, basis, (_, precision, _) = freed.model, objective.model.aberrations, freed.scaled_data(state.calibration)
-    precision = precision * state.calibration.noise_inflation[:, None, None].to(precision)
+    model, basis = freed.model, objective.model.aberrations
+    precision = freed.scaled_data(state.with_noise_inflation(1.0).calibration).precision
     wave = 2 * math.pi * model.band.mean / model.window.grid.wavelength  # [rad] at the wavelength of the grid
     z, first = widen(state.z), basis.n_own
 
