@@ -189,20 +189,24 @@ def test_aberrations_are_integrated_out_after_the_last_descent_or_in_its_place(e
 
 
 @pytest.mark.parametrize(
-    ("end", "descends", "integrates"),
+    ("end", "gentle", "descends", "integrates"),
     [
-        (End.LAST_DESCENT, True, None),
-        (End.FULL_PUPIL, True, None),
-        (End.OBJECT, True, None),
-        (End.BOTH, False, True),
-        (End.INTEGRATION, None, False),
+        (End.LAST_DESCENT, False, True, None),
+        (End.LAST_DESCENT, True, True, None),
+        (End.FULL_PUPIL, False, True, None),
+        (End.OBJECT, False, True, None),
+        (End.BOTH, False, False, True),
+        (End.BOTH, True, False, False),
+        (End.INTEGRATION, False, None, False),
+        (End.INTEGRATION, True, None, False),
     ],
 )
-def test_which_priors_are_adapted_to_the_object(end, descends, integrates, explained, monkeypatch):
-    """That of a descent, before each of its segments, and that of an integration after one: neither in the descent
-    before it, nor where the search has ended in faint frames."""
+def test_which_priors_are_adapted_to_the_object(end, gentle, descends, integrates, explained, monkeypatch):
+    """That of a descent, before each of its segments, and that of an integration after one, unless slopes are gentle:
+    neither in the descent before it, nor where the search has ended in faint frames."""
     objective, state = explained
     asked, told = {True: set(), False: set()}, []
+    monkeypatch.setattr(finish, "shows_gentle_slopes", lambda *given: gentle)
     monkeypatch.setattr(SmoothVariation, "adapted_to", lambda self, image, reach: told.append((image, reach)) or self)
     descend, integrate = finish.descend, finish.integrate_aberrations
 

@@ -8,7 +8,8 @@ of the object; a faint search under a lighter prior, or with fewer modes than ar
 one before. Between segments of the last descent the phases of frames are retrieved that a mask's search has left in
 poor minima (`retrieval`). For a full pupil its segments begin with the object settled for the aberrations at hand: a
 joint descent is too slow at the frequencies that a full pupil hardly passes, in which most of the error in bright light
-would lie. The prior of a last descent, and of an integration after it, is adapted to the object that is known by then.
+would lie. The prior of a last descent, and of an integration after it unless the object has gentle slopes, is adapted
+to the object that is known by then.
 Where the aberrations are known, the object alone descends once more, under the prior of its whole family
 (`ObjectPrior.family`) that the frames choose.
 """
@@ -72,7 +73,7 @@ class Finisher:
             astray = gentle and is_too_steep(objective, ended.state)
             rate = rate_in_noise(objective, ended.state, self.change, gentle=gentle)
             prior = prior.suited_to(rate) if rate > 0 else prior
-            if end.descends:  # what a search finds in faint frames shows too little of the object
+            if end.descends and not gentle:  # steep ones in gentle slopes are noise; a faint search shows too little
                 prior = prior.adapted_to(ended.state.image, _reach(objective))
             objective = objective.with_changes(prior=prior)
             ended.state, spent = integrate_aberrations(objective, ended.state, rounds, *how, **known, astray=astray)
