@@ -192,7 +192,6 @@ def test_aberrations_are_integrated_out_after_the_last_descent_or_in_its_place(e
     ("end", "gentle", "descends", "integrates"),
     [
         (End.LAST_DESCENT, False, True, None),
-        (End.LAST_DESCENT, True, True, None),
         (End.FULL_PUPIL, False, True, None),
         (End.OBJECT, False, True, None),
         (End.BOTH, False, False, True),

@@ -8,8 +8,8 @@ of the object; a faint search under a lighter prior, or with fewer modes than ar
 one before. Between segments of the last descent the phases of frames are retrieved that a mask's search has left in
 poor minima (`retrieval`). For a full pupil its segments begin with the object settled for the aberrations at hand: a
 joint descent is too slow at the frequencies that a full pupil hardly passes, in which most of the error in bright light
-would lie. The prior of a last descent, and of an integration after it unless the object has gentle slopes, is adapted
-to the object that is known by then.
+would lie. The prior of a last descent is adapted to the object that is known by then; where an integration follows,
+only the prior of that is, unless the frames show gentle slopes. In faint frames none is.
 Where the aberrations are known, the object alone descends once more, under the prior of its whole family
 (`ObjectPrior.family`) that the frames choose.
 """
@@ -73,7 +73,7 @@ class Finisher:
             astray = gentle and is_too_steep(objective, ended.state)
             rate = rate_in_noise(objective, ended.state, self.change, gentle=gentle)
             prior = prior.suited_to(rate) if rate > 0 else prior
-            if end.descends and not gentle:  # steep ones in gentle slopes are noise; a faint search shows too little
+            if end.descends and not gentle:  # there, most edges found are noise; a faint search shows too few
                 prior = prior.adapted_to(ended.state.image, _reach(objective))
             objective = objective.with_changes(prior=prior)
             ended.state, spent = integrate_aberrations(objective, ended.state, rounds, *how, **known, astray=astray)
@@ -104,7 +104,7 @@ class Finisher:
             return choose_prior(objective, state, choices, schedule.comparing)
 
         def objective_under(prior: ObjectPrior, state: State) -> MyopicObjective:
-            # noisy frames show edges that are none; their integration adapts its own prior to what this descent finds
+            # noisy frames show edges that are none; their integration may adapt its own prior to what is found here
             return objective.with_changes(prior=prior if end.integrates else self._adapted(prior, objective, state))
 
         def listen(cost: float, evaluations: int, variables: Variables) -> None:
