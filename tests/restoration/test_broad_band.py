@@ -53,7 +53,7 @@ def test_restoration_with_the_band_explains_what_one_wavelength_cannot(observed)
     narrow = MyopicDeconvolution(aperture, grid, **options).restore(frames)
     assert broad.chi_square.mean() < 0.5 * narrow.chi_square.mean()
     assert broad.coefficients.shape == (8, 3, 6)
-    assert broad.coefficients.std(0)[:, 3:].max() < 1e-6  # they have stayed common
+    assert broad.coefficients.std(0)[:, 3:].max() < 1e-12  # they have stayed common, whatever a processor rounds
     secondary = broad.object.clone()
     secondary[18:23, 16:21] = 0  # the primary and its neighbours
     row, column = divmod(int(secondary.argmax()), 40)

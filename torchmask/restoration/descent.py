@@ -80,7 +80,8 @@ def descend(
         lower[-1] = -math.log(largest_magnification(objective.model)) / step_scale[-1]
     found = minimizer(cost, start, lower, max_iterations=n_iterations, callback=after).x
     image, z = split(found)
-    state = replace(state, image=image, z=z)
+    # what frames have in common has the same slope in each, but products of the minimiser round by place in its vector
+    state = replace(state, image=image, z=objective.model.aberrations.mean_common(z))
     if not moves:
         return state
     turn, shrinkage = found[place:] * step_scale
