@@ -8,6 +8,7 @@ import torch
 
 from torchmask.restoration.aberrations import turbulent_basis
 from torchmask.restoration.descent import descend
+from torchmask.restoration.fringes import change_fringes
 from torchmask.restoration.group_delays import delay_errors, start_from_delays, tells_delays
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.projected_lbfgs import ProjectedLBFGS
@@ -23,14 +24,14 @@ def waves_off(objective, found, state):
     return (wrong - plane @ torch.linalg.lstsq(plane, wrong).solution).T
 
 
-def worst_but_one(objective, found, state):
-    """The largest error of a piston [waves], but in the worst frame: which fringe a single one takes may depend on how
-    a processor rounds, as its delay is 0.2 to 0.25 of a wave off at first."""
-    return float(waves_off(objective, found, state).abs().amax(1).sort().values[-2])
-
-
 def descended(objective, state, iterations=300):
     return descend(objective, state, iterations, ProjectedLBFGS(), lambda *told: None)
+
+
+def found_from(objective, begun, state):
+    """The end of a descent with whole waves changed: a single frame may end a fringe off, by how a processor rounds."""
+    ended = descended(objective, replace(begun, calibration=state.calibration))
+    return descended(objective, change_fringes(objective, ended)[0])
 
 
 def cost(objective, state):
@@ -62,13 +63,12 @@ def test_pistons_find_the_fringes_that_a_descent_misses(waves, wide, off):
     """Whole waves and parts of one, the same in all frames, which the object takes over as far as it can."""
     objective, state = wide
     lost = descended(objective, descended(objective, off(objective, state, waves)))
-    assert float(waves_off(objective, lost, state).abs().max()) > 0.2
+    assert float(waves_off(objective, lost, state).abs().max()) > 0.3
     begun, evaluations = start_from_delays(objective, lost, 30.0, ProjectedLBFGS())
     assert 100 <= evaluations <= 130
     assert (begun.calibration.noise_inflation == 30).all()
-    assert float(waves_off(objective, begun, state).abs().max()) < 0.3  # half a wave is another fringe
-    found = descended(objective, replace(begun, calibration=state.calibration))
-    assert worst_but_one(objective, found, state) < 0.05
+    found = found_from(objective, begun, state)
+    assert float(waves_off(objective, found, state).abs().max()) < 0.05
     assert cost(objective, found) < cost(objective, lost) - 10
 
 
@@ -114,8 +114,8 @@ def test_float32_and_frames_that_last_find_them_too(moves, five_hole_basis, expl
     lost = off(objective, state, [0, 1, 0, -1, 0])
     begun, _ = start_from_delays(objective, lost, 30.0, ProjectedLBFGS())
     assert begun.z.dtype == torch.float64
-    ends = [descended(objective, replace(one, calibration=state.calibration)) for one in (lost, begun)]
-    errors = [worst_but_one(objective, one, state) for one in ends]
+    ends = [descended(objective, replace(lost, calibration=state.calibration)), found_from(objective, begun, state)]
+    errors = [float(waves_off(objective, one, state).abs().max()) for one in ends]
     assert errors[1] < 0.05 < 0.3 < errors[0]
 
 
