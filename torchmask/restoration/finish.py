@@ -73,7 +73,8 @@ class Finisher:
             astray = gentle and is_too_steep(objective, ended.state)
             rate = rate_in_noise(objective, ended.state, self.change, gentle=gentle)
             prior = prior.suited_to(rate) if rate > 0 else prior
-            if end.descends and not gentle:  # there, most edges found are noise; a faint search shows too few
+            # most edges found in gentle slopes are noise, and a faint search shows too few
+            if end.descends and not gentle:
                 prior = prior.adapted_to(ended.state.image, _reach(objective))
             objective = objective.with_changes(prior=prior)
             ended.state, spent = integrate_aberrations(objective, ended.state, rounds, *how, **known, astray=astray)
