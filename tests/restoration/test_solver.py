@@ -32,7 +32,7 @@ from torchmask.restoration.verdict import Finding
 
 ALL_MISSED = {"chance": -1e9}  # no fit is good enough
 NONE_MISSED = {"chance": math.inf, "in_vain": 0}  # and none is to be improved
-PLAIN = {"sharp_after": 50, "escapes": 0}  # ends when a segment brings nothing more
+PLAIN = {"sharp_after": 50, "escapes": 0, "last_segments": 0}  # ends when a segment brings nothing more
 BRISK = {"segment": 5, "sharp_after": 3, "escapes": 0}
 UNIT = 500.0  # electrons
 
@@ -471,7 +471,7 @@ def test_a_start_too_short_to_tell_is_not_judged(explained):
 def test_only_what_is_wholly_unknown_starts_again(explained):
     """Not with something known, from an earlier result, without a prior on the aberrations, or of one frame."""
     objective, truth = explained
-    schedule = Schedule(start_iterations=5, starts=2, alike=-1.0, **ALL_MISSED, **BRISK)
+    schedule = Schedule(start_iterations=5, starts=2, alike=-1.0, last_segments=0, **ALL_MISSED, **BRISK)
     coefficients = objective.model.aberrations.coefficients(truth.z)
     window = objective.model.window
     for known in (Known(coefficients), Known(coefficients, torch.eye(15)), Known(object=window.crop(truth.image))):
@@ -493,7 +493,7 @@ def test_a_mask_begins_without_aberrations_and_starts_again_at_random(explained)
         begun = solver_of(objective, seed=seed).begin(Known(), None)
         assert begun.candidates.n_each == 1
         assert float(begun.state.z.abs().max()) == 0
-    schedule = Schedule(start_iterations=4, starts=2, alike=-1.0, **ALL_MISSED, **BRISK)
+    schedule = Schedule(start_iterations=4, starts=2, alike=-1.0, last_segments=0, **ALL_MISSED, **BRISK)
     starts = {}
     for seed in (0, 0, 5):
         records: list[Record] = []
@@ -832,9 +832,10 @@ def test_a_descent_at_rest_comes_to_an_end(observation):
 @pytest.mark.slow
 def test_a_missed_object_gets_a_second_start(observation, restoring, tmp_path):
     """Here nothing is missed, so the thresholds are lowered: the better of both is kept, resumed or not."""
-    once = restoring(schedule=Schedule(start_iterations=400, in_vain=0)).restore(observation.frames)
+    brief = {"start_iterations": 400, "last_segments": 1}
+    once = restoring(schedule=Schedule(in_vain=0, **brief)).restore(observation.frames)
     assert len(once.cost) <= 400
-    method = restoring(schedule=Schedule(start_iterations=400, alike=-1.0, starts=2, **ALL_MISSED))
+    method = restoring(schedule=Schedule(alike=-1.0, starts=2, **brief, **ALL_MISSED))
     twice = method.restore(observation.frames)
     assert len(once.cost) < len(twice.cost) <= 800
     assert torch.equal(twice.cost[: len(once.cost)], once.cost)
