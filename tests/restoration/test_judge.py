@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from torchmask.grid import Grid
+from torchmask.metrics import lowpass, relative_error
 from torchmask.restoration import model_error
 from torchmask.restoration.aberrations import turbulent_basis
 from torchmask.restoration.candidates import Candidates
@@ -169,7 +170,7 @@ def test_a_start_in_faint_frames_is_given_up_where_it_costs_much_more(explain):
     assert above > 0
 
     def given_up(hopeless, end=End.INTEGRATION, iterations=300, rival=state, starts=1):
-        schedule = Schedule(hopeless=hopeless, near=math.inf)
+        schedule = Schedule(hopeless=hopeless, near=math.inf, returned=0.0)
         judge = Judge(Setting.of(objective), stack_of(objective), TRAITS, schedule, end)
         before = None if rival is None else Ending(rival, Status.CONVERGED)
         now = Candidates(worse.with_noise_inflation(3.0), 1)
@@ -201,7 +202,7 @@ def test_a_twin_of_an_explained_mask_has_to_be_near_and_is_kept_if_it_costs_less
     assert 0 < part < above
 
     def judge_of(nearly_at_rest=0.0, **numbers):
-        schedule = Schedule(nearly_at_rest=nearly_at_rest, **numbers)
+        schedule = Schedule(nearly_at_rest=nearly_at_rest, returned=0.0, **numbers)
         return Judge(Setting.of(objective), stack_of(objective), TRAITS, schedule, end)
 
     def given_up(near, explained=True, **numbers):
@@ -240,6 +241,36 @@ def test_a_twin_of_an_explained_mask_has_to_be_near_and_is_kept_if_it_costs_less
     left = [judge_of().verdict(objective, Ending(ending, Status.CONVERGED)).excess for ending in (low, high)]
     for tell in (replaces, advances):
         assert tell(math.inf, low, high, **missed) is (left[0] <= left[1])
+
+
+def test_a_twin_that_has_come_back_is_given_up(explain):
+    """From some iterations on, if the object is that of the best but for its fine parts, and costs no less."""
+    objective, state = explain(noise=0.003)
+    finer = objective.model.cutoff / 2
+    rest = state.image - lowpass(state.image, finer)
+    fine = replace(state, image=state.image - 0.5 * rest)  # alike but for what is above half the cut-off
+    moved = replace(state, image=state.image.roll((3, 1), (0, 1)), z=state.z)
+    coarse = replace(state, image=state.image + 0.2 * state.image.roll(6, 0))
+    apart = relative_error(coarse.image, state.image, finer)
+    assert apart > 0.1
+
+    def given_up(now, best=state, iterations=200, starts=2, end=End.LAST_DESCENT, **numbers):
+        schedule = Schedule(near=math.inf, hopeless=math.inf, **{"chance": math.inf} | numbers)
+        judge = Judge(Setting.of(objective), stack_of(objective), TRAITS, schedule, end)
+        progress = Progress(Candidates(now, 1), iterations * [1.0], starts=starts, rival=Ending(best, Status.CONVERGED))
+        return judge.gives_up(objective, progress)
+
+    assert given_up(fine)
+    assert given_up(moved)  # frames do not say where the object lies
+    assert given_up(fine, iterations=900)
+    assert not given_up(fine, iterations=199)
+    assert not given_up(fine, returning=201)
+    assert not given_up(fine, returned=0.0)
+    assert not given_up(state, best=fine)  # it costs less
+    assert given_up(coarse, returned=1.01 * apart)
+    assert not given_up(coarse, returned=0.99 * apart)
+    assert not given_up(fine, end=End.INTEGRATION)
+    assert not given_up(fine, chance=-1e9, promising=math.inf)  # the best does not explain the frames
 
 
 def test_a_start_that_explains_a_masks_frames_is_replaced_by_none_that_does_not(explain):

@@ -180,7 +180,9 @@ def turned(observe, five_holes):
     """Frames through a mask that lies otherwise than told, and their restorations."""
     seen, once = observe(TRUE.apply(five_holes), n_photons=3e6), Schedule(starts=1)  # in less time
     restored = {
-        refine: MyopicDeconvolution(five_holes, seen.grid, 10, refine_geometry=refine, schedule=once).restore(seen.frames)
+        refine: MyopicDeconvolution(five_holes, seen.grid, 10, refine_geometry=refine, schedule=once).restore(
+            seen.frames
+        )
         for refine in (None, False)
     }
     return seen, restored

@@ -6,6 +6,7 @@ import math
 from functools import cached_property
 from typing import NamedTuple
 
+from torchmask.metrics import relative_error
 from torchmask.restoration.calibration import fit_of_frames
 from torchmask.restoration.checkpoint import Ending, Progress, Status
 from torchmask.restoration.frames import FrameStack
@@ -179,22 +180,33 @@ class Judge:
         return not self.traits.many_minima and (in_turn or self._twins_may_improve(verdict))
 
     def gives_up(self, objective: MyopicObjective, progress: Progress) -> bool:
-        """Return whether it is time to give up the present start, if it is from a twin: after some iterations.
+        """Return whether it is time to give up the present start, if it is from a twin.
 
-        It is, unless it is near the best start, if that explains the frames, or else well ahead of it. In faint frames,
-        whose residual does not tell, any start is given up that costs much more than the best.
+        After some iterations it is, unless it is near the best start, if that explains the frames, or else well ahead
+        of it. In faint frames, whose residual does not tell, any start is given up then that costs much more than the
+        best. A twin of an explained object is given up once it has come back to that: it would find the same again.
         """
-        if progress.rival is None or progress.iterations != self.schedule.glance:
+        best, now, schedule = progress.rival, progress.ending, self.schedule
+        if best is None or progress.iterations < min(schedule.glance, schedule.returning):
             return False
-        now, best = progress.ending, progress.rival
+        is_time = progress.iterations == schedule.glance
         if self.end is End.INTEGRATION:
-            return self._saves(objective, best, now) > self.schedule.hopeless * now.state.z.numel()
+            return is_time and self._saves(objective, best, now) > schedule.hopeless * now.state.z.numel()
         verdict = self.verdict(objective, best)
         if not self.is_twin(progress.starts, verdict):
             return False
-        if verdict.explained:
-            return self._saves(objective, best, now) > self._part(objective, best, self.schedule.near)
-        return self.verdict(objective, now).excess >= self.schedule.promising * verdict.excess
+        if not verdict.explained:
+            return is_time and self.verdict(objective, now).excess >= schedule.promising * verdict.excess
+        more = self._saves(objective, best, now)
+        if is_time and more > self._part(objective, best, schedule.near):
+            return True
+        may_be_back = more >= 0 and progress.iterations >= schedule.returning
+        return may_be_back and self._is_back(objective, now, best)
+
+    def _is_back(self, objective: MyopicObjective, now: Ending, best: Ending) -> bool:
+        """Return whether an ending has come back to the object of the best, whose fine parts take longer to agree."""
+        cutoff = objective.model.cutoff / 2
+        return relative_error(now.state.image, best.state.image, cutoff) < self.schedule.returned
 
     def _saves(self, objective: MyopicObjective, one: Ending, other: Ending) -> float:
         """Return by how much one ending costs less than the other."""

@@ -74,6 +74,9 @@ class Schedule:
         below a chi-square of 1024 beyond noise in a frame one is enough
     likelier : cost by which a later start in faint frames has to be lower to replace an earlier one
     glance : number of iterations after which a start from a twin, or any later start in faint frames, may be given up
+    returning : number of iterations from which on a twin of an explained object is given up if it has come back to that
+        and costs no less
+    returned : it has if the two objects differ by less than this, relative, up to half the cut-off frequency
     promising : where the best start so far does not explain the frames, a twin is given up unless its excess chi-square
         is below this fraction of that of the best
     hopeless : a start in faint frames is, if its cost exceeds that of the best so far by more than this for each
@@ -147,6 +150,8 @@ class Schedule:
     faint_starts: int = 6
     likelier: float = 50.0
     glance: int = 300
+    returning: int = 200
+    returned: float = 0.07
     promising: float = 0.7
     hopeless: float = 0.3
     averaged: int = 3
