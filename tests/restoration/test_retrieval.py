@@ -102,11 +102,50 @@ def test_reflections_find_most_frames_where_descents_stop():
     objective, truth = problem(48)
     generator = torch.Generator().manual_seed(7)
     start = replace(truth, z=0.4 * torch.randn(truth.z.shape, generator=generator, dtype=torch.float64))
-    found = parameters_of_fields(objective, retrieve_fields(objective, start, 200), start.z)
+    found = parameters_of_fields(objective, retrieve_fields(objective, start, 200).fields, start.z)
     reflected = fit_modes(objective, replace(start, z=found), 100)
     descended = fit_modes(objective, start, 400)
     number, number_before = (int((chi_squares(objective, state) < 1.25).sum()) for state in (reflected, descended))
     assert number > number_before + 2 * 4.9
+
+
+def test_reflections_of_a_frame_end_once_its_phases_are_found(monkeypatch):
+    """Of those that end before, as many are found as if all had gone on, to twice the error of the difference."""
+    objective, truth = problem(48)
+    generator = torch.Generator().manual_seed(7)
+    start = replace(truth, z=0.4 * torch.randn(truth.z.shape, generator=generator, dtype=torch.float64))
+
+    def found_and_spent():
+        fields, spent = retrieve_fields(objective, start, 200)
+        fitted = fit_modes(objective, replace(start, z=parameters_of_fields(objective, fields, start.z)), 100)
+        return chi_squares(objective, fitted) < 1.25, spent
+
+    found, spent = found_and_spent()
+    monkeypatch.setattr(reflections, "_FALLEN", 0.0)
+    found_too, whole = found_and_spent()
+    assert whole.tolist() == [200] * 48
+    ended = spent < 200
+    assert int(ended.sum()) >= 5
+    assert int(spent.min()) >= 10 * (2 + 3 + 5)  # looks that it takes to tell
+    several, without = int((found & ended).sum()), int((found_too & ended).sum())
+    assert abs(several - without) <= 2 * math.sqrt(several + without)
+    assert several > 0.5 * int(ended.sum())
+
+
+def test_a_gap_has_fallen_if_it_is_far_below_what_it_was_and_falls_no_more():
+    up, low = [1.0, 1.2, 0.9, 1.1], [0.5, 0.6, 0.6, 0.7, 0.6, 0.6]
+
+    def has_fallen(*looks):
+        return bool(reflections._has_fallen(torch.tensor([[3.0], [2.0], *([look] for look in looks)]))[0])
+
+    assert has_fallen(*up, *low)
+    assert not has_fallen(*up, *low[:-1])  # it may fall further
+    assert not has_fallen(*up, *low[:3], 0.4, *low[3:])  # and does
+    assert not has_fallen(*up, *(look + 0.2 for look in low))  # not far enough, by the median
+    assert not has_fallen(*up[:2], *low, *low)  # too early to tell
+    assert not has_fallen(*up, *up, *up)
+    looks = torch.tensor([[3.0, 3.0], [2.0, 2.0], *([one, 1.0] for one in up + low)])
+    assert reflections._has_fallen(looks).tolist() == [True, False]  # each frame by itself
 
 
 @pytest.mark.parametrize("background", [Background.NONE, Background.PER_FRAME])
@@ -115,7 +154,7 @@ def test_the_true_field_stays(background):
     objective, truth = problem(3, rms=0.15, background=background)
     sky = 0.7 if background is Background.PER_FRAME else 0.0
     objective = MyopicObjective(objective.model, objective.frames + sky, objective.precision, TotalVariation())
-    found = parameters_of_fields(objective, retrieve_fields(objective, truth, 5), truth.z)
+    found = parameters_of_fields(objective, retrieve_fields(objective, truth, 5).fields, truth.z)
     fitted = fit_modes(objective, replace(truth, z=found), 20)
     torch.testing.assert_close(found[:, 1:], truth.z[:, 1:], rtol=0, atol=0.1)
     torch.testing.assert_close(chi_squares(objective, fitted), torch.ones(3).double(), rtol=0, atol=0.2)

@@ -61,7 +61,7 @@ def retrieve_frames(
 
     Aberrations in common stay as they are, since only some frames may change.
     """
-    spent = (n_reflections + LAST) * _EVALUATIONS
+    spent = 0.0
 
     def count(cost: float, evaluations: int, variables: Variables) -> None:
         nonlocal spent
@@ -69,7 +69,8 @@ def retrieve_frames(
 
     part, now = objective.of_frames(tried, free=Free.ABERRATIONS), share_noise_inflation(state).of_frames(tried)
     fresh = random_candidates(part, now, 1, schedule.start_rms, seed).state
-    fields = retrieve_fields(part, fresh, n_reflections)
+    fields, made = retrieve_fields(part, fresh, n_reflections)
+    spent += (float(made.double().mean()) + LAST) * _EVALUATIONS
     trial = unwrap_pistons(part, replace(now, z=parameters_of_fields(part, fields, now.z)))
     trial = descend(part, trial, schedule.retrieved_iterations, minimizer, count)
     after, before = (part.frame_costs(now.image, z, now.calibration) for z in (trial.z, now.z))

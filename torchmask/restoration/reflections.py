@@ -5,11 +5,15 @@ field has no walls: on the way it may have any amplitude. So it goes back and fo
 the amplitude of the pupil and those whose PSF gives the frame, and reflections at both lead it out of places where
 mere projections stop (Luke, Inverse Problems 21, 37, 2005). Where the object hides frequencies of the PSF from the
 frame, or noise does, the second projection leaves them as they are.
+
+While the phases of a frame are not found the gap between the two sets goes up and down. It falls within some tens of
+reflections once they are; what follows brings no more, as the field begins to follow the noise.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -27,11 +31,23 @@ _RELAXATION = 0.9  # of the reflections; 1 has no attraction to the present fiel
 _STIFFNESS = 3e3  # holds focal amplitudes, of unit norm, where they are while their PSF is fitted to a frame
 _DARK = 1e-6  # intensity below which a PSF of unit sum is free to change as if it had so much
 LAST = 10  # projections at the end, without reflections
+_LOOK = 10  # reflections from one look at the gap to the next
+_FALLING = 2  # looks at the beginning in which it always falls,
+_BEFORE = 3  # and further ones, from which is known what it was before it fell
+_FALLEN = 0.65  # of the median gap before: with no more, phases are found,
+_AT_REST = 5  # and there are no more reflections if it has not been lower for so many looks
+
+
+class Retrieved(NamedTuple):
+    """Fields (T, P) at the open samples, of any amplitude, and the number of reflections (T,) that each took."""
+
+    fields: Tensor
+    n_reflections: Tensor
 
 
 @torch.no_grad()
-def retrieve_fields(objective: MyopicObjective, state: State, n_reflections: int) -> Tensor:
-    """Return the fields (T, P) at the open samples, of any amplitude, to which `state` leads.
+def retrieve_fields(objective: MyopicObjective, state: State, n_reflections: int) -> Retrieved:
+    """Return the fields to which `state` leads by `n_reflections`, or fewer where the phases are found before.
 
     The light must have one wavelength and frames be snapshots: there is one raster of the pupil.
     """
@@ -42,11 +58,12 @@ def retrieve_fields(objective: MyopicObjective, state: State, n_reflections: int
     spectrum, samples = single.model.spectrum(state.image), single.model.pupil.samples()
 
     @torch.no_grad()  # needed here too, as no_grad applies to one thread only
-    def of_part(part: slice) -> Tensor:
+    def of_part(part: slice) -> Retrieved:
         chunk = _Frames(single.model, samples, spectrum, frames[part], precision[part])
         return chunk.reflect(samples.field(samples.phase(state.z[part])), n_reflections)
 
-    return torch.cat(list(single.parallel(of_part, single.model.chunks(len(state.z)))))
+    parts = single.parallel(of_part, single.model.chunks(len(state.z)))
+    return Retrieved(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -59,19 +76,46 @@ class _Frames:
     frames: Tensor
     precision: Tensor
 
-    def reflect(self, field: Tensor, n_reflections: int) -> Tensor:
-        """Return the field (t, P) to which reflections lead from `field` (t, P)."""
-        fit_frames = graphed(self._fit_frames, field.device)
+    def reflect(self, field: Tensor, n_reflections: int) -> Retrieved:
+        """Return the fields to which reflections lead from `field` (t, P)."""
+        found, spent = field.clone(), torch.full((len(field),), n_reflections)
+        chunk, left = self, torch.arange(len(field), device=field.device)
+        fit_frames = graphed(chunk._fit_frames, field.device)
         now = self.model.raster(self.samples, field)
-        pull = torch.zeros_like(now[:, 0].real)
-        for _ in range(n_reflections):
+        pull, gaps = torch.zeros_like(now[:, 0].real), now.real.new_empty(0, len(now))
+        for number in range(n_reflections):
             fitted, pull = fit_frames(now, pull)
+            if number % _LOOK == 0:
+                gaps = torch.cat([gaps, chunk._gap(fitted)[None]])
+                ends = _has_fallen(gaps)
+                if bool(ends.any()):
+                    found[left[ends]] = chunk._of(ends)._end(now[ends], pull[ends])
+                    spent[left[ends].cpu()] = number
+                    chunk, left, now, fitted = chunk._of(~ends), left[~ends], now[~ends], fitted[~ends]
+                    pull, gaps, fit_frames = pull[~ends], gaps[:, ~ends], graphed(chunk._fit_frames, field.device)
+                if not len(left):
+                    break
             mirrored = 2 * fitted - now
-            reflected = 2 * self._fit_pupil(mirrored) - mirrored
+            reflected = 2 * chunk._fit_pupil(mirrored) - mirrored
             now = _RELAXATION * (reflected + now) / 2 + (1 - _RELAXATION) * fitted
-        for _ in range(LAST):
-            now, pull = fit_frames(self._fit_pupil(now), pull)
-        return now.flatten(1)[:, self.samples.index]
+        found[left] = chunk._end(now, pull)
+        return Retrieved(found, spent)
+
+    def _of(self, some: Tensor) -> _Frames:
+        """Return some of the frames, by booleans (t,)."""
+        precision = self.precision[some] if len(self.precision) > 1 else self.precision
+        return replace(self, frames=self.frames[some], precision=precision)
+
+    def _end(self, raster: Tensor, pull: Tensor) -> Tensor:
+        """Return the fields (t, P) to which mere projections lead."""
+        fit_frames = graphed(self._fit_frames, raster.device)
+        for _ in range(LAST if len(raster) else 0):
+            raster, pull = fit_frames(self._fit_pupil(raster), pull)
+        return raster.flatten(1)[:, self.samples.index]
+
+    def _gap(self, raster: Tensor) -> Tensor:
+        """Return how far rasters (t, 1, H', W') are from having the amplitude of the pupil (t,), relative."""
+        return (raster - self._fit_pupil(raster)).flatten(1).norm(dim=1) / raster.flatten(1).norm(dim=1)
 
     def _fit_pupil(self, raster: Tensor) -> Tensor:
         """Return the nearest rasters (t, 1, H', W') with the amplitude of the pupil."""
@@ -107,3 +151,14 @@ class _Frames:
         """Apply the adjoint of `_imaged`."""
         spectrum = torch.fft.rfft2(self.model.window.embed(frames)) * self.spectrum.conj()
         return torch.fft.irfft2(spectrum, s=self.model.window.field.shape)
+
+
+def _has_fallen(gaps: Tensor) -> Tensor:
+    """Return whether the gap of each frame (t,) has fallen and falls no more, by all looks at it so far (n, t)."""
+    looks = gaps[_FALLING:]
+    if len(looks) <= _BEFORE + _AT_REST:
+        return torch.zeros_like(gaps[0], dtype=torch.bool)
+    least, when = looks.min(0)
+    number = torch.arange(len(looks), device=gaps.device)[:, None]
+    before = looks.masked_fill(number >= when, torch.nan).nanmedian(0).values
+    return (when >= _BEFORE) & (len(looks) - 1 - when >= _AT_REST) & (least < _FALLEN * before)
