@@ -37,6 +37,19 @@ def test_forward_is_the_derivative(band):
         torch.testing.assert_close(linear[number], exact, rtol=1e-10, atol=1e-12 * float(exact.abs().max()))
 
 
+@pytest.mark.parametrize("n_bytes", [1, 2**30])
+@pytest.mark.parametrize("band", [None, Band.of((560e-9, 600e-9))])
+def test_modes_are_changes_of_one_aberration_each(band, n_bytes, monkeypatch):
+    model, image, z, *_ = setup(band=band)
+    tangent, n = Linearization(model, image, z), 4
+    monkeypatch.setattr(linearization, "_AT_A_TIME", AtATime(processor=n_bytes, gpu=1))
+    each = torch.eye(n, z.shape[1], dtype=z.dtype)[:, None].expand(-1, len(z), -1)
+    expected = tangent.forward(torch.zeros(n, *image.shape, dtype=z.dtype), each)
+    found = tangent.by_modes(n)
+    assert found.shape == (n, len(z), *GRID.shape)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-13 * float(expected.abs().max()))
+
+
 @pytest.mark.parametrize("n_bytes", [2**17, 2**30])
 def test_as_many_changes_at_a_time_as_suit_the_device(n_bytes, monkeypatch):
     """Three of five at a time, and all, give what single ones give, to the rounding of other orders of sums."""

@@ -35,23 +35,48 @@ class Linearization:
 
     def forward(self, image: Tensor, z: Tensor) -> Tensor:
         """Return J times changes of the object (S, H', W') and the aberrations (S, T, K), as frames (S, T, H, W)."""
-        model, samples, shape = self.model, self.samples, self.model.window.field.shape
-        spectra = model.spectrum(image)[:, None]
+        spectra = self.model.spectrum(image)[:, None]
 
         @torch.no_grad()
         def part_of(number: int) -> Tensor:
-            field, amplitude, transfer = self.fields[number], self.amplitudes[number], self.transfers[number]
-            frames, changes = [], z[:, self.parts[number]]
-            size = max(1, _AT_A_TIME.on(z.device) // (amplitude.numel() * amplitude.itemsize))
+            size, changes, frames = self._at_a_time(number), z[:, self.parts[number]], []
             for spectrum, change in zip(spectra.split(size), changes.split(size), strict=True):
-                moved = model.amplitude(samples, (1j * field * samples.phase(change)).flatten(0, 1))
-                moved = moved.unflatten(0, change.shape[:2])
-                psf = 2 * (amplitude.real * moved.real + amplitude.imag * moved.imag).sum(2)
-                frame = torch.fft.irfft2(torch.fft.rfft2(psf) * self.spectrum + transfer * spectrum, s=shape)
-                frames.append(model.window.crop(frame))
+                moved = self._moved(number, self.samples.phase(change)) + self.transfers[number] * spectrum
+                frames.append(self._seen(moved))
             return torch.cat(frames)
 
         return torch.cat(list(self.parallel(part_of, range(len(self.parts)))), dim=1)
+
+    def by_modes(self, n: int) -> Tensor:
+        """Return the derivatives (n, T, H, W) of all frames in the first `n` of their own aberrations.
+
+        It is `forward` of one change for each, without the transforms of an object that stays.
+        """
+        phases = self.samples.basis[:, :n].T[:, None]
+
+        @torch.no_grad()
+        def part_of(number: int) -> Tensor:
+            some = phases.split(self._at_a_time(number))
+            return torch.cat([self._seen(self._moved(number, phase)) for phase in some])
+
+        return torch.cat(list(self.parallel(part_of, range(len(self.parts)))), dim=1)
+
+    def _at_a_time(self, number: int) -> int:
+        """Return how many changes of the frames of this part to work on at a time."""
+        amplitude = self.amplitudes[number]
+        return max(1, _AT_A_TIME.on(amplitude.device) // (amplitude.numel() * amplitude.itemsize))
+
+    def _moved(self, number: int, phases: Tensor) -> Tensor:
+        """Return changes of the spectra (S, t, H', W'/2 + 1) of the frames of a part for phases (S, t or 1, P)."""
+        amplitude, fields = self.amplitudes[number], 1j * self.fields[number] * phases
+        moved = self.model.amplitude(self.samples, fields.flatten(0, 1)).unflatten(0, fields.shape[:2])
+        psf = 2 * (amplitude.real * moved.real + amplitude.imag * moved.imag).sum(2)
+        return torch.fft.rfft2(psf) * self.spectrum
+
+    def _seen(self, spectra: Tensor) -> Tensor:
+        """Return the frames (..., H, W) of spectra (..., H', W'/2 + 1)."""
+        window = self.model.window
+        return window.crop(torch.fft.irfft2(spectra, s=window.field.shape))
 
     def adjoint(self, frames: Tensor) -> tuple[Tensor, Tensor]:
         """Return J^T times frames (S, T, H, W), as objects (S, H', W') and aberrations (S, T, K)."""

@@ -160,9 +160,7 @@ def _tangents(frame: MyopicObjective, state: State, made: Tensor, root: Tensor) 
         rows.append(torch.ones_like(made))
     n_own = model.aberrations.n_own if Free.ABERRATIONS in frame.free else 0
     if n_own:
-        still = torch.zeros_like(state.image).expand(n_own, *state.image.shape)
-        each = torch.eye(n_own, z.shape[1], dtype=z.dtype, device=z.device)[:, None]
-        rows.append(Linearization(model, state.image, z).forward(still, each)[:, 0])
+        rows.append(Linearization(model, state.image, z).by_modes(n_own)[:, 0])
     tangents = (torch.cat(rows) * root).flatten(1).to(z)
     length = tangents.norm(dim=1).clamp(min=torch.finfo(z.dtype).tiny ** 0.5)
     weight = torch.zeros_like(z[0]) + frame.aberration_weight(state.calibration, z)

@@ -109,12 +109,11 @@ def laplace_precision(objective: MyopicObjective, state: State) -> Tensor:
     n_own = model.aberrations.n_own
     precision = objective.scaled_data(state.calibration)[1]
     weight = torch.zeros_like(z[0]) + objective.aberration_weight(state.calibration, z)
-    still = state.image.expand(n_own, *state.image.shape) * 0
-    each = torch.eye(n_own, z.shape[1], dtype=z.dtype, device=z.device)[:, None]
 
     @torch.no_grad()  # needed here too, as no_grad applies to one thread only
     def of_frame(t: int) -> Tensor:
-        changes = Linearization(model, state.image, z[t : t + 1]).forward(still, each)[:, 0]
+        changes = Linearization(model, state.image, z[t : t + 1]).by_modes(n_own)[:, 0]
+        # in the dtype of z, or rounding could outweigh the prior of modes that are hardly seen
         changes = (changes * precision[t if len(precision) > 1 else 0].sqrt()).flatten(1).to(z)
         return changes @ changes.T + weight[:n_own].diag()
 
