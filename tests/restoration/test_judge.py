@@ -170,7 +170,7 @@ def test_a_start_in_faint_frames_is_given_up_where_it_costs_much_more(explain):
     assert above > 0
 
     def given_up(hopeless, end=End.INTEGRATION, iterations=300, rival=state, starts=1):
-        schedule = Schedule(hopeless=hopeless, near=math.inf, returned=0.0)
+        schedule = Schedule(hopeless=hopeless, near=math.inf, back_within=0.0)
         judge = Judge(Setting.of(objective), stack_of(objective), TRAITS, schedule, end)
         before = None if rival is None else Ending(rival, Status.CONVERGED)
         now = Candidates(worse.with_noise_inflation(3.0), 1)
@@ -202,7 +202,7 @@ def test_a_twin_of_an_explained_mask_has_to_be_near_and_is_kept_if_it_costs_less
     assert 0 < part < above
 
     def judge_of(nearly_at_rest=0.0, **numbers):
-        schedule = Schedule(nearly_at_rest=nearly_at_rest, returned=0.0, **numbers)
+        schedule = Schedule(nearly_at_rest=nearly_at_rest, back_within=0.0, **numbers)
         return Judge(Setting.of(objective), stack_of(objective), TRAITS, schedule, end)
 
     def given_up(near, explained=True, **numbers):
@@ -264,11 +264,13 @@ def test_a_twin_that_has_come_back_is_given_up(explain):
     assert given_up(moved)  # frames do not say where the object lies
     assert given_up(fine, iterations=900)
     assert not given_up(fine, iterations=199)
-    assert not given_up(fine, returning=201)
-    assert not given_up(fine, returned=0.0)
+    assert not given_up(fine, back_after=201)
+    assert given_up(fine, iterations=400, glance=300, back_after=400)
+    assert given_up(fine, iterations=250, glance=300)
+    assert not given_up(fine, back_within=0.0)
     assert not given_up(state, best=fine)  # it costs less
-    assert given_up(coarse, returned=1.01 * apart)
-    assert not given_up(coarse, returned=0.99 * apart)
+    assert given_up(coarse, back_within=1.01 * apart)
+    assert not given_up(coarse, back_within=0.99 * apart)
     assert not given_up(fine, end=End.INTEGRATION)
     assert not given_up(fine, chance=-1e9, promising=math.inf)  # the best does not explain the frames
 

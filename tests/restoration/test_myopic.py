@@ -427,12 +427,13 @@ def test_refuses_shapes_that_disagree(observation, restored, restoring):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "limit"), [("skylab_1e7_mask", 0.062), ("mgs_1e6_full", 0.08)])
+@pytest.mark.parametrize(("name", "limit"), [("skylab_1e7_mask", 0.0593), ("mgs_1e6_full", 0.08)])
 def test_reference_stacks(name, limit, shared_stack):
     """One call, nothing known but the instrument.
 
-    The limit of the mask is that measured plus 2 % for another platform. A start of the full pupil ends in another
-    minimum after another rounding: the limit of one, without the mean of three, is a lead of 1.5 over the best peer.
+    The limit of the mask is that measured, 0.0579 and 0.0581 on two processors, plus 2 % for another one. A start of
+    the full pupil ends in another minimum after another rounding: the limit of one, without the mean of three, is a
+    lead of 1.5 over the best peer.
     """
     stack = shared_stack(name)
     method = MyopicDeconvolution(stack.aperture, stack.grid, schedule=Schedule(averaged=1))

@@ -243,6 +243,20 @@ def test_a_twin_that_is_behind_is_given_up(explained):
         assert (progress.state is rival) is not goes_on
 
 
+def test_a_twin_that_has_come_back_is_in_vain(explained):
+    """As soon as it may be told; two in succession end the search, and the best is kept."""
+    objective, truth = explained
+    for within, iterations in ((math.inf, 2 * 5), (0.0, 2 * 10)):  # otherwise at a glance, as none may be far behind
+        limits = {"near": 0.0, "glance": 10, "back_after": 5, "back_within": within}
+        schedule = Schedule(chance=1e9, in_vain=2, cooling=0, **limits, **BRISK)
+        begun = Progress(Candidates(truth, 1), [], starts=1)
+        begun.start_again(Ending(truth, Status.CONVERGED))
+        begun.candidates = Candidates(replace(truth, z=0 * truth.z), 1)
+        progress = solver_of(objective, schedule=schedule).run(begun, True, lambda _: None)
+        assert len(progress.costs) == iterations
+        assert progress.state is truth
+
+
 def test_a_fit_is_improved_until_that_is_in_vain_and_a_doubted_one_as_long_as_it_may_be(explained):
     """A fit is doubted, though explained, if it leaves more than is expected."""
     objective, truth = explained

@@ -61,16 +61,15 @@ def retrieve_frames(
 
     Aberrations in common stay as they are, since only some frames may change.
     """
-    spent = 0.0
+    part, now = objective.of_frames(tried, free=Free.ABERRATIONS), share_noise_inflation(state).of_frames(tried)
+    fresh = random_candidates(part, now, 1, schedule.start_rms, seed).state
+    fields, n_made = retrieve_fields(part, fresh, n_reflections)
+    spent = (float(n_made.double().mean()) + LAST) * _EVALUATIONS
 
     def count(cost: float, evaluations: int, variables: Variables) -> None:
         nonlocal spent
         spent += evaluations
 
-    part, now = objective.of_frames(tried, free=Free.ABERRATIONS), share_noise_inflation(state).of_frames(tried)
-    fresh = random_candidates(part, now, 1, schedule.start_rms, seed).state
-    fields, made = retrieve_fields(part, fresh, n_reflections)
-    spent += (float(made.double().mean()) + LAST) * _EVALUATIONS
     trial = unwrap_pistons(part, replace(now, z=parameters_of_fields(part, fields, now.z)))
     trial = descend(part, trial, schedule.retrieved_iterations, minimizer, count)
     after, before = (part.frame_costs(now.image, z, now.calibration) for z in (trial.z, now.z))

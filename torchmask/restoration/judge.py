@@ -180,33 +180,34 @@ class Judge:
         return not self.traits.many_minima and (in_turn or self._twins_may_improve(verdict))
 
     def gives_up(self, objective: MyopicObjective, progress: Progress) -> bool:
-        """Return whether it is time to give up the present start, if it is from a twin.
+        """Return whether it is time to give up the present start, if it is not from random aberrations.
 
-        After some iterations it is, unless it is near the best start, if that explains the frames, or else well ahead
-        of it. In faint frames, whose residual does not tell, any start is given up then that costs much more than the
-        best. A twin of an explained object is given up once it has come back to that: it would find the same again.
+        After `glance` iterations it is, unless it is near the best start, if that explains the frames, or else well
+        ahead of it. In faint frames, whose residual does not tell, any start is given up then that costs much more than
+        the best. From `back_after` iterations on it is, too, if it has come back to the object of a best start that
+        explains the frames, and costs no less: it would find the same again.
         """
         best, now, schedule = progress.rival, progress.ending, self.schedule
-        if best is None or progress.iterations < min(schedule.glance, schedule.returning):
+        if best is None or progress.iterations < min(schedule.glance, schedule.back_after):
             return False
-        is_time = progress.iterations == schedule.glance
+        at_glance = progress.iterations == schedule.glance
         if self.end is End.INTEGRATION:
-            return is_time and self._saves(objective, best, now) > schedule.hopeless * now.state.z.numel()
+            return at_glance and self._saves(objective, best, now) > schedule.hopeless * now.state.z.numel()
         verdict = self.verdict(objective, best)
         if not self.is_twin(progress.starts, verdict):
             return False
         if not verdict.explained:
-            return is_time and self.verdict(objective, now).excess >= schedule.promising * verdict.excess
-        more = self._saves(objective, best, now)
-        if is_time and more > self._part(objective, best, schedule.near):
+            return at_glance and self.verdict(objective, now).excess >= schedule.promising * verdict.excess
+        excess_cost = self._saves(objective, best, now)
+        if at_glance and excess_cost > self._part(objective, best, schedule.near):
             return True
-        may_be_back = more >= 0 and progress.iterations >= schedule.returning
-        return may_be_back and self._is_back(objective, now, best)
+        is_late = progress.iterations >= schedule.back_after
+        return is_late and excess_cost >= 0 and self._is_back(objective, now, best)
 
     def _is_back(self, objective: MyopicObjective, now: Ending, best: Ending) -> bool:
         """Return whether an ending has come back to the object of the best, whose fine parts take longer to agree."""
         cutoff = objective.model.cutoff / 2
-        return relative_error(now.state.image, best.state.image, cutoff) < self.schedule.returned
+        return relative_error(now.state.image, best.state.image, cutoff) < self.schedule.back_within
 
     def _saves(self, objective: MyopicObjective, one: Ending, other: Ending) -> float:
         """Return by how much one ending costs less than the other."""

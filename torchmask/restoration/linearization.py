@@ -47,12 +47,12 @@ class Linearization:
 
         return torch.cat(list(self.parallel(part_of, range(len(self.parts)))), dim=1)
 
-    def by_modes(self, n: int) -> Tensor:
-        """Return the derivatives (n, T, H, W) of all frames in the first `n` of their own aberrations.
+    def by_modes(self, n_own: int) -> Tensor:
+        """Return the derivatives (n_own, T, H, W) of all frames in the first parameters of each, its own aberrations.
 
         It is `forward` of one change for each, without the transforms of an object that stays.
         """
-        phases = self.samples.basis[:, :n].T[:, None]
+        phases = self.samples.basis[:, :n_own].T[:, None]
 
         @torch.no_grad()
         def part_of(number: int) -> Tensor:

@@ -7,7 +7,8 @@ mere projections stop (Luke, Inverse Problems 21, 37, 2005). Where the object hi
 frame, or noise does, the second projection leaves them as they are.
 
 While the phases of a frame are not found the gap between the two sets goes up and down. It falls within some tens of
-reflections once they are; what follows brings no more, as the field begins to follow the noise.
+reflections once they are. In noise it grows again then, as the field begins to follow the frame, and more reflections
+seldom find anything better.
 """
 
 from __future__ import annotations
@@ -32,14 +33,17 @@ _STIFFNESS = 3e3  # holds focal amplitudes, of unit norm, where they are while t
 _DARK = 1e-6  # intensity below which a PSF of unit sum is free to change as if it had so much
 LAST = 10  # projections at the end, without reflections
 _LOOK = 10  # reflections from one look at the gap to the next
-_FALLING = 2  # looks at the beginning in which it always falls,
-_BEFORE = 3  # and further ones, from which is known what it was before it fell
-_FALLEN = 0.65  # of the median gap before: with no more, phases are found,
-_AT_REST = 5  # and there are no more reflections if it has not been lower for so many looks
+_FIRST_LOOKS = 2  # at the beginning, where it always falls
+_LOOKS_BEFORE = 3  # which tell what it is while phases are not found, at least
+_LOOKS_AT_REST = 5  # in which it has not been lower than before
+_FALLEN = 0.65  # fraction of the median before to which it falls when phases are found
 
 
 class Retrieved(NamedTuple):
-    """Fields (T, P) at the open samples, of any amplitude, and the number of reflections (T,) that each took."""
+    """Fields (T, P) at the open samples, of any amplitude, and the number of reflections (T,) that each took.
+
+    The `LAST` projections of each are not counted.
+    """
 
     fields: Tensor
     n_reflections: Tensor
@@ -47,9 +51,10 @@ class Retrieved(NamedTuple):
 
 @torch.no_grad()
 def retrieve_fields(objective: MyopicObjective, state: State, n_reflections: int) -> Retrieved:
-    """Return the fields to which `state` leads by `n_reflections`, or fewer where the phases are found before.
+    """Return the fields to which `state` leads by `n_reflections`, or fewer where phases are found before.
 
-    The light must have one wavelength and frames be snapshots: there is one raster of the pupil.
+    The hundredth reflection is the first that can tell. The light must have one wavelength and frames be snapshots:
+    there is one raster of the pupil.
     """
     single = with_candidates(objective, 1)
     frames, precision, unit = single.scaled_data(state.calibration)
@@ -78,7 +83,7 @@ class _Frames:
 
     def reflect(self, field: Tensor, n_reflections: int) -> Retrieved:
         """Return the fields to which reflections lead from `field` (t, P)."""
-        found, spent = field.clone(), torch.full((len(field),), n_reflections)
+        found, spent = field.clone(), torch.full((len(field),), n_reflections, device="cpu")
         chunk, left = self, torch.arange(len(field), device=field.device)
         fit_frames = graphed(chunk._fit_frames, field.device)
         now = self.model.raster(self.samples, field)
@@ -89,12 +94,12 @@ class _Frames:
                 gaps = torch.cat([gaps, chunk._gap(fitted)[None]])
                 ends = _has_fallen(gaps)
                 if bool(ends.any()):
-                    found[left[ends]] = chunk._of(ends)._end(now[ends], pull[ends])
-                    spent[left[ends].cpu()] = number
+                    found[left[ends]] = chunk._of(ends)._end(fitted[ends], pull[ends])
+                    spent[left[ends].cpu()] = number + 1
                     chunk, left, now, fitted = chunk._of(~ends), left[~ends], now[~ends], fitted[~ends]
                     pull, gaps, fit_frames = pull[~ends], gaps[:, ~ends], graphed(chunk._fit_frames, field.device)
                 if not len(left):
-                    break
+                    return Retrieved(found, spent)
             mirrored = 2 * fitted - now
             reflected = 2 * chunk._fit_pupil(mirrored) - mirrored
             now = _RELAXATION * (reflected + now) / 2 + (1 - _RELAXATION) * fitted
@@ -103,14 +108,12 @@ class _Frames:
 
     def _of(self, some: Tensor) -> _Frames:
         """Return some of the frames, by booleans (t,)."""
-        precision = self.precision[some] if len(self.precision) > 1 else self.precision
-        return replace(self, frames=self.frames[some], precision=precision)
+        return replace(self, frames=self.frames[some], precision=self.precision[some])
 
     def _end(self, raster: Tensor, pull: Tensor) -> Tensor:
         """Return the fields (t, P) to which mere projections lead."""
-        fit_frames = graphed(self._fit_frames, raster.device)
-        for _ in range(LAST if len(raster) else 0):
-            raster, pull = fit_frames(self._fit_pupil(raster), pull)
+        for _ in range(LAST):
+            raster, pull = self._fit_frames(self._fit_pupil(raster), pull)
         return raster.flatten(1)[:, self.samples.index]
 
     def _gap(self, raster: Tensor) -> Tensor:
@@ -155,10 +158,10 @@ class _Frames:
 
 def _has_fallen(gaps: Tensor) -> Tensor:
     """Return whether the gap of each frame (t,) has fallen and falls no more, by all looks at it so far (n, t)."""
-    looks = gaps[_FALLING:]
-    if len(looks) <= _BEFORE + _AT_REST:
+    looks = gaps[_FIRST_LOOKS:]
+    if len(looks) <= _LOOKS_BEFORE + _LOOKS_AT_REST:
         return torch.zeros_like(gaps[0], dtype=torch.bool)
     least, when = looks.min(0)
     number = torch.arange(len(looks), device=gaps.device)[:, None]
     before = looks.masked_fill(number >= when, torch.nan).nanmedian(0).values
-    return (when >= _BEFORE) & (len(looks) - 1 - when >= _AT_REST) & (least < _FALLEN * before)
+    return (when >= _LOOKS_BEFORE) & (len(looks) - 1 - when >= _LOOKS_AT_REST) & (least < _FALLEN * before)

@@ -74,9 +74,10 @@ class Schedule:
         below a chi-square of 1024 beyond noise in a frame one is enough
     likelier : cost by which a later start in faint frames has to be lower to replace an earlier one
     glance : number of iterations after which a start from a twin, or any later start in faint frames, may be given up
-    returning : number of iterations from which on a twin of an explained object is given up if it has come back to that
-        and costs no less
-    returned : it has if the two objects differ by less than this, relative, up to half the cut-off frequency
+    back_after : number of iterations from which on a start from a twin, group delays or heat is given up if it has come
+        back to the object of the best, where that explains the frames, and costs no less
+    back_within : relative difference of the two objects up to half the cut-off frequency, but for shift and brightness,
+        below which it has come back; 0: it never has
     promising : where the best start so far does not explain the frames, a twin is given up unless its excess chi-square
         is below this fraction of that of the best
     hopeless : a start in faint frames is, if its cost exceeds that of the best so far by more than this for each
@@ -120,7 +121,7 @@ class Schedule:
     retrievals : for a full pupil, maximum number of rounds of phase retrieval after a start; 0: there is none
     retrieved_starts : number of starts after which phases are retrieved, until they are found
     retrieved_from : a round is made while the mean chi-square is above that of noise by more than this
-    reflections_full : number of reflections of a round
+    reflections_full : number of reflections of a round, at most: those of a frame end once its phases are found
     retrieved_iterations : maximum number of iterations that fit the modes of the phases retrieved
     retrieved_segments : number of segments in which object and aberrations then descend
     retrieved_gain : what the rounds have found is kept if the excess chi-square falls below this fraction
@@ -150,8 +151,8 @@ class Schedule:
     faint_starts: int = 6
     likelier: float = 50.0
     glance: int = 300
-    returning: int = 200
-    returned: float = 0.07
+    back_after: int = 200
+    back_within: float = 0.07
     promising: float = 0.7
     hopeless: float = 0.3
     averaged: int = 3
