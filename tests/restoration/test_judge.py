@@ -249,7 +249,7 @@ def test_a_twin_that_has_come_back_is_given_up(explain):
     finer = objective.model.cutoff / 2
     rest = state.image - lowpass(state.image, finer)
     fine = replace(state, image=state.image - 0.5 * rest)  # alike but for what is above half the cut-off
-    moved = replace(state, image=state.image.roll((3, 1), (0, 1)), z=state.z)
+    moved = replace(state, image=state.image.roll((3, 1), (0, 1)))
     coarse = replace(state, image=state.image + 0.2 * state.image.roll(6, 0))
     apart = relative_error(coarse.image, state.image, finer)
     assert apart > 0.1
