@@ -107,6 +107,31 @@ def test_the_frames_tell_the_power_of_slopes_the_better_the_more_they_show(estim
     assert told[2] / told[1] == pytest.approx(64 / 96, rel=0.2)
 
 
+@pytest.mark.parametrize("knee", [0.02, 0.2, 3.0])
+@pytest.mark.parametrize("exponent", [0.5, 3.0, 10.0])
+def test_the_slopes_of_the_spectrum_are_those_by_autograd(knee, exponent):
+    """At knees within the frequencies and beyond them."""
+    nu = torch.linspace(0.01, 0.5, 20, dtype=torch.float64)
+    x = torch.tensor([0.3, math.log(knee), -math.log(exponent)], dtype=torch.float64)
+    value, by_x = spectrum._spectrum(x, nu)
+    torch.testing.assert_close(value, math.exp(0.3) / (1 + (nu / knee) ** exponent), rtol=1e-12, atol=0)
+    expected = torch.autograd.functional.jacobian(lambda place: spectrum._spectrum(place, nu)[0], x).T
+    torch.testing.assert_close(by_x, expected, rtol=1e-10, atol=1e-300)
+
+
+def test_the_fitted_spectrum_is_the_likeliest():
+    """Of mean powers without scatter it is the true one; with scatter, its likelihood has no slope left."""
+    nu = torch.linspace(0.01, 0.5, 500, dtype=torch.float64)
+    passed, truth = 1 / (1 + 20 * nu), torch.tensor([4.0, math.log(0.06), -math.log(3.0)], dtype=torch.float64)
+    power = spectrum._spectrum(truth, nu)[0] * passed + 0.1
+    torch.testing.assert_close(spectrum._fit(nu, passed, power, 0.1), truth, rtol=1e-4, atol=0)
+    scatter = torch.empty_like(nu).exponential_(generator=torch.Generator().manual_seed(0))
+    found = spectrum._fit(nu, passed, power * scatter, 0.1).requires_grad_()
+    mean = spectrum._spectrum(found, nu)[0] * passed + 0.1
+    (slope,) = torch.autograd.grad((mean.log() + power * scatter / mean).mean(), found)
+    assert slope.abs().max() < 1e-4
+
+
 def test_more_frames_tell_the_power_of_slopes_better_as_far_as_noise_hides_it(seen):
     """Four times as many halve the error of noise, but not that of the one object that they all show."""
     ratios = []
@@ -163,9 +188,9 @@ def test_an_object_that_follows_noise_is_known_by_its_frames(amplitude, gentle, 
     noisy = replace(state, image=state.image + 20 * rough * (state.image.abs() > 0.1 * state.image.max()))
     assert rate_of_slopes(noisy.image) < 0.4
     for found in (state, noisy):
-        assert shows_gentle_slopes(objective, found, BRIGHT) is gentle
+        assert shows_gentle_slopes(objective, found, BRIGHT, faint=False) is gentle
         for silent in (BRIGHT._replace(n_frames=1), Change(0.9, 8, 4096)):
-            assert not shows_gentle_slopes(objective, found, silent)
+            assert not shows_gentle_slopes(objective, found, silent, faint=False)
 
 
 @pytest.mark.parametrize(("errors", "gentle"), [(1.5, True), (2.5, False)])
@@ -175,8 +200,8 @@ def test_bright_frames_tell_gentle_slopes_more_sharply(errors, gentle, seen):
     total, power = float(torch.hypot(*gradient(state.image)).sum()), power_of_slopes(objective, state)
     scale = 3 * total / power.value / (0.5 * math.exp(-errors * power.error))
     objective, state = seen(0, amplitude=50 * scale, noise=0.3 * scale)
-    assert shows_gentle_slopes(objective, state, Change(5.1, 8, 4096)) is gentle
-    assert shows_gentle_slopes(objective, state, Change(4.9, 8, 4096))
+    assert shows_gentle_slopes(objective, state, BRIGHT, faint=False) is gentle
+    assert shows_gentle_slopes(objective, state, BRIGHT, faint=True)
 
 
 @pytest.mark.parametrize("name", ["mgs_1e6_mask", "skylab_1e7_mask"])
@@ -193,7 +218,7 @@ def test_slopes_of_planets_in_bright_frames_are_not_gentle(name, shared_stack):
     shape = (len(stack.frames), objective.model.aberrations.n_parameters)
     z = torch.randn(shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     state = State(image, z, objective.neutral_calibration())
-    assert not shows_gentle_slopes(objective, state, Change(20.0, 20, 128**2))
+    assert not shows_gentle_slopes(objective, state, Change(20.0, 20, 128**2), faint=False)
 
 
 def test_the_rate_of_a_search_is_that_of_its_object_unless_it_follows_noise(seen, monkeypatch):
@@ -203,7 +228,7 @@ def test_the_rate_of_a_search_is_that_of_its_object_unless_it_follows_noise(seen
     for own in (0.3, 0.81, 0.83, 1.7):
         found = replace(state, image=state.image * rate_of_slopes(state.image) / own)
         for gentle, expected in ((False, min(own, 1.0)), (True, 1.5 if own < 0.82 else min(own, 1.0))):
-            monkeypatch.setattr(spectrum, "shows_gentle_slopes", lambda *given, answer=gentle: answer)
+            monkeypatch.setattr(spectrum, "shows_gentle_slopes", lambda *given, answer=gentle, **how: answer)
             assert rate_in_search(objective, found, change) == pytest.approx(expected, rel=1e-9)
 
 
@@ -285,8 +310,9 @@ def test_the_rate_at_the_end_is_higher_for_gentle_slopes_and_that_of_the_frames_
     monkeypatch.setattr(spectrum, "power_of_slopes", lambda *given: Power(squares / shown, 0.1))
     gentle_rate = rate_of_descent(0.4 * max(shown, 1.0), full=full)
     for gentle, expected in ((False, 0.4), (True, gentle_rate)):
-        monkeypatch.setattr(spectrum, "_are_gentle", lambda *given, answer=gentle: answer)
-        assert rate_at_end(objective, state, BRIGHT, full=full) == pytest.approx(expected, rel=1e-9)
+        monkeypatch.setattr(spectrum, "_are_gentle", lambda *given, answer=gentle, **how: answer)
+        assert rate_at_end(objective, state, BRIGHT, faint=False, full=full) == pytest.approx(expected, rel=1e-9)
     dark = replace(state, image=torch.zeros_like(state.image))
-    assert rate_at_end(objective, dark, BRIGHT, full=full) == 0
-    assert rate_at_end(objective, state, BRIGHT._replace(n_frames=1), full=full) == pytest.approx(0.4, rel=1e-9)
+    assert rate_at_end(objective, dark, BRIGHT, faint=False, full=full) == 0
+    single = BRIGHT._replace(n_frames=1)
+    assert rate_at_end(objective, state, single, faint=False, full=full) == pytest.approx(0.4, rel=1e-9)

@@ -69,7 +69,7 @@ class Finisher:
             rounds = self.schedule.fine_rounds if end.descends else self.schedule.rounds
             how = (self.schedule, self.minimizer, self.callback)
             known = {"seed": self.traits.seed, "follow_r0": self.traits.r0_is_open}
-            gentle = shows_gentle_slopes(objective, ended.state, self.change)
+            gentle = shows_gentle_slopes(objective, ended.state, self.change, faint=self._faint)
             astray = gentle and is_too_steep(objective, ended.state)
             rate = rate_in_noise(objective, ended.state, self.change, gentle=gentle)
             prior = prior.suited_to(rate) if rate > 0 else prior
@@ -144,7 +144,7 @@ class Finisher:
         edges already, and would ask for still sharper ones. Faint frames show too little structure: `prior` stays.
         """
         reach = _reach(objective)
-        if self.change.each < self.schedule.faint:
+        if self._faint:
             return prior
         if prior.adapted_to(state.image, reach) is prior:  # a prior without regard for structure needs no settling
             return prior
@@ -171,11 +171,15 @@ class Finisher:
         if end.integrates or end is End.OBJECT:
             # an integration finds the object's scale, and would find too heavy a one in what a heavier prior leaves
             return objective.prior.choices(0.0)[0]
-        rate = rate_at_end(objective, state, self.change, full=self.traits.many_minima)
+        rate = rate_at_end(objective, state, self.change, faint=self._faint, full=self.traits.many_minima)
         heaviest, *lighter = objective.prior.choices(rate)
         # faint frames of a full pupil would choose too light a one; and the heavier a prior, the gentler are the slopes
         # that it leaves, which would ask for a heavier one
         return heaviest if self.traits.many_minima or not lighter else None
+
+    @property
+    def _faint(self) -> bool:
+        return self.change.each < self.schedule.faint
 
     def _chance(self) -> float:
         """Return by how much the mean chi-square may rise by chance: a heavier prior leaves more of the noise."""

@@ -78,8 +78,9 @@ class Restarts:
         is_sharp = progress.iterations >= self.schedule.sharp_after + self.schedule.segment
         if not (progress.starts == 1 and is_sharp and self.judge.has_room_for_all(progress)):
             return False
-        is_missed = self.judge.verdict(objective, progress.ending).finding is Finding.NOT_EXPLAINED
-        return is_missed and self.follows_delays(objective, progress)
+        if not self.follows_delays(objective, progress):  # told in less time than a verdict
+            return False
+        return self.judge.verdict(objective, progress.ending).finding is Finding.NOT_EXPLAINED
 
     def follows_delays(self, objective: MyopicObjective, progress: Progress) -> bool:
         """Return whether a start from group delays may follow the present one.
@@ -132,4 +133,5 @@ class Restarts:
         return self.traits.seed + progress.starts - 1
 
     def _is_gentle(self, objective: MyopicObjective, state: State) -> bool:
-        return shows_gentle_slopes(self.setting.objective_at(objective, state), state, self.stack.change)
+        change, placed = self.stack.change, self.setting.objective_at(objective, state)
+        return shows_gentle_slopes(placed, state, change, faint=change.each < self.schedule.faint)

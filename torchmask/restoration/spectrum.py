@@ -16,7 +16,6 @@ from torch import Tensor
 from torchmask.restoration.change import Change
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.projected_lbfgs import minimize_bounded
-from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.slopes import gradient, rate_in_light, rate_of_descent, rate_of_slopes
 from torchmask.restoration.state import State
 
@@ -45,14 +44,14 @@ class Power(NamedTuple):
         return self.value * math.exp(max(-_VAGUE, min(errors * self.error, _VAGUE)))
 
 
-def shows_gentle_slopes(objective: MyopicObjective, state: State, change: Change) -> bool:
+def shows_gentle_slopes(objective: MyopicObjective, state: State, change: Change, *, faint: bool) -> bool:
     """Return whether the slopes of the object are gentle, as far as the power of its frames tells.
 
-    Their rate is not below 0.5 by more than two standard errors then; by faint frames it is above 0.22 by one, even if
-    those of the object in `state` are steep, as it may follow noise. Only the sum of its slopes is taken from it.
-    Frames that change by hardly more than noise do not tell, nor does a single one.
+    Their rate is not below 0.5 by more than two standard errors then; by frames that are `faint` it is above 0.22 by
+    one, even if those of the object in `state` are steep, as it may follow noise. Only the sum of its slopes is taken
+    from it. Frames that change by hardly more than noise do not tell, nor does a single one.
     """
-    return _tell(change) and _are_gentle(_sum_of_slopes(state), power_of_slopes(objective, state), change)
+    return _tell(change) and _are_gentle(_sum_of_slopes(state), power_of_slopes(objective, state), faint=faint)
 
 
 def is_too_steep(objective: MyopicObjective, state: State) -> bool:
@@ -71,7 +70,7 @@ def rate_in_search(objective: MyopicObjective, state: State, change: Change) -> 
     and it is that of `rate_in_light`.
     """
     rate = rate_of_slopes(state.image)
-    follows_noise = 0 < rate < _OF_NOISE and shows_gentle_slopes(objective, state, change)
+    follows_noise = 0 < rate < _OF_NOISE and shows_gentle_slopes(objective, state, change, faint=True)
     return rate_in_light(change) if follows_noise else min(rate, 1.0)
 
 
@@ -93,7 +92,7 @@ def rate_in_noise(objective: MyopicObjective, state: State, change: Change, *, g
     return max(rate, least) if gentle and least > 1 else rate
 
 
-def rate_at_end(objective: MyopicObjective, state: State, change: Change, *, full: bool) -> float:
+def rate_at_end(objective: MyopicObjective, state: State, change: Change, *, faint: bool, full: bool) -> float:
     """Return the rate that the prior of a last descent suits, for the slopes that a search has found.
 
     It is that of the object unless the frames show gentle slopes. Then it is that of `rate_of_descent` for what the
@@ -103,7 +102,8 @@ def rate_at_end(objective: MyopicObjective, state: State, change: Change, *, ful
     if total == 0 or not _tell(change):
         return rate
     power = power_of_slopes(objective, state)
-    return rate_of_descent(max(rate, 3 * total / power.value), full=full) if _are_gentle(total, power, change) else rate
+    gentle = _are_gentle(total, power, faint=faint)
+    return rate_of_descent(max(rate, 3 * total / power.value), full=full) if gentle else rate
 
 
 def power_of_slopes(objective: MyopicObjective, state: State) -> Power:
@@ -124,20 +124,14 @@ def power_of_slopes(objective: MyopicObjective, state: State) -> Power:
     steps = (2 * torch.sin(math.pi * nu_y)).square() + (2 * torch.sin(math.pi * nu_x)).square()
     fitted = _fit(nu, passed, power, noise)
 
-    def logarithm(x: Tensor) -> Tensor:
-        return (steps[seen] * _spectrum(x, nu)).sum().log()
-
-    def expected(x: Tensor) -> Tensor:
-        return _spectrum(x, nu) * passed + noise
-
-    by_x, slope = torch.func.jacfwd(expected)(fitted), torch.func.grad(logarithm)(fitted)
-    mean = expected(fitted)
-    signal = mean - noise
+    spectrum, by_x = _spectrum(fitted, nu)
+    signal, total = passed * spectrum, float(steps[seen] @ spectrum)
+    mean, slope = signal + noise, by_x @ steps[seen] / total
     variance = signal**2 + (2 * signal + noise) * noise / len(frames)
-    relative = by_x / mean[:, None]
+    relative = (by_x * passed / mean).T
     inverse = torch.linalg.pinv(relative.T @ relative, hermitian=True)
     spread = 2 * inverse @ (relative.T * (variance / mean**2)) @ relative @ inverse  # two frequencies hold one number
-    return Power(float(logarithm(fitted).exp()), float((slope @ spread @ slope).clamp(min=0).sqrt()))
+    return Power(total, float((slope @ spread @ slope).clamp(min=0).sqrt()))
 
 
 @torch.no_grad()
@@ -152,9 +146,13 @@ def _mean_powers(objective: MyopicObjective, state: State, frames: Tensor) -> tu
     return power / len(frames), passed / len(frames)
 
 
-def _spectrum(x: Tensor, nu: Tensor) -> Tensor:
-    """Return k / (1 + (nu / nu_0)^p) for the logarithms (3,) of k, nu_0 and 1 / p."""
-    return torch.exp(x[0]) / (1 + (nu / torch.exp(x[1])) ** torch.exp(-x[2]))
+def _spectrum(x: Tensor, nu: Tensor) -> tuple[Tensor, Tensor]:
+    """Return k / (1 + (nu / nu_0)^p) (F,), and its slopes (3, F) in the logarithms `x` (3,) of k, nu_0 and 1 / p."""
+    exponent, ratio = torch.exp(-x[2]), nu.log() - x[1]
+    above = torch.exp(exponent * ratio)
+    value = torch.exp(x[0]) / (1 + above)
+    fall = value * exponent * above / (1 + above)
+    return value, torch.stack([value, fall, fall * ratio])
 
 
 def _fit(nu: Tensor, passed: Tensor, power: Tensor, noise: float) -> Tensor:
@@ -162,12 +160,10 @@ def _fit(nu: Tensor, passed: Tensor, power: Tensor, noise: float) -> Tensor:
     lowest = float(nu.min())
 
     def cost(x: Tensor) -> tuple[float, Tensor]:
-        with torch.enable_grad():
-            leaf = x.detach().requires_grad_()
-            expected = _spectrum(leaf, nu) * passed + noise
-            value = (expected.log() + power / expected).mean()
-            (slope,) = torch.autograd.grad(value, leaf)
-        return float(value.detach()), slope
+        spectrum, by_x = _spectrum(x, nu)
+        expected = spectrum * passed + noise
+        slope = by_x @ ((1 - power / expected) / expected * passed) / len(nu)
+        return float((expected.log() + power / expected).mean()), slope
 
     first = (power / passed)[nu < _LOWEST * lowest].mean()
     start = torch.stack([first.log(), first.new_tensor(2 * lowest).log(), -first.new_tensor(3.0).log()])
@@ -190,9 +186,9 @@ def _tell(change: Change) -> bool:
     return change.n_frames > 1 and not change.is_scarce
 
 
-def _are_gentle(total: float, power: Power, change: Change) -> bool:
+def _are_gentle(total: float, power: Power, *, faint: bool) -> bool:
     """Return whether slopes whose sum is `total` and whose squares' sum is `power` are gentle; see
     `shows_gentle_slopes`."""
-    if change.each < Schedule.faint:
+    if faint:
         return 3 * total > _GENTLE_FAINT * power.off_by(1)
     return 3 * total > _GENTLE * power.off_by(-_DOUBT)
