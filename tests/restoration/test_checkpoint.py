@@ -1,6 +1,6 @@
 """Progress on disk: all of it comes back, nothing foreign or damaged is taken, and what goes on ends in the same."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
 from types import FunctionType
 
@@ -331,6 +331,27 @@ def test_a_checkpoint_belongs_to_what_was_known(observation, restored, restoring
         MyopicDeconvolution(*instrument, r0=0.22, max_iterations=2).restore(observation.frames, checkpoint=path)
 
 
+def test_a_checkpoint_belongs_to_the_modes_of_the_last_descent(observation, restoring, tmp_path):
+    """With a number of modes given there are no more after the search, which six are without one as well."""
+    path = tmp_path / "state.npz"
+    restoring(None, max_iterations=2).restore(observation.frames, checkpoint=path)
+    with pytest.raises(ValueError, match="other frames or settings"):
+        restoring(6, max_iterations=2).restore(observation.frames, checkpoint=path)
+
+
+def test_a_checkpoint_belongs_to_its_start(observation, restored, restoring, tmp_path):
+    """One of a blind restoration is not that of one which goes on from a result, nor from another result."""
+    method, path, blind = restoring(max_iterations=2), tmp_path / "state.npz", tmp_path / "blind.npz"
+    method.restore(observation.frames, checkpoint=blind)
+    with pytest.raises(ValueError, match="other frames or settings"):
+        method.restore(observation.frames, start=restored, checkpoint=blind)
+    first = method.restore(observation.frames, start=restored, checkpoint=path)
+    assert torch.equal(method.restore(observation.frames, start=restored, checkpoint=path).object, first.object)
+    other = replace(restored, coefficients=2 * restored.coefficients)
+    with pytest.raises(ValueError, match="other frames or settings"):
+        method.restore(observation.frames, start=other, checkpoint=path)
+
+
 def test_a_checkpoint_belongs_to_its_settings(observation, restoring, tmp_path):
     path = tmp_path / "state.npz"
     frames, mine = observation.frames, {"prior": Hidden(2.0)}
@@ -343,6 +364,7 @@ def test_a_checkpoint_belongs_to_its_settings(observation, restoring, tmp_path):
         {"minimizer": TorchMinimizer(partial(torch.optim.Adam, lr=0.1))},
         {"r0": 0.3},
         {"aberration_prior": False},
+        {"exposure_tau0": 0.5},
     ):
         with pytest.raises(ValueError, match="other frames or settings"):
             restoring(3, max_iterations=2, **mine | change).restore(frames, checkpoint=path)

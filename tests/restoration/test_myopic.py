@@ -198,11 +198,16 @@ def test_dead_pixels_are_left_out(observation, restored, restoring):
     assert result.residuals[:, ~valid].abs().max() == 0
 
 
-def test_another_default_device_sees_nothing_of_it(observation):
-    """From the constructor to the standard deviations and the score, all arrays are made where the inputs are."""
+@pytest.mark.parametrize("light", [{}, {"wavelengths": (550e-9, 600e-9), "schedule": Schedule(sharp_after=0)}])
+def test_another_default_device_sees_nothing_of_it(light, observation):
+    """From the constructor to the standard deviations and the score, all arrays are made where the inputs are.
+
+    In a band fringes are changed besides, here at once.
+    """
 
     def everything():
-        method = MyopicDeconvolution(observation.aperture, observation.grid, 3, static_modes=3, max_iterations=3)
+        given = (observation.aperture, observation.grid, 3)
+        method = MyopicDeconvolution(*given, static_modes=3, max_iterations=3, **light)
         result = method.restore(observation.frames, n_samples=2)
         return result.object, result.object_std, torch.tensor(errors(observation, result.object), device="cpu")
 

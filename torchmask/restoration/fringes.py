@@ -55,12 +55,12 @@ def sides_of_lines(centers: Tensor) -> Tensor:
     Each division is there once, as the side that does not hold the first hole; `centers` is (N, 2) [m].
     """
     points = centers.detach().double().cpu()
-    first, second = torch.triu_indices(len(points), len(points), 1)
+    first, second = torch.triu_indices(len(points), len(points), 1, device="cpu")
     apart = points[second] - points[first]
     level = torch.atan2(apart[:, 1], apart[:, 0]) + math.pi / 2  # directions along which these two are level
     angles = torch.cat([level - _ASIDE, level + _ASIDE])
     order = (torch.stack([angles.cos(), angles.sin()], 1) @ points.T).argsort(dim=1)
     ranks = order.argsort(dim=1)
     below = torch.cat([ranks < n for n in range(1, len(points))])  # the n holes that lie furthest back
-    sides = torch.cat([below, torch.eye(len(points), dtype=torch.bool)])
+    sides = torch.cat([below, torch.eye(len(points), dtype=torch.bool, device="cpu")])
     return torch.unique(sides ^ sides[:, :1], dim=0)

@@ -31,7 +31,7 @@ from torchmask.restoration.recipe import FULL_MODES, MASK_MODES, ModelRecipe
 from torchmask.restoration.result import RestorationResult
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.solver import Solver
-from torchmask.restoration.starts import Known
+from torchmask.restoration.starts import Known, tensors_of
 from torchmask.restoration.traits import Refinement, Traits, check_numbers, check_samples
 from torchmask.restoration.variation import TotalVariation
 
@@ -235,7 +235,7 @@ class MyopicDeconvolution:
             Number of posterior samples for the standard deviations of object and coefficients; each costs about as much
             as 50 iterations, and 8 are enough. 0: no standard deviations.
         seed : int
-            Seed of the random starts and candidates, and of the samples of aberrations that are integrated out.
+            Seed of random starts, candidates and samples of aberrations.
         checkpoint : path, optional
             An .npz file, written every 100 iterations, not of phase retrieval, from which a restoration resumes.
         callback : callable, optional
@@ -247,7 +247,7 @@ class MyopicDeconvolution:
             If a shape is wrong, a valid pixel or a known value is not finite, one of `errors` is not positive, a frame
             or the known object has no light, both object and aberrations are known, `covariance` is not a covariance or
             comes without coefficients or with static modes, the prior is not a finite, differentiable scalar, or the
-            checkpoint is damaged or belongs to other frames, settings or known values.
+            checkpoint is damaged or of other frames, settings, known values or another start.
 
         Warns
         -----
@@ -261,8 +261,7 @@ class MyopicDeconvolution:
         (look := look_at_mask(stack.frames, told.aperture, told.grid, told.band)).warn(stacklevel=2)
         known = Known.of(coefficients, covariance, known_object)
         stack = stack.to(self._model.dtype, self._model.device)
-        blind, faint = known.nothing and start is None, stack.change.each < self.schedule.faint
-        recipe = self.recipe.for_frames(blind=blind, faint=faint)
+        recipe = told.for_frames(blind=known.nothing and start is None, faint=stack.change.each < self.schedule.faint)
         model = self.model if recipe.frame_modes == self.recipe.frame_modes else recipe.turbulent_model()
         model = (model if known.covariance is None else recipe.estimated_model(known.covariance)).beside(stack.free)
         with torch.inference_mode(False), each_on_a_core(model.device) as parallel:
@@ -271,9 +270,11 @@ class MyopicDeconvolution:
             )
             traits, later = self._traits(known, seed), recipe.later_bases(model.aberrations, blind=known.nothing)
             solver = Solver(objective, stack, traits, self.schedule, self.minimizer, callback, *later)
-            settings = (replace(traits, max_iterations=0, tolerance=0.0), self.minimizer, self.schedule)
+            unlimited = replace(traits, max_iterations=0, tolerance=0.0)
+            settings = (unlimited, self.minimizer, self.schedule, recipe.last_modes, recipe.exposure_tau0)
             check_prior(self.prior, model.window.embed(stack.frames.mean(0).clamp(min=0)).double())
-            progress = solver.solve(known, start, Checkpoint.of(checkpoint, objective, settings, known.tensors))
+            file = Checkpoint.of(checkpoint, objective, settings, (*known.tensors, *tensors_of(start)))
+            progress = solver.solve(known, start, file)
             verdict = replace(solver.judge.verdict(solver.objective, progress.ending), **look._asdict())
             result = assemble_result(solver.objective, stack, progress, solver.prior_r0, verdict, n_modes=self.n_modes)
             if n_samples:
@@ -296,5 +297,4 @@ class MyopicDeconvolution:
             tolerance=self.tolerance,
             seed=seed,
             refinement=self.refinement.where(blind=known.nothing and self.recipe.whitened),
-            exposure_tau0=self.recipe.exposure_tau0,
         )

@@ -180,6 +180,13 @@ def start_from_result(
     return replace(state, image=image, z=z, geometry=start.geometry), known
 
 
+def tensors_of(start: RestorationResult | None) -> tuple[Tensor | None, ...]:
+    """Return all of an earlier result that a restoration takes over; nothing if there is none."""
+    if start is None:
+        return ()
+    return start.extended_object, start.coefficients, start.motion, start.geometry.matrix
+
+
 def fit_new_frames(
     objective: MyopicObjective,
     state: State,

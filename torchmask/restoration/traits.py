@@ -86,7 +86,6 @@ class Traits:
     tolerance : the restoration has converged when a segment lowers the cost by a smaller fraction
     seed : seed of the random starts
     refinement : whether to refine the mask's geometry
-    exposure_tau0 : exposure time of a frame [tau0]; 0: frames are snapshots
     """
 
     many_minima: bool
@@ -99,7 +98,6 @@ class Traits:
     tolerance: float
     seed: int
     refinement: Refinement
-    exposure_tau0: float = 0.0
 
     @property
     def aberration_weight(self) -> float:
