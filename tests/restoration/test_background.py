@@ -180,6 +180,13 @@ def test_a_sky_is_free_where_the_darkest_part_of_the_field_shows_it(three_holes)
         assert told.of(shining) is told
 
 
+def test_a_model_does_not_decide_what_frames_show(three_holes):
+    model = ExposureModel(three_holes, GRID, 4)
+    for make in (lambda sky: ExposureModel(three_holes, GRID, 4, background=sky), model.beside):
+        with pytest.raises(ValueError, match=r"IF_SEEN, which frames decide and no model"):
+            make(Background.IF_SEEN)
+
+
 def test_a_model_beside_a_background_shares_all_else(random_exposures, three_holes):
     model = ExposureModel(three_holes, GRID, 4)
     beside = model.beside(FREE)

@@ -13,6 +13,7 @@ from torchmask.metrics import relative_error
 from torchmask.optics.aperture import FullAperture
 from torchmask.optics.detector import Detector
 from torchmask.record import Record
+from torchmask.restoration.aberrations import AberrationBasis
 from torchmask.restoration.candidates import Candidates, play_stage, select, several, with_candidates
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.myopic import MyopicDeconvolution
@@ -29,16 +30,18 @@ FRAMES, CANDIDATES = 3, 4
 BRIEF = Schedule(candidates=((16, 3), (8, 3), (4, 3), (2, 3)))  # stages of a few iterations
 
 
-def problem(n_modes=6):
+def problem(n_modes=6, n_common=0):
     """The objective of random frames, and random candidates for them."""
     generator = torch.Generator().manual_seed(0)
 
     def uniform(*shape):
         return torch.rand(*shape, generator=generator, dtype=torch.float64)
 
-    model = ExposureModel(PUPIL, GRID, n_modes)
+    basis = AberrationBasis(torch.eye(n_modes, dtype=torch.float64), n_modes, n_common=n_common)
+    model = ExposureModel(PUPIL, GRID, basis)
     frames, precision = 1 + uniform(FRAMES, *GRID.shape), uniform(FRAMES, *GRID.shape)
     z = torch.randn(CANDIDATES * FRAMES, n_modes, generator=generator, dtype=torch.float64)
+    z = basis.with_common_of(z, z[:1])
     image, transmission = 1 + uniform(*model.window.field.shape), 0.5 + uniform(CANDIDATES * FRAMES)
     calibration = Calibration(transmission, torch.full_like(transmission, 2.0), 0.3)
     objective = MyopicObjective(model, frames, precision, TotalVariation(0.7))
@@ -52,9 +55,13 @@ def members(candidates):
     ]
 
 
-def test_a_crowd_costs_as_much_as_its_members_one_by_one():
-    """Up to single precision: in the worst case the roundings of all samples of the pupil add up."""
-    alone, candidates = problem()
+@pytest.mark.parametrize("n_common", [0, 2])
+def test_a_crowd_costs_as_much_as_its_members_one_by_one(n_common):
+    """Up to single precision: in the worst case the roundings of all samples of the pupil add up.
+
+    The prior of aberrations in common counts once for all frames, and so once for each candidate of all of them.
+    """
+    alone, candidates = problem(n_common=n_common)
     state, together = candidates.state, with_candidates(alone, CANDIDATES)
     cost = together.value_and_gradients(state.image, state.z, state.calibration)
     by_object, by_aberrations = cost.object_gradient, cost.aberration_gradient
@@ -63,7 +70,7 @@ def test_a_crowd_costs_as_much_as_its_members_one_by_one():
     rounding = len(alone.model.pupil.basis) * torch.finfo(torch.float32).eps
     expected = sum(cost.object_gradient for cost in costs)
     assert float((by_object - expected).norm() / expected.norm()) < rounding
-    expected = torch.cat([cost.aberration_gradient for cost in costs])
+    expected = alone.model.aberrations.mean_common(torch.cat([cost.aberration_gradient for cost in costs]))
     assert float((by_aberrations - expected).norm() / expected.norm()) < rounding
     assert alone.model.dtype == torch.float64  # the crowd's single precision is its own
     assert together.model.dtype == torch.float32

@@ -10,8 +10,10 @@ from torchmask.grid import Grid
 from torchmask.metrics import shift
 from torchmask.optics.band import Band
 from torchmask.restoration.aberrations import AberrationBasis
-from torchmask.restoration.escapes import centre_on_pixels, restart_outlier_frames, tilt
+from torchmask.restoration.background import Background
+from torchmask.restoration.escapes import centre_on_pixels, restart_outlier_frames, settle, tilt
 from torchmask.restoration.forward import ExposureModel
+from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.projected_lbfgs import Minimum, ProjectedLBFGS
 from torchmask.restoration.schedule import Schedule
 
@@ -71,8 +73,9 @@ def test_a_lost_frame_is_found_again(explained):
     assert torch.equal(found.z[others], lost.z[others])
     assert torch.equal(found.image, lost.image)
     assert found.calibration is lost.calibration
-    assert minimizer.n_evaluations > SCHEDULE.restarts * SCHEDULE.restart_rounds
-    assert n_evaluations == minimizer.n_evaluations // FRAMES  # in units of evaluations of the whole stack
+    assert minimizer.n_evaluations > SCHEDULE.restart_rounds
+    # all starts in one descent, in units of evaluations of the whole stack
+    assert n_evaluations == SCHEDULE.restarts * minimizer.n_evaluations // FRAMES
 
 
 def test_frames_that_fit_are_left_alone_at_no_cost(explained):
@@ -122,6 +125,19 @@ def test_what_all_frames_share_stays_when_one_starts_anew(five_holes, five_hole_
     torch.testing.assert_close(found.z[:, shared.n_own :], state.z[:, shared.n_own :], rtol=1e-14, atol=0)
 
 
+def test_a_start_whose_cost_is_no_number_replaces_nothing(explained):
+    """As from pairs of steps without a solution."""
+    objective, state = explained
+    lost = with_lost(state, state.z[LOST] + 0.3)
+
+    def diverges(cost, start, lower, *, max_iterations, callback):
+        callback(start, cost(start)[0], 1)
+        return Minimum(start * math.nan, math.nan, 1, 1, False, "diverged")
+
+    found, _ = restart_outlier_frames(objective, lost, FIRST_INFLATION, SCHEDULE, diverges, seed=1)
+    assert found is lost
+
+
 # --- the object between the pixels
 
 
@@ -165,6 +181,20 @@ def test_an_object_off_its_pixels_comes_back_to_them(offset, whole, explained):
     assert found.calibration is away.calibration
     values = [objective.value_and_gradients(one.image, one.z, one.calibration).value for one in (found, state, away)]
     assert values[0] < values[1] < values[2]
+
+
+@pytest.mark.parametrize("background", [Background.PER_FRAME, Background.COMMON])
+def test_beside_a_sky_an_object_on_its_pixels_costs_no_more_than_before(background, explained):
+    """The object's light has a price there: without it a settled object gains light that the sky should have."""
+    told, state = explained
+    model = told.model.beside(background)
+    objective = MyopicObjective(model, told.frames + 3.0, told.precision, told.prior)
+    state = state.calibrated(aberration_weight=0.0)
+    for offset in ((0.0, 0.0), (0.4, -0.2)):
+        begun = settle(objective, moved_away(objective, state, offset), 1000)
+        found = centre_on_pixels(objective, begun, SCHEDULE)
+        before, after = (float(objective.evaluator(one.calibration)(one.image, one.z).value) for one in (begun, found))
+        assert after <= before
 
 
 def test_an_object_on_its_pixels_is_the_very_same_state(explained):

@@ -1,6 +1,7 @@
 """A stack of frames: its unit, its weights, what changes from frame to frame, and how bright its border is."""
 
 import math
+import warnings
 
 import pytest
 import torch
@@ -8,6 +9,7 @@ import torch
 from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture
 from torchmask.restoration.frames import FrameStack, border_brightness
+from torchmask.restoration.myopic import MyopicDeconvolution
 
 GRID = Grid.nyquist(1.0, 550e-9, 32)
 PUPIL = FullAperture(1.0)
@@ -85,6 +87,17 @@ def test_border_brightness():
 def test_a_bright_border_is_noticed():
     with pytest.warns(UserWarning, match="does the object extend beyond the field"):
         FrameStack.of(exposures() + 100.0, None, GRID, PUPIL, None)
+
+
+def test_warnings_name_the_line_that_restores():
+    """And so each caller is told, not only the first."""
+    method = MyopicDeconvolution(PUPIL, GRID, 3, readout_noise=1e5, max_iterations=1)
+    for call in (method.restore, method.objective):
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            call(exposures() + 100.0)
+        ours = {str(one.message)[:24]: one.filename for one in told if one.category is UserWarning}
+        assert ours == dict.fromkeys(("the noise of the frames ", "the frames are bright at"), __file__)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

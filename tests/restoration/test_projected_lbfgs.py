@@ -139,6 +139,17 @@ def test_bad_input_is_refused():
         minimize_bounded(cost, torch.ones(3).double(), torch.zeros(2).double(), max_iterations=1)
     with pytest.raises(ValueError, match="finite"):
         minimize_bounded(lambda x: (math.nan, x), torch.ones(3), torch.zeros(3), max_iterations=1)
+    with pytest.raises(ValueError, match="finite"):
+        minimize_bounded(lambda x: (-math.inf, x), torch.ones(3), torch.zeros(3), max_iterations=1)
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf])
+def test_a_gradient_that_is_no_number_is_no_minimum(number):
+    start = torch.ones(3).double()
+    found = minimize_bounded(lambda x: (1.0, x * number), start, torch.zeros(3).double(), max_iterations=5)
+    assert not found.converged
+    assert found.message == f"the gradient is {number}"
+    assert torch.equal(found.x, start)
 
 
 def test_the_number_of_corrections_is_passed_on():

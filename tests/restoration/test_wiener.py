@@ -80,12 +80,23 @@ def test_gradient():
     assert torch.autograd.gradcheck(lambda f, h: multiframe_wiener(f, h, psd, 0.1 * psd), (frames, otfs))
 
 
+def test_the_image_has_the_dtype_of_the_frames():
+    frames, otfs = draw(2)
+    psd = torch.tensor(1.0)
+    exact = multiframe_wiener(frames, otfs, psd, 0.1 * psd)
+    found = multiframe_wiener(frames.float(), otfs, psd, 0.1 * psd)
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found.double(), exact, rtol=0, atol=1e-5 * float(exact.abs().max()))
+
+
 @pytest.mark.parametrize(
     ("change", "error", "words"),
     [
         (lambda f, h: (f[:1], h), ValueError, "same"),
         (lambda f, h: (f[0], h[0]), ValueError, "frame, rows"),
         (lambda f, h: (f, h.real), TypeError, "complex"),
+        (lambda f, h: (f.half(), h), TypeError, "float32 or float64"),
+        (lambda f, h: (f.expand(2, *f.shape), h.expand(3, *h.shape)), ValueError, "must broadcast"),
     ],
 )
 def test_refuses(change, error, words):

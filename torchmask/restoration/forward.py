@@ -85,7 +85,8 @@ class ExposureModel(nn.Module):
     Raises
     ------
     ValueError
-        If the shortest wavelength undersamples the image, or a sub-aperture is narrower than two samples.
+        If the shortest wavelength undersamples the image, a sub-aperture is narrower than two samples, or `background`
+        is `Background.IF_SEEN`, which only frames decide.
 
     Notes
     -----
@@ -126,7 +127,7 @@ class ExposureModel(nn.Module):
         band = band or Band.of([grid.wavelength])
         basis = copy.deepcopy(basis).to(device=device)
         self.window: Window = Window.around(grid, margin)
-        self.background: Background = background
+        self.background: Background = _of_a_model(background)
         response = None if pixel is None else _half_plane(pixel, self.window.field).to(device)
         self.register_buffer("response", response, persistent=False)
         self.pupil: SampledPupil = SampledPupil(aperture, self.window.field, band, basis, dtype=dtype, device=device)
@@ -165,7 +166,7 @@ class ExposureModel(nn.Module):
     def beside(self, background: Background) -> ExposureModel:
         """Return the model for frames with the given background; it shares all arrays."""
         twin = copy.copy(self)
-        twin.background = background
+        twin.background = _of_a_model(background)
         return twin
 
     def chunks(self, n_frames: int) -> Iterator[slice]:
@@ -243,3 +244,13 @@ def fast_size(n: int) -> int:
         if rest == 1 and n % 2 == 0:
             return n
         n += 1
+
+
+def _of_a_model(background: Background) -> Background:
+    """Return the background. Raises ValueError for `IF_SEEN`."""
+    if background is Background.IF_SEEN:
+        raise ValueError(
+            "background is Background.IF_SEEN, which frames decide and no model: give Background.NONE, PER_FRAME or "
+            "COMMON, or what Background.IF_SEEN.of(frames) returns"
+        )
+    return background

@@ -81,7 +81,7 @@ class FrameStack:
             warnings.warn(
                 "the frames are bright at the border: does the object extend beyond the field? If it is sky, give its "
                 "level [electrons per pixel]",
-                stacklevel=3,
+                stacklevel=4,
             )
         return cls(frames / unit, valid, unit, variance, known, free, errors, slope)
 

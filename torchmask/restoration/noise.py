@@ -77,7 +77,7 @@ def expected_variance(
         warnings.warn(
             f"the noise of the frames is {measured**0.5:.3g} electrons rms, but {told} give {variance**0.5:.3g}: check "
             f"the gain and {option}",
-            stacklevel=4,
+            stacklevel=5,
         )
     more_than_light = errors is None and measured is not None and measured > _CLEARLY_MORE * variance
     return measured if measured is not None and more_than_light else variance

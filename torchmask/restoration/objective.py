@@ -267,7 +267,7 @@ class MyopicObjective(nn.Module):
         if not n_common:
             return value
         weight = torch.full_like(z[0], value)
-        weight[-n_common:] = 1 / len(z) if value else 0.0
+        weight[-n_common:] = self.prior_copies / len(z) if value else 0.0
         return weight
 
     def frame_costs(self, image: Tensor, z: Tensor, calibration: Calibration) -> Tensor:

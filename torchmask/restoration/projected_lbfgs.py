@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
@@ -122,6 +123,8 @@ def minimize_bounded(
     while True:
         free = (x > lower) | (gradient < 0)
         steepness = float((gradient * free).abs().max())
+        if not math.isfinite(steepness):
+            return end(f"the gradient is {steepness}")
         if steepness <= gradient_tolerance:
             return end(f"projected gradient {steepness:.1e}", converged=True)
         if iteration == max_iterations:
@@ -168,8 +171,8 @@ def require_vectors(start: Tensor, lower: Tensor) -> None:
 
 
 def require_finite(value: float) -> None:
-    """Raise ValueError unless the cost at the start is a number below infinity."""
-    if not value < float("inf"):
+    """Raise ValueError unless the cost at the start is finite."""
+    if not math.isfinite(value):
         raise ValueError(f"the cost at the start is {value}: it must be finite")
 
 

@@ -8,6 +8,8 @@ from torch import Tensor
 from torchmask.grid import Grid
 from torchmask.spectra import PSD, evaluate_psd
 
+_REAL, _COMPLEX = (torch.float32, torch.float64), (torch.complex64, torch.complex128)
+
 
 def multiframe_wiener(frames: Tensor, otfs: Tensor, object_psd: PSD, noise_psd: PSD) -> Tensor:
     """Return the multi-frame Wiener estimate: O = sum_t conj(H_t) Y_t / (sum_t |H_t|^2 + S_n / S_o).
@@ -32,7 +34,8 @@ def multiframe_wiener(frames: Tensor, otfs: Tensor, object_psd: PSD, noise_psd: 
     Raises
     ------
     ValueError, TypeError
-        If frames and OTFs do not broadcast to each other, or a PSD has a wrong type, shape or sign.
+        If frames or OTFs are not of single or double precision or do not broadcast to each other, or a PSD has a wrong
+        type, shape or sign.
 
     Examples
     --------
@@ -42,14 +45,15 @@ def multiframe_wiener(frames: Tensor, otfs: Tensor, object_psd: PSD, noise_psd: 
     >>> torch.allclose(restored, frames.mean(0))  # no blur, no noise: the mean
     True
     """
-    if not frames.is_floating_point() or not otfs.is_complex():
+    if frames.dtype not in _REAL or otfs.dtype not in _COMPLEX:
         raise TypeError(
-            f"frames are {frames.dtype} and otfs {otfs.dtype}: they must be real floating point and complex"
+            f"frames are {frames.dtype} and otfs {otfs.dtype}: they must be float32 or float64, and complex64 or "
+            "complex128"
         )
-    if frames.ndim < 3 or otfs.ndim < 3 or frames.shape[-3:] != otfs.shape[-3:]:
+    if frames.ndim < 3 or otfs.ndim < 3 or frames.shape[-3:] != otfs.shape[-3:] or not _broadcast(frames, otfs):
         raise ValueError(
             f"frames have shape {tuple(frames.shape)} and otfs {tuple(otfs.shape)}: both must end in the same "
-            "(frame, rows, columns)"
+            "(frame, rows, columns), and what comes before must broadcast"
         )
     grid = Grid((frames.shape[-2], frames.shape[-1]), 1.0, 1.0)  # PSDs are functions of cycles/pixel only
     signal = evaluate_psd(object_psd, grid, "object_psd", frames.dtype, frames.device)
@@ -59,4 +63,13 @@ def multiframe_wiener(frames: Tensor, otfs: Tensor, object_psd: PSD, noise_psd: 
     denominator = signal * power + noise
     # Where signal and noise are both zero, the estimate is 0.
     gain = torch.where(denominator > 0, signal / torch.where(denominator > 0, denominator, 1), 0)
-    return torch.fft.ifft2(matched * gain).real
+    return torch.fft.ifft2(matched * gain).real.to(frames.dtype)
+
+
+def _broadcast(one: Tensor, other: Tensor) -> bool:
+    """Return whether two tensors broadcast to each other."""
+    try:
+        torch.broadcast_shapes(one.shape, other.shape)
+    except RuntimeError:
+        return False
+    return True
