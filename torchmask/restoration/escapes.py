@@ -67,39 +67,39 @@ def restart_outlier_frames(
 ) -> tuple[State, int]:
     """Refit the aberrations of outlying frames from several random starts; return the state and the evaluations spent.
 
-    A frame keeps its aberrations unless a start ends at a lower cost; if all keep theirs, `state` itself is returned.
+    All starts of all such frames descend together, as if each were a frame. A frame keeps its aberrations unless a
+    start ends at a lower cost; if all keep theirs, `state` itself is returned.
     """
     inflation = calibrate(objective, state).calibration.noise_inflation
     lost = (inflation > schedule.outlying * inflation.quantile(0.25)).nonzero().flatten()
-    if not len(lost):
+    every = lost.repeat(schedule.restarts)
+    if not len(every):
         return state, 0
-    part, basis = objective.of_frames(lost, free=Free.ABERRATIONS), objective.model.aberrations
-    generator = torch.Generator().manual_seed(seed)
+    starts, now = objective.of_frames(every, free=Free.ABERRATIONS), state.of_frames(every)
     n_evaluations = 0
 
     def count(cost: float, evaluations: int, variables: Variables) -> None:
         nonlocal n_evaluations
         n_evaluations += evaluations
 
-    now = state.of_frames(lost)
-    best, least = now.z, part.frame_costs(now.image, now.z, now.calibration)
+    generator = torch.Generator().manual_seed(seed)
+    noise = torch.randn(now.z.shape, dtype=now.z.dtype, device="cpu", generator=generator).to(now.z)
     spread = float((state.z - objective.centre).square().mean(1).sqrt().median())  # robust against the lost frames
-    for _ in range(schedule.restarts):
-        noise = torch.randn(now.z.shape, dtype=now.z.dtype, device="cpu", generator=generator).to(now.z)
-        fresh = basis.with_common_of(part.centre + spread * noise, now.z)
-        trial = replace(now, z=fresh).with_noise_inflation(first_inflation)
-        for _ in range(schedule.restart_rounds):  # the noise falls, else most starts end in poor minima
-            trial = descend(part, trial, schedule.restart_iterations, minimizer, count)
-            left = calibrate(part, trial).calibration.noise_inflation
-            trial = trial.calibrated(noise_inflation=left)
-        costs = part.frame_costs(trial.image, trial.z, now.calibration)
-        best = torch.where((costs < least)[:, None], trial.z, best)
-        least = torch.minimum(costs, least)
-    spent = n_evaluations * len(lost) // len(state.z)
-    if torch.equal(best, now.z):
+    fresh = objective.model.aberrations.with_common_of(starts.centre + spread * noise, now.z)
+    trial = replace(now, z=fresh).with_noise_inflation(first_inflation)
+    for _ in range(schedule.restart_rounds):  # the noise falls, else most starts end in poor minima
+        trial = descend(starts, trial, schedule.restart_iterations, minimizer, count)
+        left = calibrate(starts, trial).calibration.noise_inflation
+        trial = trial.calibrated(noise_inflation=left)
+    rivals = torch.cat([state.z[lost], trial.z])  # the present aberrations first
+    every = lost.repeat(1 + schedule.restarts)
+    costs = objective.of_frames(every).frame_costs(state.image, rivals, state.of_frames(every).calibration)
+    best = costs.nan_to_num(torch.inf).unflatten(0, (-1, len(lost))).argmin(0)
+    spent = n_evaluations * len(now.z) // len(state.z)
+    if not best.any():
         return state, spent
     z = state.z.clone()
-    z[lost] = best
+    z[lost] = rivals[best * len(lost) + torch.arange(len(lost), device=best.device)]
     return replace(state, z=z), spent
 
 
@@ -110,6 +110,7 @@ def centre_on_pixels(objective: MyopicObjective, state: State, schedule: Schedul
     which needs FFTs of the object only, not of the frames.
     """
     gradient, power = objective.object_quadratic(state.image, state.z, state.calibration)
+    gradient = gradient + objective.model.background.price
 
     def settle(offset: tuple[float, float]) -> tuple[float, Tensor]:
         image, slope = shift(state.image, offset), shift(gradient, offset)
