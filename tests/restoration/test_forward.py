@@ -114,6 +114,17 @@ def test_a_star_is_drawn_out_along_the_radius_and_nowhere_else():
     assert (moved - model.psf(torch.zeros(1, 9, dtype=torch.float64))[0].roll(1, 1)).abs().max() < 1e-14
 
 
+def test_an_object_and_aberrations_of_another_model_are_refused():
+    model = ExposureModel(MASK, GRID, 4)
+    image, z = torch.zeros(model.window.field.shape, dtype=torch.float64), torch.zeros(2, 12, dtype=torch.float64)
+    assert model(image, z).shape == (2, *GRID.shape)
+    with pytest.raises(ValueError, match=r"the object has shape .*into which model\.window\.embed puts an object"):
+        model(model.window.crop(image), z)
+    for other in (z[:, :-1], z[0]):
+        with pytest.raises(ValueError, match=r"z has shape .*: \(T, 12\) is needed"):
+            model(image, other)
+
+
 def test_chunks_cover_the_frames_once_and_stay_small(monkeypatch):
     model = ExposureModel(MASK, GRID, 4, Band.of((550e-9, 560e-9)))
     chunk = 2 * 16 * 2 * math.prod(model.window.field.shape)

@@ -401,6 +401,7 @@ def test_an_object_beyond_the_field_is_noticed(restoring):
         ({"readout_noise": math.nan}, "readout_noise"),
         ({"max_iterations": 0}, "max_iterations"),
         ({"max_iterations": math.nan}, "max_iterations is nan"),
+        ({"max_iterations": 10.5}, r"max_iterations is 10\.5: it must be a whole number"),
         ({"tolerance": -1.0}, "tolerance"),
         ({"n_modes": 0}, "n_modes is 0"),
         ({"n_modes": 3.5}, r"n_modes is 3\.5: it must be a whole number"),
@@ -411,6 +412,38 @@ def test_an_object_beyond_the_field_is_noticed(restoring):
 def test_refuses_settings(options, words, observation):
     with pytest.raises(ValueError, match=words):
         MyopicDeconvolution(observation.aperture, observation.grid, **options)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (
+            lambda mask, grid: {"aperture": mask.centers, "grid": grid},
+            "aperture is of type Tensor: it must be of type Aperture",
+        ),
+        (
+            lambda mask, grid: {"aperture": mask, "grid": mask},
+            "grid is of type SparseAperture: it must be of type Grid",
+        ),
+        (lambda mask, grid: {"aperture": mask, "grid": grid, "refine_geometry": "no"}, "refine_geometry is 'no'"),
+        (lambda mask, grid: {"aperture": mask, "grid": grid, "aberration_prior": "no"}, "aberration_prior is 'no'"),
+    ],
+)
+def test_refuses_other_types(change, words, observation):
+    with pytest.raises(TypeError, match=words):
+        MyopicDeconvolution(**change(observation.aperture, observation.grid))
+
+
+def test_whole_numbers_may_be_floats(observation):
+    method = MyopicDeconvolution(observation.aperture, observation.grid, 3.0, max_iterations=2.0, readout_noise=3.0)
+    result = method.restore(observation.frames, n_samples=2.0)
+    assert result.coefficients.shape[-1] == 3
+    assert result.object_std is not None
+
+
+def test_a_start_is_an_earlier_result(observation, restored, restoring):
+    with pytest.raises(TypeError, match="start is a Tensor: give what an earlier restoration has returned"):
+        restoring().restore(observation.frames, start=restored.object)
 
 
 def test_refuses_shapes_that_disagree(observation, restored, restoring):

@@ -339,6 +339,8 @@ def test_refuses_numbers(number):
 def test_refuses_what_cannot_be_called():
     with pytest.raises(TypeError, match=r"prior is 3\.0: it must be a function or module"):
         as_prior(3.0)
+    with pytest.raises(TypeError, match=r"prior is the class TotalVariation: give an object of it, such as TotalV"):
+        as_prior(TotalVariation)
 
 
 def test_a_subclass_without_forward_says_so():
@@ -352,6 +354,17 @@ class OfWrongShape:
 
     def gradient(self, image):
         return 2 * image[:-1]
+
+
+class OfGradient:
+    def __init__(self, factor):
+        self.factor = factor
+
+    def __call__(self, image):
+        return (image**2).sum()
+
+    def gradient(self, image):
+        return self.factor * image
 
 
 class OfCurvature:
@@ -375,6 +388,8 @@ class OfCurvature:
         (lambda image: image[9, 9], r"fails on an image \(6, 7\): index 9 is out of bounds"),
         (lambda image: (image @ image).sum(), r"fails on an image \(6, 7\)"),
         (OfWrongShape(), r"has shape \(5, 7\) or is not finite"),
+        (OfGradient(-2.0), "another than that of its value by autograd, by 2 of it"),
+        (OfGradient(1.0), "by 0.5 of it: mend the method, or leave it out"),
         (OfCurvature(lambda image: image[:-1]), r"curvature of .* is a tensor of shape \(5, 7\), or holds"),
         (OfCurvature(lambda image: 2.0), r"curvature of .* is a float, or holds"),
         (OfCurvature(lambda image: -image.abs()), r"negative or not finite: a tensor of shape \(6, 7\) is needed"),

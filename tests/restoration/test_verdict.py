@@ -18,7 +18,7 @@ ERROR = ModelError(excess=0.3, fitted=40.0, phase=0.2)
 TOLERANCE = Tolerance(2.0, 2.0)
 
 
-def verdict_on(*chi_square, contrast=50.0, tolerance=TOLERANCE, at_rest=True, error=ERROR, **fits):
+def verdict_on(*chi_square, contrast=50.0, tolerance=TOLERANCE, at_rest=True, alone=False, error=ERROR, **fits):
     n_frames = len(chi_square)
     told = {
         "chi_square": torch.tensor(chi_square, dtype=torch.float64),
@@ -27,7 +27,7 @@ def verdict_on(*chi_square, contrast=50.0, tolerance=TOLERANCE, at_rest=True, er
         "noise": FrameNoise(torch.ones(n_frames), torch.ones(n_frames)),
         "parameters": 100.0,
     }
-    return judge(FrameFits(**(told | fits)), contrast, error, tolerance, at_rest=at_rest)
+    return judge(FrameFits(**(told | fits)), contrast, error, tolerance, at_rest=at_rest, alone=alone)
 
 
 def test_chi_square_is_over_its_degrees_of_freedom():
@@ -50,6 +50,15 @@ def test_pixels_that_are_not_valid_do_not_count():
     verdict = verdict_on(1.0, 9.0, pixels=torch.tensor([1000, 40]))
     assert verdict.degrees_of_freedom == 961  # a frame that tells nothing has one left
     assert verdict.chi_square == pytest.approx((1000 + 360) / 961)
+
+
+def test_one_frame_alone_is_explained_by_many_objects():
+    """So its user is told to look at others; where it is not explained, something else is amiss first."""
+    verdict = verdict_on(1.0, alone=True)
+    assert verdict.explained
+    assert "check against other frames: one alone is explained by many objects" in str(verdict)
+    assert verdict_on(1.0).check == ""
+    assert "other frames" not in verdict_on(8.0, alone=True).check
 
 
 def test_single_frames_may_be_lost():

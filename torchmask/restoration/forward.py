@@ -212,8 +212,22 @@ class ExposureModel(nn.Module):
         return intensity(self.amplitude(samples, samples.field(samples.phase(z))))
 
     def forward(self, image: Tensor, z: Tensor, samples: OpenSamples | None = None) -> Tensor:
+        self._check(image, z)
         transfer = torch.fft.rfft2(self.psf(z, samples))
         return self.window.crop(torch.fft.irfft2(transfer * self.spectrum(image), s=self.window.field.shape))
+
+    def _check(self, image: Tensor, z: Tensor) -> None:
+        """Raise ValueError unless an object and aberrations are those of this model."""
+        if image.shape[-2:] != self.window.field.shape:
+            raise ValueError(
+                f"the object has shape {tuple(image.shape)}: (..., *{self.window.field.shape}) is needed, that of the "
+                "field, into which model.window.embed puts an object on the pixels of the frames"
+            )
+        if z.ndim < 2 or z.shape[-1] != self.aberrations.n_parameters:
+            raise ValueError(
+                f"z has shape {tuple(z.shape)}: (T, {self.aberrations.n_parameters}) is needed, the parameters of all "
+                "sub-apertures in each frame, as model.aberrations.parameters_of(coefficients) returns"
+            )
 
 
 def intensity(amplitude: Tensor) -> Tensor:

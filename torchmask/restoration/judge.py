@@ -13,7 +13,7 @@ from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.model_error import NO_MODEL_ERROR, LeftOut, ModelError, expected_error, fitted_parameters
 from torchmask.restoration.motion import Setting
 from torchmask.restoration.noise import FrameNoise
-from torchmask.restoration.objective import MyopicObjective
+from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.state import State
 from torchmask.restoration.traits import End, Traits
@@ -77,7 +77,8 @@ class Judge:
         frames = FrameFits(
             chi_square, pixels, state.calibration.transmission, self.noise, _parameters(objective, state)
         )
-        return judge(frames, self.contrast, error, self.tolerance, at_rest=at_rest)
+        blind = Free.OBJECT in objective.free and Free.ABERRATIONS in objective.free and not self.traits.estimated
+        return judge(frames, self.contrast, error, self.tolerance, at_rest=at_rest, alone=blind and len(pixels) == 1)
 
     def compare(self, objective: MyopicObjective, now: Ending, rival: Ending | None) -> Comparison:
         """Compare the present ending with the best of the earlier ones, if there is one.

@@ -32,7 +32,7 @@ from torchmask.restoration.result import RestorationResult
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.solver import Solver
 from torchmask.restoration.starts import Known, tensors_of
-from torchmask.restoration.traits import Refinement, Traits, check_numbers, check_samples
+from torchmask.restoration.traits import Refinement, Traits, check_given, number_of_iterations, number_of_samples
 from torchmask.restoration.variation import TotalVariation
 
 
@@ -104,7 +104,7 @@ class MyopicDeconvolution:
     ValueError
         If a number is out of range, or the grid samples the aperture too coarsely.
     TypeError
-        If the prior is not callable.
+        If the aperture, the grid or a switch is of another type, or the prior is not callable.
 
     Examples
     --------
@@ -145,7 +145,7 @@ class MyopicDeconvolution:
         dtype: torch.dtype = torch.float32,
         device: torch.device | str | None = None,
     ) -> None:
-        check_numbers(readout_noise, max_iterations, tolerance)
+        check_given(aperture, grid, readout_noise, tolerance, aberration_prior)
         if wavelengths is None and weights is not None:
             raise ValueError("weights are given without wavelengths: give both")
         self.many_minima, self.known_r0 = aperture.n_subapertures == 1, r0 is not None
@@ -168,7 +168,7 @@ class MyopicDeconvolution:
         )
         self.refinement: Refinement = Refinement.of(refine_geometry, aperture)
         self.readout_noise, self.background = readout_noise, background
-        self.max_iterations, self.tolerance = max_iterations, tolerance
+        self.max_iterations, self.tolerance = number_of_iterations(max_iterations), tolerance
         self.prior: ObjectPrior = as_prior(TotalVariation() if prior is None else prior)
         self.minimizer: Minimizer = minimizer or ProjectedLBFGS()
         self._model: ExposureModel = self.recipe.turbulent_model()
@@ -255,7 +255,7 @@ class MyopicDeconvolution:
             If noise, border or fringes of the frames contradict `readout_noise`, the field or the mask.
         """
         started = time.perf_counter()
-        check_samples(n_samples)
+        n_samples = number_of_samples(n_samples)
         keep_freed_memory()
         told, stack = self.recipe, self._stack(frames, valid, errors)
         (look := look_at_mask(stack.frames, told.aperture, told.grid, told.band)).warn(stacklevel=2)

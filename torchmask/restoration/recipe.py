@@ -14,6 +14,7 @@ from torchmask.optics.aperture import Aperture
 from torchmask.optics.band import Band
 from torchmask.optics.pixel import PixelResponse
 from torchmask.optics.pupil import sample_holes
+from torchmask.optics.whole import whole_number
 from torchmask.restoration.aberrations import (
     AberrationBasis,
     MakesBasis,
@@ -75,9 +76,8 @@ class ModelRecipe:
         for name, value in (("r0", self.r0), ("outer_scale", self.outer_scale)):
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{name} is {value}: it must be finite and positive, in m")
-        for name, count, least in (("n_modes", self.frame_modes, 1), ("static_modes", self.static_modes, 0)):
-            if not float(count).is_integer() or count < least:
-                raise ValueError(f"{name} is {count}: it must be a whole number of at least {least}")
+        for field, name, least in (("frame_modes", "n_modes", 1), ("static_modes", "static_modes", 0)):
+            object.__setattr__(self, field, whole_number(name, getattr(self, field), least))
         if self.whitened and self.n_modes * self.aperture.n_subapertures == 1:
             raise ValueError(
                 "n_modes is 1: the piston of a single opening does not show, take at least 3 for its tilts"

@@ -181,9 +181,14 @@ def start_from_result(
 
 
 def tensors_of(start: RestorationResult | None) -> tuple[Tensor | None, ...]:
-    """Return all of an earlier result that a restoration takes over; nothing if there is none."""
+    """Return all of an earlier result that a restoration takes over; nothing if there is none.
+
+    Raises TypeError if it is no result.
+    """
     if start is None:
         return ()
+    if not isinstance(start, RestorationResult):
+        raise TypeError(f"start is a {type(start).__name__}: give what an earlier restoration has returned")
     return start.extended_object, start.coefficients, start.motion, start.geometry.matrix
 
 

@@ -6,7 +6,9 @@ import math
 from dataclasses import dataclass
 from enum import Enum
 
+from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture, SparseAperture
+from torchmask.optics.whole import whole_number
 from torchmask.restoration.objective import Free
 from torchmask.restoration.schedule import Schedule
 
@@ -59,8 +61,11 @@ class Refinement(Enum):
     def of(cls, refine: bool | None, aperture: Aperture) -> Refinement:
         """Return the member for a caller's True, False or None; always `OFF` for an aperture without baselines.
 
-        Raises ValueError for True with such an aperture, which does not show its geometry.
+        Raises ValueError for True with such an aperture, which does not show its geometry, and TypeError for anything
+        else than these three.
         """
+        if refine is not None and not isinstance(refine, bool):
+            raise TypeError(f"refine_geometry is {refine!r}: give True, False, or None for if the frames show an error")
         if isinstance(aperture, SparseAperture) and aperture.n_subapertures > 1:
             return cls.IF_SEEN if refine is None else cls.ON if refine else cls.OFF
         if refine:
@@ -114,17 +119,33 @@ class Traits:
         return 2 if self.many_minima else 1
 
 
-def check_numbers(readout_noise: float | None, max_iterations: int, tolerance: float) -> None:
-    """Raise ValueError for a read-out noise [electrons rms], a number of iterations or a tolerance out of range."""
+def check_given(
+    aperture: Aperture, grid: Grid, readout_noise: float | None, tolerance: float, aberration_prior: bool
+) -> None:
+    """Check what a method is given. `readout_noise` is in electrons rms.
+
+    Raises TypeError for an aperture, a grid or a switch of another type, and ValueError for a read-out noise or a
+    tolerance out of range.
+    """
+    for name, value, kind in (("aperture", aperture, Aperture), ("grid", grid, Grid)):
+        if not isinstance(value, kind):
+            raise TypeError(f"{name} is of type {type(value).__name__}: it must be of type {kind.__name__}")
+    if not isinstance(aberration_prior, bool):
+        raise TypeError(f"aberration_prior is {aberration_prior!r}: it must be True or False")
     if readout_noise is not None and not (math.isfinite(readout_noise) and readout_noise >= 0):
         raise ValueError(f"readout_noise is {readout_noise}: it must be finite and at least 0, in electrons rms")
-    if not max_iterations >= 1:
-        raise ValueError(f"max_iterations is {max_iterations}: it must be at least 1")
     if not tolerance >= 0:
         raise ValueError(f"tolerance is {tolerance}: it must be at least 0, a fraction of the cost")
 
 
-def check_samples(n_samples: int) -> None:
-    """Raise ValueError for a number of samples that does not allow standard deviations."""
-    if n_samples < 0 or n_samples == 1:
-        raise ValueError(f"n_samples is {n_samples}: it must be 0, for no standard deviations, or at least 2")
+def number_of_iterations(max_iterations: int) -> int:
+    """Return a maximum number of iterations. Raises ValueError unless it is a whole number of at least 1."""
+    return whole_number("max_iterations", max_iterations)
+
+
+def number_of_samples(n_samples: int) -> int:
+    """Return a number of samples. Raises ValueError for one that does not allow standard deviations."""
+    n_samples = whole_number("n_samples", n_samples, least=0)
+    if n_samples == 1:
+        raise ValueError("n_samples is 1: it must be 0, for no standard deviations, or at least 2")
+    return n_samples

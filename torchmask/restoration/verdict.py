@@ -135,13 +135,16 @@ class FrameFits(NamedTuple):
     parameters: float = math.inf
 
 
-def judge(frames: FrameFits, contrast: float, error: ModelError, tolerance: Tolerance, *, at_rest: bool) -> Verdict:
+def judge(
+    frames: FrameFits, contrast: float, error: ModelError, tolerance: Tolerance, *, at_rest: bool, alone: bool = False
+) -> Verdict:
     """Return the verdict on frames.
 
     `contrast` is the chi-square per pixel of the mean frame against a uniform one; `at_rest` says whether the search
-    ran to its end. Noise gives a frame the chi-square of its own noise level, whose variance is 2 over the degrees of
-    freedom times `unevenness`; what the model lacks adds in proportion to the square of its transmission. Each free
-    parameter takes the noise of one pixel at most, of a bright one where noise is uneven.
+    ran to its end, and `alone` that object and aberrations were restored from a single frame. Noise gives a frame the
+    chi-square of its own noise level, whose variance is 2 over the degrees of freedom times `unevenness`; what the
+    model lacks adds in proportion to the square of its transmission. Each free parameter takes the noise of one pixel
+    at most, of a bright one where noise is uneven.
     """
     chi_square, pixels, transmission, level, unevenness = (
         values.double().cpu() for values in (*frames[:3], *frames.noise)
@@ -165,6 +168,8 @@ def judge(frames: FrameFits, contrast: float, error: ModelError, tolerance: Tole
     else:
         finding = Finding.EXPLAINED if found <= limit else Finding.NOT_EXPLAINED
     check = _what_to_check(finding, len(lost), len(pixels), at_rest)
+    if finding is Finding.EXPLAINED and alone:
+        check = "against other frames: one alone is explained by many objects with aberrations to suit"
     numbers = (found, round(total), error.excess, limit, error.phase)
     return Verdict(finding, *numbers, lost, len(pixels), check, least=least)
 
