@@ -166,6 +166,9 @@ def test_files_that_hold_none_say_why(text, said, tmp_path):
         ({"observing_time": None}, "not both"),
         ({"observing_time": None, "n_frames": 0}, "n_frames is 0"),
         ({"observing_time": None, "n_frames": math.inf}, "n_frames is inf: it must be a whole number"),
+        ({"n_wavelengths": 0}, "n_wavelengths is 0: it must be a whole number from 1 to 32"),
+        ({"n_wavelengths": 2.5}, r"n_wavelengths is 2\.5: it must be a whole number from 1 to 32"),
+        ({"n_wavelengths": 33}, "n_wavelengths is 33: it must be a whole number from 1 to 32"),
         ({"source": Source(magnitude=3.0, system="Vega")}, "known for the filters bessell-U"),
     ],
 )
@@ -228,6 +231,15 @@ def test_vanes_go_from_a_file_to_the_pupil_and_to_the_rules_of_masks(tmp_path):
     on, beside = SparseAperture([[-0.3, 0.3 * math.sqrt(3)]], 0.1, 2.0), SparseAperture([[-0.5, 0.3]], 0.1, 2.0)
     assert [float(zone.margins(on)) < 0 for zone in zones] == [False, True, False]
     assert all(float(zone.margins(beside)) > 0 for zone in zones)
+
+
+def test_whole_numbers_may_be_given_as_floats_and_are_kept_as_ints():
+    counts = {"observing_time": None, "n_frames": 20.0, "n_wavelengths": 3.0, "camera": Camera(n_pixels=64.0)}
+    instrument = make(**counts)
+    kept = instrument.frames, instrument.n_wavelengths, instrument.camera.n_pixels
+    assert kept == (20, 3, 64)
+    assert {type(number) for number in kept} == {int}
+    assert (instrument.grid().shape, len(instrument.band.wavelengths)) == ((64, 64), 3)
 
 
 def test_the_table_says_what_follows():

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchmask.grid import Grid
-from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.otf import OTF
 from torchmask.optics.zernike import ZernikePhase
 from torchmask.planning.bounds import myopic_bound
@@ -96,6 +96,10 @@ def test_it_is_computed_in_float64_where_the_aperture_is():
         assert bound(image=image) == expected
 
 
+def test_whole_numbers_may_be_floats():
+    assert bound(n_frames=4.0, n_modes=3.0) == bound(n_frames=4, n_modes=3)
+
+
 @pytest.mark.parametrize(("diameter", "finer"), [(0.4, 7), (0.3, 9)])
 def test_holes_are_14_samples_wide_unless_told(diameter, finer):
     """Samples lie 2/11 m apart, over the oversampling."""
@@ -117,6 +121,8 @@ def test_finer_samples_change_the_excess_little():
         ({"image": scene() / 0}, "image holds values that are not finite"),
         ({"n_frames": 0}, "n_frames is 0"),
         ({"n_frames": math.inf}, "n_frames is inf"),
+        ({"n_modes": 2.5}, r"n_modes is 2\.5: it must be a whole number of at least 1"),
+        ({"aperture": FullAperture(1.0), "n_modes": 1}, "n_modes is 1: the piston of .* take at least 3 for its tilts"),
         ({"noise_psd": torch.tensor(-1.0)}, "noise_psd holds negative"),
         ({"noise_psd": torch.tensor(0.0)}, "noise_psd is 0 somewhere"),
     ],

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 import json
 import warnings
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+import torchmask.planning.expectation
 import torchmask.planning.plan
 from torchmask.cli.main import main
 from torchmask.design.constraints import KeepOutDisc, KeepOutSegment, check_mask
@@ -48,10 +50,16 @@ def sharp(pupil="mask"):
     return SmearingMap(**axes, exposure_ratio=np.ones((2, 2)), band_ratio=np.ones((2, 2)))
 
 
+def with_maps(patch, **maps):
+    """Put these in the place of the maps that come with the library."""
+    for module in (torchmask.planning.plan, torchmask.planning.expectation):
+        for name, made in maps.items():
+            patch.setattr(module, name, made)
+
+
 def lose_nothing(patch):
     """Take away what blind restorations lose."""
-    patch.setattr(torchmask.planning.plan, "success_map", lossless)
-    patch.setattr(torchmask.planning.plan, "smearing_map", sharp)
+    with_maps(patch, success_map=lossless, smearing_map=sharp)
 
 
 def without_turbulence(patch):
@@ -61,8 +69,9 @@ def without_turbulence(patch):
     def forward(self, aperture):
         return FULL * self.object_psd.mean() if aperture.is_full else of_mask(self, aperture)
 
-    for name in ("instrument_criterion", "instant_criterion"):
-        patch.setattr(torchmask.planning.plan, name, functools.partial(instrument_criterion, turbulence=False))
+    plain = functools.partial(instrument_criterion, turbulence=False)
+    patch.setattr(torchmask.planning.plan, "instrument_criterion", plain)
+    patch.setattr(torchmask.planning.expectation, "instant_criterion", plain)
     patch.setattr(TurbulentMSE, "forward", forward)
 
 
@@ -144,7 +153,7 @@ def test_points_are_the_criterion_under_turbulence(exposures):
 def test_the_floor_is_that_of_the_band_and_blind_errors_grow_above_that_of_narrow_light(monkeypatch):
     """A band of 100 nm reaches further than its middle; what restorations lose was measured in narrow light."""
     costly = BlindOutlook(cost=1.1, success=0.5, low=0.4, high=0.6)
-    monkeypatch.setattr(torchmask.planning.plan, "_blind_outlook", lambda *point: costly)
+    monkeypatch.setattr(torchmask.planning.expectation, "_outlook", lambda *point: costly)
     known = make(**BRIGHT | {"width": 100e-9, "n_wavelengths": 2})
     best = plan_observation(known, aperture=MASK, exposures=(1e-3,), n_frequencies=24).best
     there, area = known.with_exposure(1e-3), float(MASK.area)
@@ -257,8 +266,7 @@ def test_no_point_beyond_what_was_tried_is_the_best(monkeypatch, quick):
     """Without turbulence in the prediction more light always wins, so the widest holes and longest exposures would."""
     tried = SuccessMap((1, 1e6), (1, 1e12), (0.1, 1.0), *np.ones((3, 2, 2, 2)))
     known = SmearingMap((1, 1e12), (0, 2.0), (0, 100), np.ones((2, 2)), np.ones((2, 2)))
-    monkeypatch.setattr(torchmask.planning.plan, "success_map", lambda pupil: tried)
-    monkeypatch.setattr(torchmask.planning.plan, "smearing_map", lambda pupil: known)
+    with_maps(monkeypatch, success_map=lambda pupil: tried, smearing_map=lambda pupil: known)
     instrument, holes = make(), (0.09, 0.15, 0.35)
     tau0 = instrument.seeing.tau0
     exposures = (tau0, 2 * tau0, 9 * tau0)
@@ -290,13 +298,14 @@ def test_no_point_beyond_what_was_tried_is_the_best(monkeypatch, quick):
         beyond = plan_observation(instrument, n_subapertures=(3,), hole_diameters=(0.35,), exposures=(tau0,), **TINY)
     assert beyond.best.is_limit
     assert "At no point of the map were blind restorations tried" in str(beyond)
+    assert "Of blind restorations under such conditions" not in str(beyond)
 
 
 def test_what_blind_restorations_lose_moves_the_best_point(monkeypatch, plan, quick):
     """Holes of more than 0.8 r0 lose a factor of 2 or more: the smaller ones win, though known PSFs favour the wide."""
     cost = np.broadcast_to([1.0, 4.0], (2, 2, 2))
     steep = SuccessMap((1, 1e6), (1, 1e12), (0.6, 1.0), np.full((2, 2, 2), 4), np.full((2, 2, 2), 3), cost)
-    monkeypatch.setattr(torchmask.planning.plan, "success_map", lambda pupil: steep)
+    with_maps(monkeypatch, success_map=lambda pupil: steep)
     with pytest.warns(UserWarning, match="for d/r0 from 0.6 to 1"):
         found = plan_observation(make(), **AXES, **TINY)
     assert found.best_known.hole_diameter == plan.best.hole_diameter == 0.35
@@ -305,7 +314,7 @@ def test_what_blind_restorations_lose_moves_the_best_point(monkeypatch, plan, qu
         grown = choice.relative_mse + (choice.blind.cost**2 - 1) * choice.above_floor
         assert choice.blind_mse == pytest.approx(min(1, grown), rel=1e-12)
     text = str(found)
-    assert "75 % of them (50 to 90 %) stay within 1.3 times" in text
+    assert "Of blind restorations under such conditions 75 % (50 to 90 %) end within 1.3 times" in text
     assert f"the least would be {plan.best.relative_mse:.4g}, with 3 holes of 0.35 m" in text
 
 
@@ -318,18 +327,77 @@ def test_the_map_is_asked_at_the_size_light_and_frames_of_each_point(monkeypatch
 
     monkeypatch.setattr(SuccessMap, "outlook", outlook)
     found = plan_observation(make(), aperture=MASK, exposures=(2e-3, 6e-3), n_frequencies=32)
-    expected = []
+    size, tried = MASK.subaperture_diameter / 0.15, lossless()
     for choice in found.choices:  # photons that would tell as much without sky and 3 electrons of read-out noise
         photons = choice.photons**2 / (choice.photons + 64**2 * (choice.sky + 9))
-        expected.append((MASK.subaperture_diameter / 0.15, pytest.approx(photons, rel=1e-12), choice.frames))
-    assert asked == expected
+        lights = [photons, *(number for number in tried.n_photons if number < photons)]
+        numbers = [choice.frames, *(number for number in tried.n_frames if number < choice.frames)]
+        for light, frames in itertools.product(lights, numbers):
+            assert asked.pop(0) == (size, pytest.approx(light, rel=1e-12), frames)
+    assert not asked
+
+
+@pytest.mark.parametrize("axis", ["n_frames", "n_photons"])
+def test_more_frames_and_more_light_never_cost(axis, monkeypatch, quick):
+    """Although on the map restorations lose four times as much with all of them: some can be left out."""
+    cost = np.ones((2, 2, 2))
+    place = (slice(None),) * ("n_frames", "n_photons").index(axis)
+    cost[(*place, 1)] = 4.0
+    axes = {"n_frames": (5, 20), "n_photons": (1e3, 1e6), "d_over_r0": (0.1, 10)}
+    worse = SuccessMap(**axes, tried=np.ones((2, 2, 2)), succeeded=np.ones((2, 2, 2)), cost=cost)
+    with_maps(monkeypatch, success_map=lambda pupil: worse)
+    quiet = {"site": Site(r0=0.15, wind=10.0), "camera": Camera(n_pixels=64), "observing_time": None}
+
+    def expected(photons, frames):
+        rate = photons / (0.5 * float(MASK.area) * 4e-3)
+        known = make(**quiet, source=Source(photon_rate=rate), n_frames=frames)
+        return plan_observation(known, aperture=MASK, exposures=(4e-3,), n_frequencies=32).best
+
+    if axis == "n_frames":
+        few, some, many = (expected(1e4, frames) for frames in (5, 10, 20))
+    else:
+        few, some, many = (expected(photons, 10) for photons in (1e3, 3e4, 1e6))
+    assert few.relative_mse > some.relative_mse > many.relative_mse
+    assert few.blind_mse == pytest.approx(few.relative_mse, rel=1e-9)
+    rounding = 1 + 1e-12
+    assert few.blind_mse * rounding >= some.blind_mse
+    assert some.blind_mse * rounding >= many.blind_mse > many.relative_mse
+    if axis == "n_frames":  # four times the amplitude of 20 frames is more than that of five
+        assert many.blind_mse == pytest.approx(few.blind_mse, rel=1e-9)
+
+
+def test_frames_that_repeat_themselves_are_told(quick):
+    """A wind of 10 m/s takes 9.13 ms to cross a hole of 0.0913 m; frames follow each other every 3 or 23 ms."""
+    for readout, said in ((1e-3, True), (21e-3, False)):
+        known = make(camera=Camera(n_pixels=64, readout_time=readout), n_frames=20, observing_time=None)
+        found = plan_observation(known, aperture=MASK, exposures=(2e-3,), n_frequencies=32)
+        differ = min(20, 1 + 19 * (readout + 2e-3) * 10 / MASK.subaperture_diameter)
+        assert found.best_instrument.frames_that_differ(MASK.subaperture_diameter) == pytest.approx(differ, rel=1e-12)
+        line = f"only about {differ:.0f} of the 20 frames show turbulence of their own"
+        assert (line in str(found)) == said
+
+
+def test_an_image_of_nothing_is_called_that(quick, tmp_path, capsys):
+    """And no mask is to be designed for it."""
+    known = make(source=Source(photon_rate=1e-3), site=Site(r0=0.15, wind=10.0))
+    with warnings.catch_warnings(action="ignore"):  # of photons beyond those tried
+        found = plan_observation(known, aperture=MASK, exposures=(2e-3,), n_frequencies=32)
+        known.save(tmp_path / "dark.json")
+        again = "--n-subapertures 3 --hole-diameters 0.15 --exposures 0.002 --n-frequencies 32 --budget 64"
+        command = f"plan --instrument {tmp_path}/dark.json {again} --out {tmp_path}/plan"
+        assert main(command.split()) == 0
+    assert not found.shows_something
+    assert "Such an image shows nothing of the target" in str(found)
+    told = capsys.readouterr().out
+    assert "Such an image shows nothing of the target" in " ".join(told.split())
+    assert "design the final mask" not in told
 
 
 def test_less_light_than_was_tried_loses_the_share_that_the_linear_estimate_loses(monkeypatch, quick):
     """Down to the least light tried errors are a quarter of those predicted; from no light nothing is expected."""
     axes = {"n_photons": (1e5, 1e12), "exposures": (0, 100), "spreads": (0, 100)}
     halves = SmearingMap(**axes, exposure_ratio=np.full((2, 2), 0.5), band_ratio=np.full((2, 2), 0.5))
-    monkeypatch.setattr(torchmask.planning.plan, "smearing_map", lambda pupil: halves)
+    with_maps(monkeypatch, smearing_map=lambda pupil: halves)
     quiet = {"site": Site(r0=0.15, wind=10.0), "camera": Camera(n_pixels=64), "observing_time": None, "n_frames": 10}
 
     def plan(photons, frames=10, **changes):
@@ -376,7 +444,7 @@ def test_exposure_and_width_are_best_where_light_balances_what_their_smearing_co
     steps, spreads = 1.02 ** np.arange(5.0), phase_spread(0.03, 1 / 0.15) * np.arange(5.0)
     axes = {"n_photons": (1, 1e12), "exposures": (0, 1, 2, 3, 4), "spreads": spreads}
     tables = {"exposure_ratio": np.tile(steps, (2, 1)), "band_ratio": np.tile(steps, (2, 1))}
-    monkeypatch.setattr(torchmask.planning.plan, "smearing_map", lambda pupil: SmearingMap(**axes, **tables))
+    monkeypatch.setattr(torchmask.planning.expectation, "smearing_map", lambda pupil: SmearingMap(**axes, **tables))
     known = make(source=Source(photon_rate=3e9), n_wavelengths=2, n_frames=20, observing_time=None)
     tau0 = 0.314 * 0.15 / 10  # r0 / wind
     times, widths = [factor * tau0 for factor in (0.05, 0.2, 0.8, 3.2)], [5e-9, 20e-9, 60e-9]
@@ -456,6 +524,12 @@ def test_bands_are_compared_on_the_same_pixels(quick):
 def test_maps_without_a_point_are_refused(settings, said):
     with pytest.raises(ValueError, match=said):
         plan_observation(make(), **settings, **TINY)
+
+
+def test_a_population_of_masks_is_no_aperture_of_a_plan():
+    both = SparseAperture(MASK.centers.expand(2, -1, -1), MASK.subaperture_diameter, 1.0)
+    with pytest.raises(ValueError, match=r"aperture has centers of shape \(2, 6, 2\): one mask is needed"):
+        plan_observation(make(), aperture=both, **TINY)
 
 
 def test_the_picture_shows_the_map_and_the_exposures(plan):

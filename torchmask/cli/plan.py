@@ -106,9 +106,11 @@ def run(options: Options) -> None:
             save_json(output.directory / "mask.json", plan.mask, best.mean_wavelength)
             output.logger.figure("plan_mask", mask_figure(plan.mask))
         told = str(plan).split("\n\n", 1)[0].splitlines()
-        output.summary.extend(in_options(line, options) for line in (*told, *plan.left_out))
+        output.summary.extend(
+            in_options(line, options) for line in (*told, *(f"left out: {reason}" for reason in plan.left_out))
+        )
         output.summary.append(table)
-        if options.mask is None:
+        if options.mask is None and plan.shows_something:
             output.summary.append(f"design the final mask with: {_design_command(plan.mask, output.directory)}")
 
 

@@ -15,8 +15,9 @@ from torchmask.grid import ARCSEC, Grid
 from torchmask.instrument.parts import Camera, Site, Source, Telescope
 from torchmask.io import extra, from_json, read_json, to_json, write_json
 from torchmask.numbers import require, require_wavelength, require_within
-from torchmask.optics.band import Band
+from torchmask.optics.band import MOST_WAVELENGTHS, Band
 from torchmask.optics.passband import Passband
+from torchmask.optics.whole import whole_number
 from torchmask.spectra import NoisePSD, PowerLawPSD
 
 _FORMAT = "torchmask instrument, version 1"
@@ -92,8 +93,10 @@ class Instrument:
             raise ValueError("wavelength is missing: give it in m, such as 550e-9")
         if (self.observing_time is None) == (self.n_frames is None):
             raise ValueError("give observing_time [s] or n_frames, and not both")
-        if self.n_frames is not None and (not float(self.n_frames).is_integer() or self.n_frames < 1):
-            raise ValueError(f"n_frames is {self.n_frames}: it must be a whole number of at least 1")
+        if self.n_frames is not None:
+            object.__setattr__(self, "n_frames", whole_number("n_frames", self.n_frames))
+        n_wavelengths = whole_number("n_wavelengths", self.n_wavelengths, most=MOST_WAVELENGTHS)
+        object.__setattr__(self, "n_wavelengths", n_wavelengths)
         self._check_time()
         self._check_band()
 
@@ -154,6 +157,10 @@ class Instrument:
             assert self.n_frames is not None
             return self.n_frames
         return math.floor(self.observing_time / self._cadence * (1 + 1e-9))
+
+    def frames_that_differ(self, diameter: float) -> float:
+        """Return how many frames show turbulence of their own, as the wind crosses an opening of a `diameter` [m]."""
+        return min(self.frames, 1 + (self.frames - 1) * self._cadence * self.site.wind / diameter)
 
     @property
     def pixel_scale(self) -> float:

@@ -10,6 +10,7 @@ from torchmask.numbers import require, require_r0, require_within
 from torchmask.optics.aperture import FullAperture
 from torchmask.optics.detector import Detector
 from torchmask.optics.pixel import PixelResponse, square_pixel
+from torchmask.optics.whole import whole_number
 
 System = Literal["AB", "Vega"]
 
@@ -167,8 +168,7 @@ class Camera:
     """Time from the end of one exposure to the start of the next [s]."""
 
     def __post_init__(self) -> None:
-        if not float(self.n_pixels).is_integer() or self.n_pixels < 2:
-            raise ValueError(f"camera.n_pixels is {self.n_pixels}: it must be a whole number of at least 2")
+        object.__setattr__(self, "n_pixels", whole_number("camera.n_pixels", self.n_pixels, least=2))
         require("camera.pixel_scale", self.pixel_scale, ", in arcsec")
         require("camera.readout_noise", self.readout_noise, ", in electrons rms", zero=True)
         require("camera.readout_time", self.readout_time, ", in s", zero=True)

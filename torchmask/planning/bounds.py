@@ -12,6 +12,7 @@ from torchmask.design.criterion import wiener_mse
 from torchmask.grid import Grid
 from torchmask.optics.otf import OTF
 from torchmask.optics.pupil import Aperture
+from torchmask.optics.whole import whole_number
 from torchmask.optics.zernike import ZernikePhase
 from torchmask.restoration.aberrations import AberrationBasis, turbulent_basis
 from torchmask.spectra import PSD, evaluate_psd
@@ -92,8 +93,8 @@ def myopic_bound(
     Raises
     ------
     ValueError
-        If the image does not have the grid's shape or is not finite, `n_frames` is not a whole number of at least 1, or
-        a PSD cannot be one; that of the noise must be positive.
+        If the image does not have the grid's shape or is not finite, `n_frames` or `n_modes` is not a whole number of
+        at least 1, a single opening has the piston alone, or a PSD cannot be one; that of the noise must be positive.
 
     Examples
     --------
@@ -110,8 +111,12 @@ def myopic_bound(
         raise ValueError(f"image has shape {tuple(image.shape)}: it must be that of the grid, {grid.shape}")
     if not bool(torch.isfinite(image).all()):
         raise ValueError("image holds values that are not finite: replace them")
-    if not float(n_frames).is_integer() or n_frames < 1:
-        raise ValueError(f"n_frames is {n_frames}: it must be a whole number of at least 1")
+    n_frames, n_modes = whole_number("n_frames", n_frames), whole_number("n_modes", n_modes)
+    if aperture.is_full and n_modes == 1:
+        raise ValueError(
+            "n_modes is 1: the piston of a single opening does not show, so nothing would be unknown; take at least 3 "
+            "for its tilts, or wiener_mse for known aberrations"
+        )
     aperture = aperture.still().double()  # small differences of large sums: float32 would not do
     device = aperture.centers.device
     finer = _oversampling(aperture, grid) if oversampling is None else oversampling

@@ -9,16 +9,17 @@ from collections.abc import Sequence
 from typing import Any
 
 from torchmask.design.constraint_base import Constraint, Infeasible
-from torchmask.design.observed import change_light, instant_criterion, instrument_criterion
+from torchmask.design.observed import change_light, instrument_criterion
 from torchmask.design.rules import MaskRules
 from torchmask.design.search import search_mask
 from torchmask.instrument.instrument import Instrument
 from torchmask.optics.packing import largest_fill_factor
 from torchmask.optics.pupil import Aperture
 from torchmask.planning.axes import at_exposures, bands_of, or_default, positive, sampled, whole
+from torchmask.planning.expectation import expect_blind, kind_of
 from torchmask.planning.result import AXES, Choice, ObservationPlan
 from torchmask.planning.smearing import phase_spread, smearing_map
-from torchmask.planning.success import BlindOutlook, Pupil, success_map
+from torchmask.planning.success import Pupil, success_map
 from torchmask.record import Callback, Record
 
 _HOLES = (0.5, 0.8, 1.2)  # in r0: wider holes hold aberrations that a blind restoration has to find
@@ -78,8 +79,8 @@ def plan_observation(
     Raises
     ------
     ValueError
-        For an axis that is empty or holds what cannot be, pixels that undersample the image at the shortest wavelength
-        of every band, and if no point can be built: says why.
+        For an axis that is empty or holds what cannot be, an `aperture` that is a population, pixels that undersample
+        the image at the shortest wavelength of every band, and if no point can be built: says why.
 
     Warns
     -----
@@ -105,6 +106,11 @@ def plan_observation(
     >>> plan.best.frames
     7
     """
+    if aperture is not None and aperture.centers.ndim != 2:
+        raise ValueError(
+            f"aperture has centers of shape {tuple(aperture.centers.shape)}: one mask is needed, (n_subapertures, 2); "
+            "plan each of a population by itself"
+        )
     lengths = positive("exposures", or_default(exposures, _EXPOSURES, instrument.seeing.tau0), "s")
     left_out: list[str] = []
     bands = [instrument] if widths is None else bands_of(instrument, positive("widths", tuple(widths), "m"))
@@ -147,7 +153,7 @@ def _predict(
     exposures and bands of a full pupil take minutes each.
     """
     choices = tuple(_measure(exposed, masks, n_frequencies, callback, beside))
-    kind = _kind(next(iter(masks.values())))
+    kind = kind_of(next(iter(masks.values())))
     return ObservationPlan(instrument, choices, masks, tried_up_to=_tried_up_to(instrument, kind))
 
 
@@ -195,12 +201,11 @@ def _measure(
 ) -> list[Choice]:
     """Return the predicted error at every point; masks with holes of one size share what is known of the turbulence."""
     choices, n_steps = [], len(exposed) * len(masks)
-    instants = _predict_instants(exposed, masks, n_frequencies)
+    expected = expect_blind(exposed, masks, n_frequencies)
     for place, instrument in enumerate(exposed):
         criterion = None
         for (n, hole), mask in sorted(masks.items(), key=lambda item: item[0][1]):
-            area = float(mask.area)
-            error, _, floor = instants[n, hole, place]
+            area, (blind_error, blind, error, floor) = float(mask.area), expected[n, hole, place]
             if not beside:
                 criterion = criterion or instrument_criterion(instrument, area, n_frequencies)
                 change_light(criterion, instrument, area)
@@ -208,58 +213,9 @@ def _measure(
                 floor = criterion.relative_floor(instrument.telescope.diameter)
             photons, sky = instrument.photons(area), instrument.sky(area)
             light = instrument.exposure, instrument.width, instrument.frames, photons, sky
-            blind = _blind_outlook(instrument, mask)
-            expected = _expected_error(blind, *instants[n, hole, place])
-            choices.append(Choice(n, hole, *light, error, error - floor, expected, blind))
+            choices.append(Choice(n, hole, *light, error, error - floor, blind_error, blind))
             _tell(callback, "plan/full" if beside else "plan/map", len(choices), n_steps, error)
     return sorted(choices, key=lambda choice: tuple(getattr(choice, name) for name in AXES))
-
-
-def _predict_instants(
-    exposed: Sequence[Instrument], masks: dict[tuple[int, float], Aperture], n_frequencies: int
-) -> dict[tuple[int, float, int], tuple[float, float, float]]:
-    """Return the error predicted for instants in narrow light with the photons of each exposure, for each mask.
-
-    What is known of the turbulence then depends on the holes alone. The second error is that in the least light in
-    which restorations were tried, if there is less: it is that of as much less noise. The third is the floor of both.
-    """
-    errors, criterion = {}, None
-    for (n, hole), mask in sorted(masks.items(), key=lambda item: item[0][1]):
-        for place, instrument in enumerate(exposed):
-            area = float(mask.area)
-            criterion = criterion or instant_criterion(instrument, area, n_frequencies)
-            change_light(criterion, instrument, area)
-            error = tried = float(criterion.relative(mask))
-            if (share := instrument.equivalent_photons(area) / smearing_map(_kind(mask)).n_photons[0]) < 1:
-                criterion.load_state_dict(criterion.state_dict() | {"noise_psd": share * criterion.noise_psd})
-                tried = float(criterion.relative(mask))
-            errors[n, hole, place] = error, tried, criterion.relative_floor(instrument.telescope.diameter)
-    return errors
-
-
-def _expected_error(blind: BlindOutlook, error: float, tried: float, floor: float) -> float:
-    """Return the error expected of a blind restoration, where `error` is predicted for instants in narrow light.
-
-    `tried` is predicted for the least light in which restorations were tried, or is `error` where there is more, and
-    `floor` is what of both no mask can avoid. In less light a restoration is taken to lose the same share of the image
-    as the linear estimate does, so that from no light nothing is expected.
-    """
-    return 1 - (1 - blind.mse(tried, tried - floor)) * (1 - error) / (1 - tried)
-
-
-def _kind(aperture: Aperture) -> Pupil:
-    """Return of which kind of pupil the restorations were that tell about an aperture."""
-    return "full" if aperture.is_full else "mask"
-
-
-def _blind_outlook(instrument: Instrument, aperture: Aperture) -> BlindOutlook:
-    """Return what was measured of restorations that have to find the aberrations behind an aperture."""
-    kind, r0, diameter = _kind(aperture), instrument.site.r0, instrument.telescope.diameter
-    photons = instrument.equivalent_photons(float(aperture.area))
-    instants = success_map(kind).outlook(aperture.subaperture_diameter / r0, photons, instrument.frames)
-    spread = phase_spread(instrument.band.relative_width, diameter / r0)
-    exposure = instrument.exposure / instrument.seeing.tau0
-    return smearing_map(kind).outlook(instants, n_photons=photons, exposure=exposure, spread=spread)
 
 
 def _tried_up_to(instrument: Instrument, kind: Pupil) -> dict[str, float]:

@@ -13,6 +13,14 @@ from torchmask.instrument.instrument import Instrument
 from torchmask.optics.pupil import Aperture
 from torchmask.planning.success import SUCCESS, BlindOutlook
 
+_EMPTY = 0.99  # expected error from which an image shows nothing
+_FEW_REPEAT = 0.7  # of the frames that show turbulence of their own: from here on the others are not worth a word
+_LIMIT = (
+    "At no point of the map were blind restorations tried: each of their errors is a lower limit, that of the nearest "
+    "conditions which were. Restore simulated frames before you trust this plan."
+)
+_NOTHING = "Such an image shows nothing of the target: it needs more light, by time, band, holes or a brighter target."
+
 AXES = ("n_subapertures", "hole_diameter", "exposure", "width")
 
 
@@ -24,7 +32,8 @@ class Choice:
     electrons per frame (of the sky, per pixel)
     relative_mse, above_floor : predicted for a linear estimate that knows the PSFs, and that less what no mask of this
         diameter can avoid
-    blind_mse : expected where the aberrations have to be found, at least so much where that was not tried
+    blind_mse : expected where the aberrations have to be found, at least so much where that was not tried, and no more
+        than with frames or light left out
     blind : what was measured of such restorations
     """
 
@@ -101,6 +110,11 @@ class ObservationPlan:
     def mask(self) -> Aperture:
         """The aperture of the best point."""
         return self.masks[self.best.n_subapertures, self.best.hole_diameter]
+
+    @property
+    def shows_something(self) -> bool:
+        """Whether the best image is expected to show anything of the target."""
+        return self.best.blind_mse <= _EMPTY
 
     def axis(self, name: str) -> list[Choice]:
         """Return the points that differ from the best one in `name` alone, in order."""
@@ -180,8 +194,9 @@ class ObservationPlan:
             f"{best.relative_mse - best.above_floor:.4g}, with {self._point(best)} "
             f"({best.hole_diameter / told.site.r0:.2g} r0, {best.exposure / told.seeing.tau0:.2g} tau0){band} and "
             f"{best.photons:.4g} photons in each.",
-            *_limit_line(best),
-            _blind_line(best.blind),
+            *([_LIMIT] if best.is_limit else [_blind_line(best.blind)]),
+            *([] if self.shows_something else [_NOTHING]),
+            *self._repeating_line(),
             *self._full_pupil_line(),
             f"Predicted for a linear estimate that knows the PSFs: {best.relative_mse:.4g}; the least would be "
             f"{self.best_known.relative_mse:.4g}, with {self._point(self.best_known)}.",
@@ -192,7 +207,9 @@ class ObservationPlan:
             "|" + "---|" * len(_HEADINGS),
             *("| " + " | ".join(_cells(choice)) + " |" for choice in self.choices),
         ]
-        return "\n".join([*lines, *(["", *(f"- {reason}" for reason in self.left_out)] if self.left_out else [])])
+        return "\n".join(
+            [*lines, *(["", *(f"- left out: {reason}" for reason in self.left_out)] if self.left_out else [])]
+        )
 
     def _point(self, choice: Choice) -> str:
         """Return the pupil of a point, and its frames, in words."""
@@ -200,6 +217,19 @@ class ObservationPlan:
         if self.masks[choice.n_subapertures, choice.hole_diameter].is_full:
             pupil = f"the full pupil of {choice.hole_diameter:.4g} m"
         return f"{pupil}, {choice.frames} frames of {1e3 * choice.exposure:.4g} ms"
+
+    def _repeating_line(self) -> list[str]:
+        """Return a sentence on frames that show the same turbulence, where many do."""
+        best, told = self.best, self.best_instrument
+        differ = told.frames_that_differ(best.hole_diameter)
+        if differ > _FEW_REPEAT * best.frames:
+            return []
+        crossing = 1e3 * best.hole_diameter / told.site.wind
+        return [
+            f"The wind takes {crossing:.3g} ms to cross {best.hole_diameter:.4g} m, so only about {differ:.0f} of the "
+            f"{best.frames} frames show turbulence of their own; the prediction counts them all. Frames that are "
+            "further apart in time show more."
+        ]
 
     def _full_pupil_line(self) -> list[str]:
         """Return a sentence on what the telescope attains without a mask."""
@@ -215,21 +245,12 @@ class ObservationPlan:
         return [f"Without a mask the least is {least}, with {self.full_pupil._point(full)}{band}{why}."]
 
 
-def _limit_line(best: Choice) -> list[str]:
-    if not best.is_limit:
-        return []
-    return [
-        "At no point of the map were blind restorations tried: each of their errors is a lower limit, that of the "
-        "nearest conditions which were. Restore simulated frames before you trust this plan."
-    ]
-
-
 def _blind_line(blind: BlindOutlook) -> str:
     return (
-        f"There blind restorations of instants in narrow light score {blind.cost:.3g} times as high as with known PSFs "
-        f"(median), and {100 * blind.success:.0f} % of them ({100 * blind.low:.0f} to {100 * blind.high:.0f} %) stay "
-        f"within {SUCCESS:g} times. With this light, exposure and band restored scores are another "
-        f"{blind.restored:.3g} times those that are predicted for a linear estimate of such instants."
+        f"Of blind restorations under such conditions {100 * blind.success:.0f} % ({100 * blind.low:.0f} to "
+        f"{100 * blind.high:.0f} %) end within {SUCCESS:g} times the score, an error in amplitude, that they have with "
+        f"known PSFs; the median is {blind.cost:.3g} times. With known PSFs, at this exposure and in this band, scores "
+        f"are {blind.restored:.3g} times those predicted for a linear estimate of instants in narrow light."
     )
 
 
