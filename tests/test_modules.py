@@ -55,8 +55,12 @@ def criterion(n_photons=1e7):
     return AsymptoticMSE(GRID, PowerLawPSD(1.5, n_photons), NoisePSD(n_photons), n_frames=20)
 
 
-def turbulent_criterion(n_photons=1e7):
-    return TurbulentMSE(GRID, PowerLawPSD(1.5, n_photons), NoisePSD(n_photons), n_frames=20, r0=0.2)
+def turbulent_criterion(n_photons=1e7, **light):
+    return TurbulentMSE(GRID, PowerLawPSD(1.5, n_photons), NoisePSD(n_photons), n_frames=20, r0=0.2, **light)
+
+
+def wide_criterion(n_photons=1e7):
+    return turbulent_criterion(n_photons, wavelengths=(550e-9, 600e-9))
 
 
 def scored(module: AsymptoticMSE, kind: Kind) -> Tensor:
@@ -136,6 +140,7 @@ MODULES: dict[str, Entry] = {
     "OTF": Entry(lambda: OTF(mask(), GRID), blurred, lambda: OTF(moved(), GRID)),
     "criterion": Entry(criterion, scored, lambda: criterion(1e6)),
     "criterion under turbulence": Entry(turbulent_criterion, scored, lambda: turbulent_criterion(1e6)),
+    "criterion of a wide band": Entry(wide_criterion, scored, lambda: wide_criterion(1e6)),
     "detector": Entry(
         lambda: Detector(1.5),
         lambda module, kind: module(1e3 * random(8, 8, **kind), seeded()),

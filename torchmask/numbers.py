@@ -58,3 +58,20 @@ def require_r0(name: str, r0: float | None) -> None:
     is not of this range; `TurbulencePhase` takes any.
     """
     require_within(name, r0, 1e-3, 20.0, " m", "visible light along the ground to 40 micrometres on the best nights")
+
+
+def whole_number(name: str, value: float, least: int = 1, most: float = math.inf, note: str = "") -> int:
+    """Return a count as an int; floats without a fraction pass, as arithmetic makes them.
+
+    Raises ValueError unless it is a whole number from `least` to `most`; a note ends the message.
+
+    >>> whole_number("n_frames", 20.0)
+    20
+    >>> whole_number("n_frames", 2.5)
+    Traceback (most recent call last):
+    ValueError: n_frames is 2.5: it must be a whole number of at least 1
+    """
+    if float(value).is_integer() and least <= value <= most:
+        return int(value)
+    among = f"of at least {least}" if math.isinf(most) else f"from {least} to {most:g}"
+    raise ValueError(f"{name} is {value}: it must be a whole number {among}{note}")

@@ -180,6 +180,13 @@ def test_unknown_profiles_are_refused_with_a_list():
         named_layers("hv99")
 
 
+def test_arrays_and_lists_are_the_same_layers():
+    heights, strengths, winds = [0.0, 1e3], [1e-13, 2e-13], [(1.0, 0.0), (0.0, 2.0)]
+    made = Layers(np.array(heights), np.array(strengths), np.array(winds))
+    assert made == Layers(heights, strengths, winds)
+    assert Layers(heights, strengths, np.zeros((0, 2))) == Layers(heights, strengths)
+
+
 @pytest.mark.parametrize(
     ("values", "message"),
     [
@@ -206,7 +213,9 @@ def test_bad_arguments_are_refused():
         layers.at_airmass(0.9)
     with pytest.raises(ValueError, match="n_layers is 0"):
         named_layers("hv57", 0)
-    with pytest.raises(ValueError, match="r0 is 0"):
+    with pytest.raises(ValueError, match=r"r0 is 0\.0: it must be finite and positive, in m"):
         Layers.from_fractions(0.0, WAVELENGTH, [1.0], [1.0])
+    with pytest.raises(ValueError, match=r"wavelength is -1: it must be finite and positive, in m"):
+        Layers.from_fractions(0.1, -1, [1.0], [1.0])
     with pytest.raises(ValueError, match="sum of fractions is 0"):
         Layers.from_fractions(0.1, WAVELENGTH, [1.0], [0.0])

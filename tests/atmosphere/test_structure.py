@@ -9,6 +9,7 @@ from torchmask.atmosphere.structure import StructureFunction
 from torchmask.atmosphere.von_karman import STRUCTURE_CONSTANT, von_karman_structure_function
 
 DISTANCE = torch.logspace(-5, 1.4, 500, dtype=torch.float64)
+PLACES = torch.tensor([[0.3, -0.1], [0.02, 0.0], [7.0, 1.0]], dtype=torch.float64)
 
 
 @pytest.mark.parametrize("outer_scale", [0.5, 5.0, 100.0])
@@ -29,6 +30,18 @@ def test_displacements_beyond_the_reach_are_taken_as_the_reach():
     structure = StructureFunction(0.1, 5.0, reach=1.0)
     far, edge = structure(torch.tensor([[30.0, 0.0], [1.0, 0.0]], dtype=torch.float64))
     assert far == pytest.approx(float(edge), rel=1e-12)
+
+
+def test_without_outer_scale_the_reach_changes_nothing():
+    assert torch.equal(StructureFunction(0.1, reach=1.0)(PLACES), StructureFunction(0.1)(PLACES))
+
+
+@pytest.mark.parametrize("outer_scale", [2.0, math.inf])
+def test_coordinates_that_broadcast_are_those_of_the_plane(outer_scale):
+    structure, (x, y) = StructureFunction(0.1, outer_scale), PLACES.unbind(-1)
+    expected = structure(torch.stack(torch.meshgrid(x, y, indexing="ij"), -1))
+    assert torch.equal(structure.at(x[:, None], y), expected)
+    assert torch.equal(structure.at(x[:1], y), expected[0])
 
 
 @pytest.mark.parametrize("outer_scale", [2.0, math.inf])

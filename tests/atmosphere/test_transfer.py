@@ -152,3 +152,16 @@ def test_hexagons_annuli_and_zero_frequency():
 def test_a_population_is_refused():
     with pytest.raises(ValueError, match="one mask is needed"):
         mean_square_otf(SparseAperture(torch.zeros(2, 1, 2), 0.2, 1.0), NYQUIST, torch.zeros(1, 2), Seeing(0.1))
+
+
+@pytest.mark.parametrize("shape", ["disc", "square"])
+@pytest.mark.parametrize("motion", [{}, {"exposure": 5e-3, "wind": 10.0}, {"exposure": 5e-3, "wind": (6.0, 8.0)}])
+def test_it_is_made_where_the_frequencies_are_whatever_the_default_device(shape, motion):
+    """In a wide band too: every array on the way is made on the processor."""
+    mask = SparseAperture([[-0.2, 0.0], [0.2, 0.1]], 0.3, 1.0, shape)
+    nu = torch.tensor([[0.02, 0.01], [0.2, 0.05]], dtype=torch.float64)
+    known = mask, NYQUIST, nu, Seeing(0.3, 10.0, **motion), Band.top_hat(550e-9, 55e-9, 2)
+    expected = mean_square_otf(*known)
+    assert bool((expected > 0).all())
+    with torch.device("meta"):
+        assert torch.equal(mean_square_otf(*known), expected)

@@ -1,5 +1,6 @@
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -274,3 +275,19 @@ def test_flow_and_counts_are_checked():
         phase_screens((8, 0), 0.1, 0.1, 20.0, 2)
     with pytest.raises(TypeError, match="float16"):
         phase_screens((8, 8), 0.1, 0.1, 20.0, 2, dtype=torch.float16)
+
+
+def test_a_step_may_be_a_number_of_numpy_or_a_tensor():
+    expected = phase_screens((8, 9), (0.25, 0.25), 0.15, 20.0, 1, seeded())
+    for step in (0.25, np.float32(0.25), torch.tensor(0.25), [0.25, 0.25]):  # which float32 holds exactly
+        assert torch.equal(phase_screens((8, 9), step, 0.15, 20.0, 1, seeded()), expected)
+    assert torch.equal(phase_screens((8.0, 9.0), 0.25, 0.15, 20.0, 1.0, seeded()), expected)
+    with pytest.raises(ValueError, match=r"step is \(0\.1, 0\.1, 0\.1\): .* in m, one number or two \(dy, dx\)"):
+        phase_screens((8, 9), (0.1, 0.1, 0.1), 0.15, 20.0, 1)
+
+
+@pytest.mark.parametrize("shape", [(3,), (0, 2), (2, 3), (1, 2, 2)])
+def test_a_flow_has_one_displacement_for_each_frame(shape):
+    told = str(shape).replace("(", r"\(").replace(")", r"\)")
+    with pytest.raises(ValueError, match=rf"displacements has shape {told}: it must be \(n_frames, 2\), .* in m"):
+        frozen_flow((8, 9), 0.1, 0.15, 20.0, torch.zeros(shape))

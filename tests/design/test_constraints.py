@@ -20,6 +20,8 @@ from torchmask.design.constraints import (
     NoOverlap,
     check_mask,
 )
+from torchmask.design.rules import MaskRules
+from torchmask.design.space import DesignSpace
 from torchmask.optics.aperture import SparseAperture
 
 INEQUALITIES = [
@@ -229,6 +231,23 @@ def test_check_names_the_rule_and_the_shortfall():
     with pytest.raises(ValueError, match="KeepOutDisc"):
         check_mask(mask([[0.0, 0.0], [0.3, 0.0]]), constraints=[KeepOutDisc(0.1)])
     check_mask(mask([[0.0, 0.0], [0.0999, 0.0]]), tolerance=1e-3)
+
+
+def test_a_population_of_no_masks_breaks_no_rule():
+    check_mask(mask(torch.zeros(0, 3, 2)), constraints=[MinimumGap(0.1), KeepOutDisc(0.2), NFoldSymmetry(3)])
+    for worst in (0, 1):  # and of others the worst is told, wherever it stands
+        masks = torch.tensor([[[0.0, 0.3], [0.0, -0.3]]]).repeat(2, 1, 1)
+        masks[worst, 0, 0] = 0.2
+        with pytest.raises(ValueError, match=r"FixedHoles.* is broken by 0\.2 m"):
+            check_mask(mask(masks), constraints=[FixedHoles([(0.0, 0.3)])])
+
+
+@pytest.mark.parametrize("name", ["min_gap", "rim_margin", "central_obstruction"])
+@pytest.mark.parametrize("make", [lambda **rules: MaskRules(**rules).constraints(), DesignSpace])
+def test_rules_given_as_numbers_are_refused_by_their_own_name(name, make):
+    for value in (-0.1, math.nan):
+        with pytest.raises(ValueError, match=f"^{name} is {value}: it must be finite and at least 0, in m$"):
+            make(**{name: value})
 
 
 def test_subspace_moves_a_hole_and_all_that_is_tied_to_it():

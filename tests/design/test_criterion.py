@@ -561,3 +561,14 @@ def test_works_on_the_device_of_the_centres(shape: str) -> None:
     assert (value.device.type, value.shape) == ("meta", (3,))
     assert mask.centers.grad is not None
     assert mask.centers.grad.device.type == "meta"
+
+
+def test_a_first_call_under_another_default_device_makes_nothing_there():
+    """Of a geometry that no other test has, as its indices are kept."""
+    criterion = criterion_of(grid_of(22))
+    for shape in ("disc", "hexagon", "square"):
+        mask = SparseAperture([[-0.2, 0.1], [0.2, 0.0]], 0.1234, 1.0, shape)
+        with torch.device("meta"):
+            value = criterion(mask)
+        overlap.cached_plan.cache_clear()
+        assert torch.equal(value, criterion(mask))

@@ -144,6 +144,11 @@ def test_populations_have_a_term_for_each_mask(criterion, dtype):
     torch.testing.assert_close(found[:, 0], torch.stack(alone), rtol=1e-5, atol=0)
 
 
+@pytest.mark.parametrize("criterion", [AsymptoticMSE(GRID, *PSDS, 10), TurbulentMSE(GRID, *PSDS, 10, r0=0.2)])
+def test_a_population_of_no_masks_has_no_terms(criterion):
+    assert criterion.jensen_term(SparseAperture(torch.zeros(2, 0, 3, 2), 0.2, 1.0)).shape == (2, 0)
+
+
 def test_what_is_no_mask_is_refused():
     with pytest.raises(ValueError, match="full pupil"):
         AsymptoticMSE(GRID, *PSDS, 10).jensen_term(FullAperture(1.0))

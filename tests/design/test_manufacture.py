@@ -175,7 +175,9 @@ def test_json_with_wrong_content_is_refused(tmp_path, change, message):
 
 
 def test_maps_too_coarse_for_the_holes_are_refused(golay6):
-    with pytest.raises(ValueError, match="at least 15 are needed") as error:
+    with pytest.raises(
+        ValueError, match="n_pixels is 10: it must be a whole number of at least 15 for a hole"
+    ) as error:
         amplitude_map(golay6, 10)
     amplitude_map(golay6, int(str(error.value).split("at least ")[1].split()[0]))
 

@@ -9,7 +9,15 @@ from scipy.optimize import linear_sum_assignment
 from torch import nn
 
 from torchmask.design.constraint_base import project
-from torchmask.design.constraints import InsideDisc, KeepOutDisc, MinimumGap, NFoldSymmetry, NoOverlap, check_mask
+from torchmask.design.constraints import (
+    FixedHoles,
+    InsideDisc,
+    KeepOutDisc,
+    MinimumGap,
+    NFoldSymmetry,
+    NoOverlap,
+    check_mask,
+)
 from torchmask.design.criterion import AsymptoticMSE
 from torchmask.design.refine import refine_mask
 from torchmask.design.search import search_mask
@@ -223,6 +231,60 @@ def test_bad_options_are_refused(option):
     (name,) = option
     with pytest.raises(ValueError, match=f"{name} is {option[name]}"):
         search_mask(COARSE, 6, 1.0, 0.15, **option)
+
+
+def test_whole_numbers_may_be_floats():
+    for method in ("hybrid", "cma"):
+        plain = search_mask(COARSE, 4, 1.0, 0.1, method=method, budget=40, seed=1).aperture
+        other = search_mask(COARSE, 4.0, 1.0, 0.1, method=method, budget=40.0, seed=1.0).aperture
+        assert torch.equal(plain.centers, other.centers)
+    assert refine_mask(COARSE, plain, budget=2.0).evaluations == 2
+    with pytest.raises(ValueError, match=r"n_subapertures is 2\.5: it must be a whole number of at least 1"):
+        search_mask(COARSE, 2.5, 1.0, 0.1)
+
+
+@pytest.mark.parametrize("method", ["cma", "hybrid"])
+@pytest.mark.parametrize("budget", [1, 2, 3])
+def test_a_search_of_very_few_masks_has_a_result(method, budget):
+    found = search_mask(COARSE, 4, 1.0, 0.1, method=method, budget=budget, refine=False)
+    check_mask(found.aperture, 1e-9)
+    assert found.evaluations <= 2 * budget + 1  # each once more where it is feasible, and the mask that room gave
+
+
+@pytest.mark.parametrize("method", ["cma", "hybrid"])
+def test_a_search_without_anything_to_move_returns_what_is_given(method):
+    places = [(0.3, 0.0), (-0.2, 0.25), (-0.1, -0.3)]
+    found = search_mask(COARSE, 3, 1.0, 0.1, method=method, budget=40, constraints=[FixedHoles(places)])
+    # of a mapping onto the disc and back, in a few roundings of numbers of at most 1
+    torch.testing.assert_close(found.aperture.centers, torch.tensor(places, dtype=torch.float64), rtol=0, atol=1e-14)
+
+
+class Bad(nn.Module):
+    """A criterion that has one value for every mask, or `else_` for those whose first hole is to the right."""
+
+    def __init__(self, value, else_=None):
+        super().__init__()
+        self.value, self.else_ = value, value if else_ is None else else_
+
+    def forward(self, aperture):
+        right = aperture.centers[..., 0, 0] > 0
+        return torch.where(right, self.else_, self.value) + 0 * aperture.centers.sum((-2, -1))
+
+    relative = forward
+
+
+@pytest.mark.parametrize("method", ["cma", "hybrid"])
+@pytest.mark.parametrize("value", [math.nan, math.inf, 0.0, -1.0])
+@pytest.mark.parametrize("constraints", [(), (KeepOutDisc(0.1, (0.2, 0.0)),)])
+def test_a_criterion_without_a_finite_logarithm_is_told_of(method, value, constraints):
+    with pytest.raises(ValueError, match=r"relative error has no finite logarithm at any of \d+ masks: it must"):
+        search_mask(Bad(value), 3, 1.0, 0.1, method=method, budget=96, constraints=constraints)
+
+
+@pytest.mark.parametrize("method", ["cma", "hybrid"])
+def test_a_criterion_that_fails_at_some_masks_is_searched_at_the_others(method):
+    found = search_mask(Bad(math.nan, 0.5), 3, 1.0, 0.1, method=method, budget=96, refine=False)
+    assert found.relative_mse == 0.5
 
 
 def test_only_one_sparse_aperture_is_refined(golay6):

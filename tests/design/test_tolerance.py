@@ -46,6 +46,12 @@ def test_mean_growth_of_known_statistics(seeded, mask, bowl):
     assert abs(mean - 12 * 0.003**2) < 4 * error
 
 
+def test_a_whole_number_of_draws_may_be_a_float(seeded, mask, bowl):
+    one, other = (machining_errors(bowl, mask, 0.003, n_draws=n, generator=seeded(1)) for n in (16, 16.0))
+    assert torch.equal(one.mse, other.mse)
+    assert len(other.mse) == 16
+
+
 def test_quantiles_of_known_statistics(seeded, mask, bowl):
     result = machining_errors(bowl, mask, position_rms=0.003, n_draws=4000, generator=seeded(2))
     for level in (0.1, 0.5, 0.95):
@@ -199,8 +205,9 @@ def test_prints_its_main_numbers(seeded, mask, bowl):
         ({"position_rms": -0.1}, "position_rms is -0.1"),
         ({"diameter_rms": 0.02}, "diameter_rms is 0.02.*a tenth of the hole diameter, 0.01 m"),
         ({"position_rms": math.nan}, "position_rms is nan"),
-        ({"n_draws": 15}, "n_draws is 15"),
-        ({"n_draws": 17}, "n_draws is 17"),
+        ({"n_draws": 15}, "n_draws is 15: it must be a whole number of at least 16"),
+        ({"n_draws": 16.5}, r"n_draws is 16\.5: it must be a whole number of at least 16"),
+        ({"n_draws": 17}, "n_draws is 17: it must be even, since draws come in pairs: take 18"),
     ],
 )
 def test_bad_errors_are_refused(mask, bowl, keywords, message):

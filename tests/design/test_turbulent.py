@@ -3,6 +3,7 @@
 import copy
 import math
 import pickle
+import re
 
 import pytest
 import torch
@@ -20,6 +21,7 @@ from torchmask.memory import AtATime
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.band import Band
 from torchmask.optics.pixel import SquarePixel
+from torchmask.optics.psf import PSF
 from torchmask.spectra import NoisePSD, PowerLawPSD
 
 GRID = Grid.nyquist(1.0, 550e-9, 48)
@@ -183,10 +185,10 @@ def test_a_band_of_one_wavelength_is_that_wavelength():
 
 
 def test_full_pupils_with_a_band_agree_with_the_general_integral():
-    band = Band.top_hat(550e-9, 110e-9, 3)
-    row, column, nu = some_frequencies(SparseAperture([[0.5, 0.0], [-0.5, 0.0]], 0.3, 1.0), GRID, 9, 0.05)
-    exact = mean_square_otf(FullAperture(1.0), GRID, nu, Seeing(0.3), band)
-    criterion = criterion_of(r0=0.3, wavelengths=band.wavelengths, weights=band.shares)
+    band, grid = Band.top_hat(550e-9, 110e-9, 3), Grid.nyquist(1.0, 550e-9, 48, 1.1)  # for the shortest wavelength
+    row, column, nu = some_frequencies(SparseAperture([[0.5, 0.0], [-0.5, 0.0]], 0.3, 1.0), grid, 9, 0.05)
+    exact = mean_square_otf(FullAperture(1.0), grid, nu, Seeing(0.3), band)
+    criterion = criterion_of(grid, r0=0.3, wavelengths=band.wavelengths, weights=band.shares)
     found = criterion.expected_power(FullAperture(1.0))[row, column]
     assert (found / exact - 1)[exact > 1e-4].abs().max() < 0.02
 
@@ -523,3 +525,53 @@ def test_the_floor_is_what_a_full_pupil_leaves_in_bright_light(wavelengths):
     assert excess[1] == pytest.approx(excess[0] / 100, rel=0.05)
     assert excess[2] == pytest.approx(excess[1] / 100, rel=0.05)
     assert 0 < excess[0] < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("scale", "wavelengths", "pupil"),
+    [
+        (1.01 * 550e-9 / 2, None, FullAperture(1.0)),
+        (1.01 * 500e-9 / 2, [500e-9, 550e-9], FullAperture(1.0, 0.2)),
+        (1.01 * 550e-9 / 2, None, SparseAperture([[0.1, 0.0]], 1.0, 1.0)),
+    ],
+)
+def test_full_pupils_that_the_pixels_undersample_are_refused_as_by_the_psf(scale, wavelengths, pupil, monkeypatch):
+    """Their light beyond the torus was lost before: its folds are not in the table along the baseline."""
+    monkeypatch.setattr("torchmask.design.turbulent.mean_square_otf", None)  # before any work
+    criterion = criterion_of(Grid(32, scale, 550e-9), r0=0.5, wavelengths=wavelengths)
+    shortest = 550e-9 if wavelengths is None else min(wavelengths)
+    with pytest.raises(ValueError, match="undersamples an aperture") as expected:
+        PSF(pupil, Grid(32, scale, shortest))
+    for evaluate in (criterion, criterion.relative, criterion.expected_power, criterion.jensen_term):
+        with pytest.raises(ValueError, match=f"^{re.escape(str(expected.value))}$"):
+            evaluate(pupil)
+
+
+@pytest.mark.parametrize("turbulence", [{"r0": 0.3}, {"r0": 0.3, "wavelengths": [540e-9, 560e-9]}])
+def test_a_population_of_no_masks_has_no_errors(turbulence):
+    criterion = criterion_of(Grid.nyquist(1.0, 550e-9, 16), **turbulence)
+    centers = torch.zeros(2, 0, 3, 2, dtype=torch.float64, requires_grad=True)
+    none = SparseAperture(centers, 0.15, 1.0)
+    assert criterion(none).shape == criterion.jensen_term(none).shape == (2, 0)
+    assert criterion.expected_power(none).shape == (2, 0, 16, 16)
+    (gradient,) = torch.autograd.grad(criterion(none).sum(), centers)
+    assert gradient.shape == centers.shape
+
+
+@pytest.mark.parametrize("pixels", [32, 128])  # the search of the second begins on a coarser grid
+def test_one_made_in_inference_mode_can_be_searched_and_refined(pixels):
+    """What it keeps of the PSDs then is not fit for a gradient, which a search takes whatever its caller does."""
+
+    def designs():
+        criterion = criterion_of(Grid.nyquist(1.0, 550e-9, pixels), r0=0.3, pixel=SquarePixel(), sky=1.0)
+        found = search_mask(criterion, 3, 1.0, 0.1, budget=40, seed=0).aperture
+        return criterion, found, refine_mask(criterion, found, budget=5).aperture
+
+    expected = designs()[1:]
+    with torch.inference_mode():
+        criterion, *again = designs()
+    for one, other in zip(expected, again, strict=True):
+        assert torch.equal(one.centers, other.centers)
+    centers = expected[0].centers.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(criterion(expected[0].replace(centers)), centers)
+    assert bool(gradient.isfinite().all())

@@ -43,6 +43,36 @@ def test_a_parameter_stays_the_very_object_and_a_tensor_becomes_a_buffer():
         SparseAperture(parameter, 0.2, 1.0, dtype=torch.float64)
 
 
+@pytest.mark.parametrize("device", ["cpu", torch.device("cpu"), None])
+def test_a_parameter_may_be_asked_for_where_it_is(device):
+    parameter = nn.Parameter(torch.tensor(TRIANGLE))
+    assert SparseAperture(parameter, 0.2, 1.0, device=device).centers is parameter
+    for elsewhere in ("meta", "cuda"):  # which this machine need not have
+        with pytest.raises(ValueError, match="Parameter of another dtype or device: convert it"):
+            SparseAperture(parameter, 0.2, 1.0, device=elsewhere)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("device", ["cuda", "cuda:0", torch.device("cuda"), torch.device("cuda", 0)])
+def test_the_gpu_has_a_name_with_and_without_its_number(device):
+    parameter = nn.Parameter(torch.tensor(TRIANGLE, device="cuda:0"))
+    with torch.cuda.device(0):
+        assert SparseAperture(parameter, 0.2, 1.0, device=device).centers is parameter
+
+
+def test_a_whole_number_of_holes_may_be_a_float():
+    one, other = (SparseAperture.random(n, 1.0, 0.1, torch.Generator().manual_seed(0)) for n in (3, 3.0))
+    assert torch.equal(one.centers, other.centers)
+    with pytest.raises(ValueError, match=r"n_subapertures is 2\.5: it must be a whole number of at least 1"):
+        SparseAperture.random(2.5, 1.0, 0.1)
+
+
+def test_a_population_of_no_masks_reaches_as_far_as_a_hole():
+    none = SparseAperture(torch.zeros(0, 3, 2, dtype=torch.float64), 0.2, 1.0)
+    assert (none.extent, none.reach) == (0.2, 0.1)
+    assert none.samples(GRID).weights.shape[:2] == (0, 3)
+
+
 def test_state_dict_round_trip():
     source = SparseAperture(TRIANGLE, 0.2, 1.0)
     target = SparseAperture(np.zeros((3, 2)), 0.2, 1.0)

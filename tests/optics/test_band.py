@@ -21,6 +21,13 @@ def test_equal_wavelengths_are_one():
     assert band == Band((5e-7, 6e-7), (0.75, 0.25))
 
 
+def test_what_is_no_wavelength_is_refused_in_metres():
+    with pytest.raises(ValueError, match=r"wavelengths are \[-5e-07\]: they must be finite and positive, in m"):
+        Band.of([-5e-7])
+    with pytest.raises(ValueError, match=r"weights are \[0\.0\]: they must be finite and positive, in any unit"):
+        Band.of([5e-7], [0.0])
+
+
 @pytest.mark.parametrize("n", [1, 3, 8])
 def test_a_top_hat_is_gauss_and_legendre(n):
     band = Band.top_hat(550e-9, 80e-9, n)
@@ -63,7 +70,9 @@ def test_means_of_polynomials_over_a_curve_are_exact(transmission, n, random):
         ([5e-7, 6e-7], [1.0, -1.0], 3, "negative"),
         ([5e-7, 6e-7], [0.0, 0.0], 3, "positive"),
         ([5e-7, 6e-7], [1.0, math.nan], 3, "finite"),
-        ([5e-7, 6e-7], [1.0, 1.0], 0, "n_wavelengths"),
+        ([5e-7, 6e-7], [1.0, 1.0], 0, "n_wavelengths is 0: it must be a whole number from 1 to 32"),
+        ([5e-7, 6e-7], [1.0, 1.0], 33, "n_wavelengths is 33: it must be a whole number from 1 to 32"),
+        ([5e-7, 6e-7], [1.0, 1.0], 2.5, r"n_wavelengths is 2\.5: it must be a whole number from 1 to 32"),
     ],
 )
 def test_what_is_no_curve_is_refused(wavelengths, transmission, n, message):

@@ -143,8 +143,8 @@ def test_spelling_does_not_matter(spelling):
         (("golay6", None, 0.15), r"both mask_diameter \[m\] and fill_factor"),
         (("golay6", 1.0, 7.0), "lower fill_factor"),
         (("vlt_eris_7",), "no source gives the hole diameter of vlt_eris_7: give fill_factor"),
-        (("golay6", -1.0, 0.15), "mask_diameter is -1.0"),
-        (("golay6", 1.0, float("nan")), "fill_factor is nan"),
+        (("golay6", -1.0, 0.15), r"mask_diameter is -1\.0: it must be finite and positive, in m"),
+        (("golay6", 1.0, float("nan")), r"fill_factor is nan: it must be finite and positive, N d\^2 / D\^2"),
     ],
 )
 def test_bad_requests_are_refused(arguments, message):

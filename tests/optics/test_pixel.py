@@ -84,5 +84,12 @@ def test_jitter_is_kept_in_files_and_replaced_not_added(pixel):
 
 @pytest.mark.parametrize("rms", [-0.1, math.nan, math.inf])
 def test_a_jitter_is_a_number_of_pixels(rms):
-    with pytest.raises(ValueError, match="pixels rms"):
+    with pytest.raises(ValueError, match=f"rms is {rms}: it must be finite and at least 0, in pixels"):
         JitteredPixel(rms)
+
+
+def test_a_map_follows_the_frequencies_and_not_the_default_device():
+    nu, pixel = frequencies(), MappedPixel(torch.eye(4), 2)
+    expected = pixel.transfer(*nu)
+    with torch.device("meta"):
+        assert torch.equal(pixel.transfer(*nu), expected)

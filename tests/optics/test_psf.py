@@ -113,3 +113,10 @@ def test_a_phase_on_other_samples_and_half_precision_are_refused():
         PSF(mask, grid)(finer)
     with pytest.raises(TypeError, match=r"torch\.float16: float32 or float64 is needed"):
         PSF(mask, grid).half()()
+
+
+def test_a_whole_oversampling_may_be_a_float():
+    grid = Grid.nyquist(1.0, WAVELENGTH, 32)
+    assert torch.equal(PSF(MASK, grid, 2.0)(), PSF(MASK, grid, 2)())
+    with pytest.raises(ValueError, match=r"oversampling is 2\.5: it must be a whole number of at least 1"):
+        PSF(MASK, grid, 2.5)

@@ -279,10 +279,16 @@ def test_coefficients_and_centres_train_through_the_psf():
 # ---- bad input
 
 
-@pytest.mark.parametrize("n_modes", [0, -1, 2.5, 3.0, math.nan])
+@pytest.mark.parametrize("n_modes", [0, -1, 2.5, math.nan])
 def test_number_of_modes_is_a_whole_number(n_modes):
     with pytest.raises(ValueError, match="whole number of at least 1"):
         ZernikePhase(mask_of_three(), Grid.nyquist(1.0, WAVELENGTH, 64), n_modes)
+
+
+def test_a_whole_number_of_modes_may_be_a_float():
+    one, other = (ZernikePhase(mask_of_three(), Grid.nyquist(1.0, WAVELENGTH, 64), n) for n in (3, 3.0))
+    assert torch.equal(one.basis, other.basis)
+    assert (noll(11.0), type(other.n_modes)) == ((4, 0), int)
 
 
 def test_coefficients_must_fit_the_mask():

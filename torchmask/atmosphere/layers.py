@@ -17,6 +17,7 @@ from torch import Tensor
 
 from torchmask.atmosphere.von_karman import STRUCTURE_CONSTANT, von_karman_structure_function
 from torchmask.grid import ARCSEC
+from torchmask.numbers import whole_number
 
 _PATH = (
     math.sqrt(math.pi) * math.gamma(-5 / 6) / math.gamma(-1 / 3)
@@ -62,7 +63,8 @@ class Layers:
 
     def __post_init__(self) -> None:
         heights, strengths = (tuple(float(v) for v in values) for values in (self.heights, self.strengths))
-        winds = tuple((float(vx), float(vy)) for vx, vy in self.winds or [(0.0, 0.0)] * len(heights))
+        still = [(0.0, 0.0)] * len(heights)
+        winds = tuple((float(vx), float(vy)) for vx, vy in (self.winds if len(self.winds) else still))
         if not len(heights) == len(strengths) == len(winds) > 0:
             given = f"{len(heights)} heights, {len(strengths)} strengths and {len(winds)} winds"
             raise ValueError(f"got {given}: give one of each for every layer, and at least one layer")
@@ -91,9 +93,14 @@ class Layers:
         Fractions need not add up to 1: only their ratios matter. Raises ValueError as the constructor does, and if
         `r0`, `wavelength` or the sum of the fractions is not finite and positive.
         """
-        for name, value in (("r0", r0), ("wavelength", wavelength), ("sum of fractions", math.fsum(fractions))):
+        known = (
+            ("r0", r0, ", in m"),
+            ("wavelength", wavelength, ", in m"),
+            ("sum of fractions", math.fsum(fractions), ""),
+        )
+        for name, value, unit in known:
             if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"{name} is {value}: it must be finite and positive")
+                raise ValueError(f"{name} is {value}: it must be finite and positive{unit}")
         total = STRUCTURE_CONSTANT / _PATH * (wavelength / (2 * math.pi)) ** 2 * r0 ** (-5 / 3)
         return cls(heights, [total * share / math.fsum(fractions) for share in fractions], winds)
 
@@ -116,8 +123,7 @@ class Layers:
 
         Raises ValueError if `n_layers` is not a whole number of at least 1.
         """
-        if not float(n_layers).is_integer() or n_layers < 1:
-            raise ValueError(f"n_layers is {n_layers}: it must be a whole number of at least 1")
+        n_layers = whole_number("n_layers", n_layers)
         if n_layers >= len(self.heights):
             return self
         order = np.argsort(self.heights, kind="stable")

@@ -13,8 +13,9 @@ from torch import Tensor, nn
 
 from torchmask.atmosphere.endless import Screen, ScreenWindow
 from torchmask.atmosphere.layers import Layers, Vector
-from torchmask.atmosphere.screens import draw_seed, frozen_flow, phase_screens, require_count
+from torchmask.atmosphere.screens import draw_seed, frozen_flow, phase_screens
 from torchmask.atmosphere.von_karman import require_turbulence
+from torchmask.numbers import whole_number
 from torchmask.optics.pupil import PupilSamples
 
 
@@ -73,7 +74,7 @@ class TurbulencePhase(nn.Module):
         self.frame_interval = frame_interval
 
     def forward(self, samples: PupilSamples, n_frames: int, generator: torch.Generator | None = None) -> Tensor:
-        require_count("n_frames", n_frames)
+        n_frames = whole_number("n_frames", n_frames)
         place, shape = _window(samples)
         like = {"generator": generator, "dtype": samples.weights.dtype, "device": samples.weights.device}
         if self.wind is None or self.frame_interval is None:
@@ -153,7 +154,7 @@ class LayeredPhase(nn.Module):
         generator: torch.Generator | None = None,
         direction: Tensor | Vector = (0.0, 0.0),
     ) -> Tensor:
-        require_count("n_frames", n_frames)
+        n_frames = whole_number("n_frames", n_frames)
         stars = torch.as_tensor(direction, dtype=torch.float64, device="cpu")
         if stars.shape[-1:] != (2,):
             raise ValueError(f"direction has shape {tuple(stars.shape)}: its last axis must be (x, y), in rad")

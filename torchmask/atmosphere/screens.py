@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
-from numbers import Integral
-
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchmask.atmosphere.endless import Screen, ScreenWindow
 from torchmask.atmosphere.random_field import COMPLEX, RandomField, split_spectrum
 from torchmask.atmosphere.von_karman import require_turbulence
+from torchmask.numbers import whole_number
 
 
 def phase_screens(
@@ -59,7 +58,7 @@ def phase_screens(
     torch.Size([3, 64, 64])
     """
     shape, step, dtype, device = _resolve(shape, step, dtype, device)
-    require_count("n_screens", n_screens)
+    n_screens = whole_number("n_screens", n_screens)
     require_turbulence(r0, outer_scale)
     extent = (shape[0] * step[0], shape[1] * step[1])
     field = RandomField(
@@ -85,10 +84,16 @@ def frozen_flow(
     """Return one random screen displaced as a whole (n_frames, rows, columns) [rad].
 
     Frame t is screen(x - displacements[t]). `displacements` (n_frames, 2) [m], (x, y), may be of any size, fractions
-    of a sample included (see `torchmask.atmosphere.endless`). Other arguments and errors are those of `phase_screens`.
+    of a sample included (see `torchmask.atmosphere.endless`). Other arguments and errors are those of `phase_screens`;
+    ValueError also for displacements of another shape, or of no frame.
     """
     shape, step, dtype, device = _resolve(shape, step, dtype, device)
     require_turbulence(r0, outer_scale)
+    if displacements.ndim != 2 or displacements.shape[1] != 2 or not len(displacements):
+        raise ValueError(
+            f"displacements has shape {tuple(displacements.shape)}: it must be (n_frames, 2), (x, y) in m for each of "
+            "at least one frame"
+        )
     screen = Screen(ScreenWindow(shape, step, outer_scale, dtype, device), r0, draw_seed(generator))
     return torch.stack([screen.at((-dx, -dy)) for dx, dy in displacements.detach().cpu().double().tolist()])
 
@@ -104,24 +109,18 @@ def _margin(extent: tuple[float, float], step: tuple[float, float]) -> float:
     return max(0.25 * max(extent), 16 * max(step))
 
 
-def require_count(name: str, count: int) -> None:
-    """Raise ValueError unless `count` is a whole number of at least 1."""
-    if not isinstance(count, Integral) or count < 1:
-        raise ValueError(f"{name} is {count}: it must be a whole number of at least 1")
-
-
 def _resolve(
     shape: tuple[int, int],
     step: float | tuple[float, float],
     dtype: torch.dtype | None,
     device: torch.device | str | None,
 ) -> tuple[tuple[int, int], tuple[float, float], torch.dtype, torch.device]:
-    for side in shape:
-        require_count("a side of shape", side)
-    dy, dx = (step, step) if isinstance(step, int | float) else step
-    if not all(math.isfinite(s) and s > 0 for s in (dy, dx)):
-        raise ValueError(f"step is {step}: it must be finite and positive, in m")
+    rows, columns = (whole_number("a side of shape", side) for side in shape)
+    steps = np.asarray(step, dtype=float)
+    if steps.shape not in ((), (2,)) or not (np.isfinite(steps) & (steps > 0)).all():
+        raise ValueError(f"step is {step}: it must be finite and positive, in m, one number or two (dy, dx)")
+    dy, dx = np.broadcast_to(steps, 2).tolist()
     dtype = dtype or torch.get_default_dtype()
     if dtype not in COMPLEX:
         raise TypeError(f"dtype is {dtype}: it must be float32 or float64")
-    return (shape[0], shape[1]), (float(dy), float(dx)), dtype, torch.device(device or "cpu")
+    return (rows, columns), (dy, dx), dtype, torch.device(device or "cpu")

@@ -12,6 +12,8 @@ from torch import Tensor
 
 from torchmask.atmosphere.structure import StructureFunction, coherence_distance
 
+_HOST = {"dtype": torch.float64, "device": "cpu"}  # whatever the default device
+
 
 @dataclass(frozen=True)
 class Seeing:
@@ -83,12 +85,12 @@ class Seeing:
         displacement represents its opposite too.
         """
         if self.exposure == 0:
-            return torch.zeros(1, 2, dtype=torch.float64), torch.ones(1, dtype=torch.float64)
+            return torch.zeros(1, 2, **_HOST), torch.ones(1, **_HOST)
         lags, weights = _triangle_quadrature(n_lags)
         if isinstance(self.wind, tuple | list):
-            directions = torch.tensor([self.wind], dtype=torch.float64)
+            directions = torch.tensor([self.wind], **_HOST)
         else:
-            angle = math.pi * (torch.arange(n_directions, dtype=torch.float64) + 0.5) / n_directions
+            angle = math.pi * (torch.arange(n_directions, **_HOST) + 0.5) / n_directions
             directions = self.wind * torch.stack([angle.cos(), angle.sin()], -1)
         steps = self.exposure * lags[:, None, None] * directions
         return steps.flatten(0, 1), (weights[:, None] / len(directions)).expand(-1, len(directions)).flatten()

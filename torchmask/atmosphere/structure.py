@@ -33,8 +33,8 @@ class StructureFunction:
     outer_scale : float
         Outer scale [m]; infinite for Kolmogorov turbulence.
     reach : float
-        Largest displacement that will be needed [m]; longer ones are clamped to it. A finite value makes the series
-        shorter.
+        Largest displacement that will be needed [m]. With a finite outer scale, a finite value makes the series
+        shorter, and longer displacements are clamped to it; Kolmogorov turbulence has no series, and clamps nothing.
 
     Raises
     ------
@@ -66,7 +66,8 @@ class StructureFunction:
         return self.at(*displacement.unbind(-1))
 
     def at(self, x: Tensor, y: Tensor) -> Tensor:
-        """Return the structure function (...) at displacements (x, y) (...) [m]."""
+        """Return the structure function (...) at displacements (x, y), of shapes that broadcast to (...) [m]."""
+        x, y = torch.broadcast_tensors(x, y)
         # The offset, a billionth of r0 squared, keeps the derivative finite at 0. As few passes over arrays as can be.
         squared = torch.addcmul(x.new_full((), 1e-18 * self.r0**2), x, x).addcmul_(y, y)
         if math.isinf(self.outer_scale):

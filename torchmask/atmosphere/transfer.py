@@ -23,7 +23,9 @@ from torchmask.grid import Grid
 from torchmask.optics.band import Band
 from torchmask.optics.pupil import Aperture
 
+_HOST = {"dtype": torch.float64, "device": "cpu"}  # whatever the default device
 _PER_R0 = 6  # samples per r0
+_PER_HOLE = 24  # samples across the finest part of a hole at least; a small r0 may need more
 _NOTHING = 1e-12  # of a density, below which it is a rounding error of its Fourier transform
 
 
@@ -93,7 +95,7 @@ def _square_otf(
     lengths = [wavelength / grid.pixel_scale for wavelength in band.wavelengths]
     shares = band.shares
     scales = [grid.wavelength / wavelength for wavelength in band.wavelengths]
-    total = torch.zeros(len(frequencies), dtype=torch.float64)
+    total = torch.zeros(len(frequencies), **_HOST)
     for row, frequency in enumerate(frequencies.double().cpu()):
         baselines = [frequency * length for length in lengths]
         overlaps = [raster.overlap(baseline) for baseline in baselines]
@@ -139,33 +141,29 @@ class OverlapRaster:
     aperture : one aperture, centres (N, 2)
     seeing : turbulence and exposure
     shortest : shortest wavelength over the reference wavelength, at most 1
-    longest : longest baseline for which overlaps are needed [m]; 0: that of the aperture
-    per_hole : minimum number of samples across the finest part of a hole; a small r0 may need more
     """
 
-    def __init__(
-        self, aperture: Aperture, seeing: Seeing, shortest: float = 1.0, longest: float = 0.0, per_hole: int = 24
-    ) -> None:
+    def __init__(self, aperture: Aperture, seeing: Seeing, shortest: float = 1.0) -> None:
         self.aperture = aperture
         self.centers: Tensor = aperture.centers.detach().cpu().double()
         diameter = aperture.subaperture_diameter
-        step = min(seeing.r0 * shortest / _PER_R0, diameter * aperture.shape.fineness / per_hole)
+        step = min(seeing.r0 * shortest / _PER_R0, diameter * aperture.shape.fineness / _PER_HOLE)
         reach = float(self.centers.norm(dim=-1).max()) + aperture.outer_diameter / 2
         size = math.ceil(2 * reach / step) + 2
-        axis = (torch.arange(size, dtype=torch.float64) - (size - 1) / 2) * step
+        axis = (torch.arange(size, **_HOST) - (size - 1) / 2) * step
         self.points: Tensor = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), -1)  # (size, size, 2)
-        self.cell: Tensor = torch.tensor([step, step], dtype=torch.float64)
+        self.cell: Tensor = torch.tensor([step, step], **_HOST)
         self.padded: tuple[int, int] = (2 * size, 2 * size)
-        lag = torch.fft.fftfreq(2 * size, 1 / (2 * size), dtype=torch.float64) * step
+        lag = torch.fft.fftfreq(2 * size, 1 / (2 * size), **_HOST) * step
         self.lattice: Tensor = torch.stack(torch.meshgrid(lag, lag, indexing="xy"), -1).flatten(0, 1)
         self.drift: tuple[Tensor, Tensor] = seeing.drift()
-        furthest = 2 * reach + float(self.drift[0].norm(dim=-1).max()) + 2 * step
-        self.structure: StructureFunction = seeing.structure(furthest + max(2 * reach, longest))
+        furthest = 4 * reach + float(self.drift[0].norm(dim=-1).max()) + 2 * step
+        self.structure: StructureFunction = seeing.structure(furthest)
 
     def _coverage(self, shift: Tensor) -> Tensor:
         """Return the open fraction of each cell of the pupil shifted by -shift (2,)."""
         diameter = self.aperture.subaperture_diameter
-        total = torch.zeros(self.points.shape[:-1], dtype=torch.float64)
+        total = torch.zeros(self.points.shape[:-1], **_HOST)
         for center in self.centers:
             total += self.aperture.shape.coverage(self.points + shift - center, self.cell, diameter)
         return total
@@ -195,14 +193,14 @@ class OverlapRaster:
 
     def variance(self, points: Tensor, baseline: Tensor, other: Tensor, scale: float, other_scale: float) -> Tensor:
         """Return Q (S,) at separations (S, 2) of the middles, averaged over the exposure."""
-        total = torch.zeros(len(points), dtype=torch.float64)
+        total = torch.zeros(len(points), **_HOST)
         for step, weight in zip(self.drift[0], self.drift[1].tolist(), strict=True):
             total += weight * difference_variance(self.structure, points + step, baseline, other, scale, other_scale)
         return total
 
     def kernel(self, points: Tensor, baseline: Tensor, other: Tensor, scale: float, other_scale: float) -> Tensor:
         """Return exp(-Q / 2) (S,) at separations (S, 2) of the middles, averaged over the exposure."""
-        total = torch.zeros(len(points), dtype=torch.float64)
+        total = torch.zeros(len(points), **_HOST)
         for step, weight in zip(self.drift[0], self.drift[1].tolist(), strict=True):
             variance = difference_variance(self.structure, points + step, baseline, other, scale, other_scale)
             total += weight * torch.exp(-variance / 2)

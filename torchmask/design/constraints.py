@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from torchmask.design.constraint_base import Constraint, Inequality, LinearEquality, require_constraints
+from torchmask.numbers import whole_number
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.overlaps import check_overlaps, pair_clearances
 from torchmask.optics.shape_base import safe_length
@@ -218,8 +219,7 @@ class NFoldSymmetry(LinearEquality):
     n_fold: int
 
     def __post_init__(self) -> None:
-        if not float(self.n_fold).is_integer() or self.n_fold < 2:
-            raise ValueError(f"n_fold is {self.n_fold}: it must be a whole number of at least 2")
+        whole_number("n_fold", self.n_fold, least=2)
 
     def equations(self, n_subapertures: int) -> tuple[np.ndarray, np.ndarray]:
         n = int(self.n_fold)
@@ -250,7 +250,7 @@ def check_mask(aperture: SparseAperture, tolerance: float = 1e-9, constraints: S
     Parameters
     ----------
     aperture : SparseAperture
-        One mask, or a population of which every mask is checked.
+        One mask, or a population of which every mask is checked; one of no masks is in order.
     tolerance : float
         Largest shortfall that is accepted, as a fraction of the mask diameter.
     constraints : sequence of Constraint
@@ -263,7 +263,7 @@ def check_mask(aperture: SparseAperture, tolerance: float = 1e-9, constraints: S
     require_constraints(constraints)
     check_overlaps(aperture, tolerance)
     for constraint in (InsideDisc(), *constraints):
-        worst = float(constraint.violation(aperture).max())
+        worst = max(constraint.violation(aperture).flatten().tolist(), default=0.0)
         if worst > tolerance * aperture.mask_diameter:
             raise ValueError(
                 f"{constraint} is broken by {worst:.3g} m ({worst / aperture.mask_diameter:.3g} of the mask "

@@ -18,6 +18,7 @@ from torchmask.design.fluctuation import mean_inverse, piston_powers
 from torchmask.design.overlap import Geometry, baseline_mse
 from torchmask.grid import Grid
 from torchmask.memory import keep_freed_memory, require_memory
+from torchmask.numbers import whole_number
 from torchmask.optics.aperture import FullAperture
 from torchmask.optics.pupil import Aperture
 from torchmask.spectra import PSD, evaluate_psd, resample_psd
@@ -77,11 +78,10 @@ class AsymptoticMSE(nn.Module):
 
     def __init__(self, grid: Grid, object_psd: PSD, noise_psd: PSD, n_frames: int) -> None:
         super().__init__()
-        if not float(n_frames).is_integer() or n_frames < 1:
-            raise ValueError(f"n_frames is {n_frames}: it must be a whole number of at least 1")
+        n_frames = whole_number("n_frames", n_frames)
         require_memory("n_pixels", max(grid.shape), _BYTES * math.prod(grid.shape), power=2)
         self.grid: Grid = grid
-        self.n_frames: int = int(n_frames)
+        self.n_frames: int = n_frames
         self._object_model = None if isinstance(object_psd, Tensor) else object_psd
         self.register_buffer("object_psd", evaluate_psd(object_psd, grid, "object_psd"))
         self.register_buffer("noise_psd", evaluate_psd(noise_psd, grid, "noise_psd"))

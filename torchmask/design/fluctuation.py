@@ -64,6 +64,6 @@ def piston_powers(centers: Tensor, geometry: Geometry, wavelength: float) -> tup
         power = torch.cat([power[:, :1] * (n**2 / 2), power[:, 1:]], 1)
         both = torch.cat([power / n**2, steady_lenses(lenses, n) / n**4])
         planes = patches.plane.summed(lenses.index.expand_as(both), both)
-        found.append(patches.plane.folded(planes)[:, None])
-    mean, steady = torch.cat(found, 1).unflatten(-1, (-1, geometry.grid[1]))
+        found.append(patches.plane.folded(planes).unflatten(0, (2, len(mask))))
+    mean, steady = torch.cat(found, 1).unflatten(-1, (geometry.grid[0] // 2 + 1, geometry.grid[1]))
     return mean, steady

@@ -53,6 +53,8 @@ def basin_hopping(
 
     Where rules are not alike all around, such as those on vanes, half of the budget goes to masks without them, which
     are then turned to where they break them least, as descents carry no hole across a vane.
+
+    Raises ValueError if the criterion has no finite logarithm at any mask.
     """
     merit, spent = Merit(criterion, holes, WEIGHT), 0
     starts: list[Tensor] = []
@@ -70,6 +72,7 @@ def basin_hopping(
         *(merit, budget - spent, starts, rng),
         lambda found, x: monitor.update(spent + merit.evaluations, found.merit, found.relative_mse, x),
     )
+    merit.require_value(bool(pool.entries))
     return torch.stack([x for _, x, _ in pool.entries[:FINALISTS]]), spent + merit.evaluations
 
 

@@ -160,7 +160,7 @@ class LensPatches:
         corner = torch.stack([patch.corner for patch in patches]).amin(0)
         ends = [patch.corner + corner.new_tensor(patch.values.shape[:1:-1]) for patch in patches]
         size = (torch.stack(ends).amax(0) - corner).nan_to_num(1.0)
-        columns, rows = size.amax((0, 1)).long().tolist()
+        columns, rows = size.amax((0, 1)).long().tolist() if len(size) else (1, 1)  # a population may be empty
         first = torch.arange(corner[..., 0].numel(), device=corner.device).view(*corner.shape[:2], 1) * (rows * columns)
         sources, targets = [], []
         for number, patch in enumerate(patches):

@@ -20,6 +20,7 @@ from torch import Tensor
 from torchmask.design.drawing import load_dxf, require_one_mask
 from torchmask.grid import Grid
 from torchmask.io import atomic_write, extra
+from torchmask.numbers import whole_number
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.records import aperture_record, read_mask
 
@@ -107,8 +108,7 @@ def amplitude_map(aperture: SparseAperture, n_pixels: int) -> tuple[Tensor, floa
     """
     require_one_mask(aperture)
     width, needed = max(aperture.mask_diameter, 2 * aperture.reach), least_pixels(aperture)
-    if not float(n_pixels).is_integer() or n_pixels < needed:
-        raise ValueError(f"n_pixels is {n_pixels}: a hole must span two pixels, so at least {needed} are needed")
+    n_pixels = whole_number("n_pixels", n_pixels, needed, note=" for a hole to span two pixels")
     step = width / (n_pixels - 2)
     # The pupil raster of a field of twice the width is wide enough for the spatial frequencies of any aperture.
     samples = aperture.samples(Grid(2 * n_pixels, 1 / (2 * n_pixels * step), 1.0))

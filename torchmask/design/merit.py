@@ -204,6 +204,14 @@ class Merit:
             self.evaluations += len(x)
             return self.penalised(self.criterion.relative(aperture), aperture)
 
+    def require_value(self, found: bool) -> None:
+        """Raise ValueError unless a mask was `found` whose merit is a finite number."""
+        if not found:
+            raise ValueError(
+                f"the criterion's relative error has no finite logarithm at any of {self.evaluations} masks: it must "
+                "be finite and positive, so look for what makes it NaN, infinite or 0"
+            )
+
     def penalised(self, relative_mse: Tensor, aperture: SparseAperture) -> Tensor:
         """Return the merit (P,) without multipliers of P masks whose relative MSE (P,) is known."""
         shortfall = self.holes.margins(aperture).clamp(max=0)

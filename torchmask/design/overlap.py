@@ -67,7 +67,7 @@ def make_plan(geometry: Geometry, n: int, dtype: torch.dtype, device: torch.devi
     row = torch.arange(int(2 * reach_y) + 1, device=device)
     height, above, below = rows // 2 + 1, int(reach_y), int(reach_y) + 1
     lowest = rows - rows // 2  # the first row at nu_y >= 1/2
-    outside = torch.cat([torch.arange(-above, 1), torch.arange(lowest, height + below)]).to(device)
+    outside = torch.cat([torch.arange(*ends, device=device) for ends in ((-above, 1), (lowest, height + below))])
     mirrored = torch.where(outside <= 0, -outside, rows - outside).clamp(0, height - 1)
     every = torch.arange(columns, device=device)
     return PatchPlan(

@@ -13,6 +13,7 @@ from torchmask.design.constraint_base import Constraint, Infeasible, project, re
 from torchmask.design.constraints import InsideDisc, NoOverlap, check_mask
 from torchmask.design.descent import BatchedBFGS
 from torchmask.design.merit import Criterion, Holes, Merit, device_of, for_processor
+from torchmask.numbers import whole_number
 from torchmask.optics.aperture import SparseAperture
 from torchmask.record import Callback, Record
 
@@ -168,8 +169,7 @@ def refine_mask(
     if aperture.centers.ndim != 2:
         raise ValueError(f"centers has shape {tuple(aperture.centers.shape)}: refine_mask takes one mask, (N, 2)")
     require_constraints(constraints)
-    if not float(budget).is_integer() or budget < 1:
-        raise ValueError(f"budget is {budget}: it must be a whole number of evaluations, at least 1")
+    budget = whole_number("budget", budget, note=", in evaluations")
     device, criterion = device_of(criterion), for_processor(criterion)
     still = aperture.still().to("cpu")
     holes = Holes(still, (InsideDisc(), NoOverlap(), *constraints))
@@ -226,7 +226,7 @@ def polish(
         raise failure
     with torch.no_grad():
         values = torch.stack([criterion.relative(candidate) for candidate in candidates])
-    best = int(values.argmin())
+    best = int(values.nan_to_num(torch.inf).argmin())
     monitor.conclude(merit.evaluations + len(candidates), float(values[best]), candidates[best])
     return candidates[best], merit.evaluations + len(candidates)
 

@@ -31,7 +31,6 @@ def require_room(
     mask_diameter: float,
     fill_factor: float,
     constraints: Sequence[Constraint],
-    seed: int = 0,
     callback: Callback | None = None,
 ) -> tuple[Holes, SparseAperture]:
     """Return the holes of a request with all their constraints, and a first mask that satisfies them.
@@ -50,7 +49,7 @@ def require_room(
     hole_diameter(n_subapertures, mask_diameter, fill_factor)
     require_constraints(constraints)
     _require_area(n_subapertures, mask_diameter, fill_factor, constraints)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     holes = _holes(n_subapertures, mask_diameter, fill_factor, constraints)
     trials = _Trials(callback)
     try:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from torchmask.design.constraint_base import Constraint
 from torchmask.design.constraints import KeepOutDisc, KeepOutSegment, MinimumGap, RimMargin
+from torchmask.numbers import require
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,6 +35,8 @@ class MaskRules:
 
         Raises ValueError if a number is out of range.
         """
+        for name in ("min_gap", "rim_margin", "central_obstruction"):
+            require(name, getattr(self, name), ", in m", zero=True)
         rules: list[Constraint] = []
         if self.min_gap:
             rules.append(MinimumGap(self.min_gap))

@@ -14,6 +14,7 @@ from torchmask.design.hybrid import basin_hopping, coarse_criterion
 from torchmask.design.merit import Criterion, device_of, for_processor
 from torchmask.design.refine import Monitor, SearchResult, conclude, polish
 from torchmask.design.room import require_room
+from torchmask.numbers import whole_number
 from torchmask.optics.packing import hole_diameter
 from torchmask.record import Callback
 
@@ -74,8 +75,8 @@ def search_mask(
     Raises
     ------
     ValueError
-        If an argument is out of range, the holes are narrower than a sample of the criterion's frequencies, or no mask
-        that fulfils the request is found.
+        If an argument is out of range, the holes are narrower than a sample of the criterion's frequencies, no mask
+        that fulfils the request is found, or the criterion has no finite logarithm at any mask.
     TypeError
         If `constraints` is not a sequence of constraints.
 
@@ -94,13 +95,12 @@ def search_mask(
     """
     if method not in METHODS:
         raise ValueError(f"method is {method!r}: known methods are {', '.join(METHODS)}")
+    n_subapertures = whole_number("n_subapertures", n_subapertures)
     if budget is None:
         # The cost of an evaluation grows with N, and searches should take about the same time.
-        budget = max(1, int(DEFAULT_BUDGETS[method] * min(1.0, 11 / n_subapertures))) if n_subapertures > 0 else 1
-    if not float(budget).is_integer() or budget < 1:
-        raise ValueError(f"budget is {budget}: it must be a whole number of evaluations, at least 1")
-    if not float(seed).is_integer() or seed < 0:
-        raise ValueError(f"seed is {seed}: it must be a whole number that is not negative")
+        budget = max(1, int(DEFAULT_BUDGETS[method] * min(1.0, 11 / n_subapertures)))
+    budget = whole_number("budget", budget, note=", in evaluations")
+    seed = whole_number("seed", seed, least=0)
     _require_sampling(criterion, n_subapertures, mask_diameter, fill_factor)
     holes, known = require_room(n_subapertures, mask_diameter, fill_factor, constraints, callback=callback)
     rng = np.random.default_rng(seed)

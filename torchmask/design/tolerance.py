@@ -20,6 +20,7 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
 from torch import Tensor
 
+from torchmask.numbers import whole_number
 from torchmask.optics.aperture import Aperture, SparseAperture
 from torchmask.record import Callback, Record
 
@@ -223,10 +224,9 @@ class _Workshop:
         if aperture.centers.ndim != 2:
             shape = tuple(aperture.centers.shape)
             raise ValueError(f"centers has shape {shape}: one mask is needed, (n_subapertures, 2)")
-        if n_draws % 2 != 0 or n_draws < 16:
-            raise ValueError(
-                f"n_draws is {n_draws}: it must be an even number of at least 16, since draws come in pairs"
-            )
+        n_draws = whole_number("n_draws", n_draws, least=16)
+        if n_draws % 2 != 0:
+            raise ValueError(f"n_draws is {n_draws}: it must be even, since draws come in pairs: take {n_draws + 1}")
         self.criterion: Criterion = criterion
         self.callback: Callback | None = callback
         self.evaluations: int = 0

@@ -65,7 +65,8 @@ class TurbulentMSE(AsymptoticMSE):
     ------
     ValueError, TypeError
         As `AsymptoticMSE`, `Seeing` and `Band.of`; for an exposure, outer scale or band without r0, a wind without an
-        exposure, weights without wavelengths, and a sky that is negative.
+        exposure, weights without wavelengths, and a sky that is negative. In a call, ValueError for a full pupil that
+        the pixels undersample at the band's shortest wavelength, as `PSF` does.
 
     Notes
     -----
@@ -76,8 +77,9 @@ class TurbulentMSE(AsymptoticMSE):
     integral for holes of 0.4 to 1.5 r0, exposures up to 2 tau0 and bands up to 20 % wide, where it is above 2 % of what
     one pair of holes gives at most (within 5 % below; 3.3 % were seen for 20 holes of 1.5 r0 in the widest band); that
     of full pupils, which is interpolated, within 2 % where it is above 1e-4 (4 % with vanes of D/25, or with an outer
-    scale of 5 D). Baselines beyond the frequency torus alias as in MSE_a. A value takes 7 to 18 times as long as that
-    of MSE_a, 35 to 85 times for 7 wavelengths over 20 %, and its gradient two to three times the value.
+    scale of 5 D). Baselines of masks beyond the frequency torus alias as in MSE_a; those of full pupils are refused. A
+    value takes 7 to 18 times as long as that of MSE_a, 35 to 85 times for 7 wavelengths over 20 %, and its gradient two
+    to three times the value.
 
     Examples
     --------
@@ -163,7 +165,8 @@ class TurbulentMSE(AsymptoticMSE):
 
     def _error(self, power: Tensor) -> Tensor:
         """Return the mean squared error (...) for E|OTF|^2 (..., H // 2 + 1, W)."""
-        weight, ratio = self._weight.to(power.dtype), self._ratio.to(power.dtype)
+        # copies of those made in inference mode, which cannot be kept for a gradient
+        weight, ratio = (part.to(power.dtype, copy=part.is_inference()) for part in (self._weight, self._ratio))
         return (weight / (power[..., None, :, :] + ratio)).sum((-3, -2, -1))
 
     def expected_power(self, aperture: Aperture) -> Tensor:
@@ -260,9 +263,18 @@ class TurbulentMSE(AsymptoticMSE):
         ratio = still(baselines) ** 2 / still(baselines, smooth).clamp(min=_NOTHING)
         return (ratio * PolarTable(kept, reach, 1.5)(baselines)).reshape(-1, self.grid.shape[1])
 
+    @property
+    def _bluest_grid(self) -> Grid:
+        """The grid at the band's shortest wavelength, which samples the image most coarsely."""
+        return self.grid if self.band is None else replace(self.grid, wavelength=self.band.shortest)
+
     def _cutoff(self, mask_diameter: float) -> float:
-        shortest = self.grid.wavelength if self.band is None else self.band.shortest
-        return replace(self.grid, wavelength=shortest).cutoff(mask_diameter)
+        return self._bluest_grid.cutoff(mask_diameter)
+
+    def _check(self, aperture: Aperture) -> None:
+        super()._check(aperture)
+        if self.seeing is not None and aperture.is_full:  # its table has no folds from beyond the torus
+            self._bluest_grid.require_sampling(aperture.outer_diameter)
 
     def _check_sampling(self, aperture: Aperture, band: Band) -> None:
         highest = self._cutoff(aperture.outer_diameter)

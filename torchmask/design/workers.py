@@ -11,6 +11,8 @@ from typing import Any, Generic, TypeVar
 
 import torch
 
+from torchmask.numbers import whole_number
+
 BACKENDS = ("loky", "ray")
 Key = TypeVar("Key")
 
@@ -29,8 +31,8 @@ def require_backend(backend: str, n_workers: int | None) -> None:
     """Raise ValueError unless `run_side_by_side` can use this backend with this number of workers."""
     if backend not in BACKENDS:
         raise ValueError(f"backend is {backend!r}: known backends are {', '.join(BACKENDS)}")
-    if n_workers is not None and (not float(n_workers).is_integer() or n_workers < 1):
-        raise ValueError(f"n_workers is {n_workers}: it must be a whole number of at least 1, or None for all cores")
+    if n_workers is not None:
+        whole_number("n_workers", n_workers, note=", or None for all cores")
     try:
         import joblib  # noqa: F401
     except ImportError as error:
@@ -75,7 +77,7 @@ def run_side_by_side(
         return
     left = set(arguments)
     with _registered(backend) as cores:
-        n_jobs = min(n_workers or cores, len(arguments))
+        n_jobs = min(int(n_workers or cores), len(arguments))
         # Without batches, because a batch would be returned only as a whole.
         options: dict[str, Any] = {"batch_size": 1, "pre_dispatch": "n_jobs", "return_as": "generator_unordered"}
         parallel: Any = joblib.Parallel(n_jobs, backend=backend, **options)

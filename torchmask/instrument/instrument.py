@@ -14,10 +14,9 @@ from torchmask.atmosphere.seeing import Seeing
 from torchmask.grid import ARCSEC, Grid
 from torchmask.instrument.parts import Camera, Site, Source, Telescope
 from torchmask.io import extra, from_json, read_json, to_json, write_json
-from torchmask.numbers import require, require_wavelength, require_within
+from torchmask.numbers import require, require_wavelength, require_within, whole_number
 from torchmask.optics.band import MOST_WAVELENGTHS, Band
 from torchmask.optics.passband import Passband
-from torchmask.optics.whole import whole_number
 from torchmask.spectra import NoisePSD, PowerLawPSD
 
 _FORMAT = "torchmask instrument, version 1"

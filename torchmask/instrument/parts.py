@@ -6,11 +6,10 @@ import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from torchmask.numbers import require, require_r0, require_within
+from torchmask.numbers import require, require_r0, require_within, whole_number
 from torchmask.optics.aperture import FullAperture
 from torchmask.optics.detector import Detector
 from torchmask.optics.pixel import PixelResponse, square_pixel
-from torchmask.optics.whole import whole_number
 
 System = Literal["AB", "Vega"]
 

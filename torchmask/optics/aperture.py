@@ -85,7 +85,7 @@ class SparseAperture(Aperture):
         if can_be_read(centers) and not bool(torch.isfinite(centers).all()):
             raise ValueError("centers holds values that are not finite: positions in m are needed")
         if isinstance(centers, nn.Parameter):
-            if dtype not in (None, centers.dtype) or device not in (None, centers.device):
+            if dtype not in (None, centers.dtype) or not _is_on(centers, device):
                 raise ValueError("centers is a Parameter of another dtype or device: convert it before passing it")
             self.centers: Tensor = centers
         else:
@@ -280,3 +280,12 @@ class FullAperture(Aperture):
             angles = ", ".join(f"{angle:.4g}" for angle in self.vane_angles)
             text += f", vane_width={self.vane_width:.4g}, vane_angles=({angles})"
         return text
+
+
+def _is_on(tensor: Tensor, device: torch.device | str | None) -> bool:
+    """Return whether a tensor is on the device that is asked for; "cuda" is torch's current one, such as "cuda:1"."""
+    if device is None:
+        return True
+    if torch.device(device).type != tensor.device.type:  # the other may not exist on this machine
+        return False
+    return torch.empty(0, device=device).device == tensor.device

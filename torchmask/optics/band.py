@@ -10,9 +10,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from torchmask.numbers import whole_number
 from torchmask.optics.passband import Passband, check_curve
 
-_MOST_WAVELENGTHS = 32  # largest number of wavelengths, far more than any image needs
+MOST_WAVELENGTHS = 32  # largest number of wavelengths, far more than any image needs
 
 
 @dataclass(frozen=True)
@@ -41,9 +42,9 @@ class Band:
             raise ValueError(
                 f"{len(wavelengths)} wavelengths have {len(shares)} weights: as many, and at least 1, are needed"
             )
-        for name, values in (("wavelengths", wavelengths), ("weights", shares)):
+        for name, values, unit in (("wavelengths", wavelengths, ", in m"), ("weights", shares, ", in any unit")):
             if not all(math.isfinite(value) and value > 0 for value in values):
-                raise ValueError(f"{name} are {list(values)}: they must be finite and positive")
+                raise ValueError(f"{name} are {list(values)}: they must be finite and positive{unit}")
         total, light = sum(shares), dict.fromkeys(map(float, wavelengths), 0.0)
         for wavelength, share in zip(wavelengths, shares, strict=True):
             light[float(wavelength)] += share / total
@@ -70,7 +71,8 @@ class Band:
         ------
         ValueError
             If the sequences differ in length or have fewer than 2 values, wavelengths are not positive and increasing,
-            the transmission is negative, not finite or nowhere positive, or `n_wavelengths` is not from 1 to 32.
+            the transmission is negative, not finite or nowhere positive, or `n_wavelengths` is not a whole number from
+            1 to 32.
 
         Examples
         --------
@@ -80,8 +82,7 @@ class Band:
         """
         nodes, weights = np.asarray(wavelengths, dtype=float), np.asarray(transmission, dtype=float)
         check_curve(nodes, weights)
-        if not 1 <= n_wavelengths <= _MOST_WAVELENGTHS:
-            raise ValueError(f"n_wavelengths is {n_wavelengths}: it must be from 1 to {_MOST_WAVELENGTHS}")
+        n_wavelengths = whole_number("n_wavelengths", n_wavelengths, most=MOST_WAVELENGTHS)
         found, shares = _gauss_quadrature(*_fine_samples(nodes, weights), n_wavelengths)
         return cls.of(found.tolist(), shares.tolist())
 
@@ -156,7 +157,7 @@ class Band:
 
 def _fine_samples(wavelengths: np.ndarray, transmission: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return nodes and weights that integrate the piecewise linear curve times a polynomial exactly."""
-    places, weights = np.polynomial.legendre.leggauss(_MOST_WAVELENGTHS + 1)
+    places, weights = np.polynomial.legendre.leggauss(MOST_WAVELENGTHS + 1)
     half = np.diff(wavelengths)[:, None] / 2
     nodes = wavelengths[:-1, None] + half * (1 + places)
     return nodes.ravel(), (half * weights * np.interp(nodes, wavelengths, transmission)).ravel()

@@ -100,9 +100,12 @@ def layout(
 ) -> dict[str, Any]:
     """Return the arguments of `SparseAperture` for a mask of the catalogue; see `SparseAperture.from_catalog`."""
     mask = entry(name)
-    for label, value in (("mask_diameter", mask_diameter), ("fill_factor", fill_factor)):
+    for label, value, unit in (
+        ("mask_diameter", mask_diameter, ", in m"),
+        ("fill_factor", fill_factor, ", N d^2 / D^2"),
+    ):
         if value is not None and not (math.isfinite(value) and value > 0):
-            raise ValueError(f"{label} is {value}: it must be finite and positive")
+            raise ValueError(f"{label} is {value}: it must be finite and positive{unit}")
     centers = np.array(mask.centers)
     if mask_diameter is not None and fill_factor is not None:
         hole = mask_diameter * math.sqrt(fill_factor / mask.n_subapertures)

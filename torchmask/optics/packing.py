@@ -9,6 +9,8 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
+from torchmask.numbers import whole_number
+
 # Smallest known diameter of the disc that encloses N = 1, 2, ... equal discs, in units of their diameter: R. L. Graham,
 # B. D. Lubachevsky, K. J. Nurmela, P. R. J. Ostergard, Discrete Mathematics 181, 139 (1998); E. Specht, packomania.com.
 # Proven optimal up to 14 and for 19.
@@ -87,11 +89,10 @@ def hole_diameter(n_subapertures: int, mask_diameter: float, fill_factor: float)
     ValueError
         If a number is out of range or the holes cannot be packed; the message gives the largest fill factor.
     """
-    if not float(n_subapertures).is_integer() or n_subapertures < 1:
-        raise ValueError(f"n_subapertures is {n_subapertures}: it must be a whole number of at least 1")
+    n_subapertures = whole_number("n_subapertures", n_subapertures)
     if not (math.isfinite(mask_diameter) and mask_diameter > 0):
         raise ValueError(f"mask_diameter is {mask_diameter}: it must be finite and positive, in m")
-    largest = largest_fill_factor(int(n_subapertures))
+    largest = largest_fill_factor(n_subapertures)
     if not 0 < fill_factor <= largest * (1 + 1e-12):
         stated = math.floor(largest * 1e5) / 1e5
         known = "the best packing known" if n_subapertures <= len(_RATIOS) else "more than any packing reaches"
@@ -110,6 +111,7 @@ def random_packing(
     Holes are drawn uniformly in the disc and pushed apart until they fit. Raises ValueError if they do not.
     """
     reach = hole_diameter(n_subapertures, 1.0, fill_factor)
+    n_subapertures = int(n_subapertures)  # a whole number, as that has checked
     best = 0.0
     for _ in range(_ATTEMPTS):
         u = torch.rand(n_subapertures, 2, generator=generator, dtype=torch.float64, device="cpu").numpy()

@@ -95,7 +95,7 @@ class MappedPixel:
 
     def _places(self, size: int) -> Tensor:
         """Return the positions of the samples along one axis [pixels]."""
-        return (torch.arange(size) - (size - 1) / 2) / self.samples
+        return (torch.arange(size, device="cpu") - (size - 1) / 2) / self.samples
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ class JitteredPixel:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.rms) and self.rms >= 0):
-            raise ValueError(f"jitter is {self.rms}: it must be finite and at least 0, in pixels rms")
+            raise ValueError(f"rms is {self.rms}: it must be finite and at least 0, in pixels")
 
     def __str__(self) -> str:
         return f"{self.pixel or 'points'}, jitter of {self.rms:.4g} pixels rms"

@@ -255,7 +255,10 @@ class _StripArea(torch.autograd.Function):
         cosine, sine = (
             half_widths.new_tensor([[f(turn) for turn in row] for row in turns]) for f in (math.cos, math.sin)
         )
-        beyond, across = half_widths[..., torch.tensor(others)], half_widths[..., None] * cosine
+        beyond, across = (
+            half_widths[..., torch.tensor(others, device=half_widths.device)],
+            half_widths[..., None] * cosine,
+        )
         ends = ((beyond - across) / sine).amin(-1) + ((beyond + across) / sine).amin(-1)
         return ends.clamp(min=0)
 

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from torchmask.grid import Grid
+from torchmask.numbers import whole_number
 from torchmask.optics.shape_base import Shape, vector
 
 
@@ -71,16 +72,16 @@ class Aperture(nn.Module):
         """Largest separation of two points of the aperture, outer edge to outer edge [m].
 
         For hexagons it is an upper bound, as if their corners lay on the longest baseline. A full pupil of this
-        diameter reaches the same spatial frequencies.
+        diameter reaches the same spatial frequencies. A population of no masks has that of one hole.
         """
         centers = self.centers.detach()
         separation = torch.linalg.vector_norm(centers[..., :, None, :] - centers[..., None, :, :], dim=-1)
-        return float(separation.max()) + self.outer_diameter
+        return _largest(separation) + self.outer_diameter
 
     @property
     def reach(self) -> float:
         """Distance of the outermost edge from the origin [m]; an upper bound for hexagons, as for `extent`."""
-        return float(torch.linalg.vector_norm(self.centers.detach(), dim=-1).max()) + self.outer_diameter / 2
+        return _largest(torch.linalg.vector_norm(self.centers.detach(), dim=-1)) + self.outer_diameter / 2
 
     def still(self) -> Self:
         """Return a copy that does not change when this aperture moves or trains."""
@@ -121,9 +122,7 @@ def sample_holes(
     """
     if centers.dtype not in (torch.float32, torch.float64):
         raise TypeError(f"the centres are {centers.dtype}: float32 or float64 is needed, as by aperture.float()")
-    finer = 1 if oversampling is None else oversampling
-    if not float(finer).is_integer() or finer < 1:
-        raise ValueError(f"oversampling is {oversampling}: it must be a whole number of at least 1")
+    finer = 1 if oversampling is None else whole_number("oversampling", oversampling)
     raster = (grid.shape[0] * finer, grid.shape[1] * finer)
     step = (grid.period / raster[0], grid.period / raster[1])
     if diameter * (1 + 1e-9) < 2 * max(step):  # more than rounding, as of a mask that was turned
@@ -154,3 +153,8 @@ def can_be_read(tensor: Tensor) -> bool:
     except RuntimeError:
         return False
     return True
+
+
+def _largest(lengths: Tensor) -> float:
+    """Return the largest of some lengths, 0 if there are none."""
+    return float(lengths.max()) if lengths.numel() else 0.0

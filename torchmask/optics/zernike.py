@@ -8,12 +8,12 @@ disc they are Noll's polynomials; on other shapes, the same polynomials orthonor
 from __future__ import annotations
 
 import math
-from numbers import Integral
 
 import torch
 from torch import Tensor, nn
 
 from torchmask.grid import Grid
+from torchmask.numbers import whole_number
 from torchmask.optics.pupil import Aperture, PupilSamples, can_be_read
 
 _INDEPENDENT = 1e-9  # smallest rms of the part of a mode that is orthogonal to the modes before it
@@ -25,7 +25,7 @@ def noll(j: int) -> tuple[int, int]:
     >>> noll(1), noll(2), noll(3), noll(11)
     ((0, 0), (1, 1), (1, -1), (4, 0))
     """
-    _require_modes(j)
+    j = whole_number("Noll's mode number", j, note=" (1 is piston)")
     n = (math.isqrt(8 * j - 7) - 1) // 2
     place = j - n * (n + 1) // 2  # 1 to n + 1 within the row
     m = 2 * (place // 2) if n % 2 == 0 else 2 * ((place - 1) // 2) + 1
@@ -44,7 +44,7 @@ def zernike(points: Tensor, n_modes: int) -> Tensor:
     >>> zernike(torch.tensor([0.5, 0.0]), 3)
     tensor([1., 1., 0.])
     """
-    _require_modes(n_modes)
+    n_modes = whole_number("n_modes", n_modes)
     x, y = points.unbind(-1)
     argument = 2 * (x**2 + y**2) - 1
     orders = [noll(j) for j in range(1, n_modes + 1)]
@@ -143,10 +143,9 @@ class ZernikePhase(nn.Module):
 
     def __init__(self, aperture: Aperture, grid: Grid, n_modes: int, oversampling: int = 1) -> None:
         super().__init__()
-        _require_modes(n_modes)
+        self.n_modes: int = whole_number("n_modes", n_modes)
         self.aperture: Aperture = aperture
         self.grid: Grid = grid
-        self.n_modes: int = n_modes
         self.oversampling: int = oversampling
         with torch.no_grad():
             self.register_buffer("basis", self._evaluate(), persistent=False)
@@ -173,8 +172,3 @@ class ZernikePhase(nn.Module):
         if coefficients.ndim >= basis.ndim:
             basis = basis.unsqueeze(-4)
         return torch.einsum("...npj,...nj->...np", basis, coefficients)
-
-
-def _require_modes(n_modes: int) -> None:
-    if not isinstance(n_modes, Integral) or n_modes < 1:
-        raise ValueError(f"mode number or count is {n_modes}: it must be a whole number of at least 1 (1 is piston)")

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from torchmask.design.criterion import wiener_mse
 from torchmask.grid import Grid
+from torchmask.numbers import whole_number
 from torchmask.optics.otf import OTF
 from torchmask.optics.pupil import Aperture
-from torchmask.optics.whole import whole_number
 from torchmask.optics.zernike import ZernikePhase
 from torchmask.restoration.aberrations import AberrationBasis, turbulent_basis
 from torchmask.spectra import PSD, evaluate_psd

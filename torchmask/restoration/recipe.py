@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from torchmask.grid import Grid
+from torchmask.numbers import whole_number
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.band import Band
 from torchmask.optics.pixel import PixelResponse
 from torchmask.optics.pupil import sample_holes
-from torchmask.optics.whole import whole_number
 from torchmask.restoration.aberrations import (
     AberrationBasis,
     MakesBasis,

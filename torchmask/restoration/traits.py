@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from enum import Enum
 
 from torchmask.grid import Grid
+from torchmask.numbers import whole_number
 from torchmask.optics.aperture import Aperture, SparseAperture
-from torchmask.optics.whole import whole_number
 from torchmask.restoration.objective import Free
 from torchmask.restoration.schedule import Schedule
 
