@@ -77,6 +77,14 @@ def test_nyquist_refuses_impossible_numbers(diameter, oversampling):
         Grid.nyquist(diameter, 1e-6, 64, oversampling)
 
 
+@pytest.mark.parametrize(("wavelength", "meant"), [(550.0, "550 nm are 550e-9"), (2.2, "2.2 micrometres are 2.2e-6")])
+def test_nyquist_refuses_a_wavelength_in_another_unit(wavelength, meant):
+    with pytest.raises(
+        ValueError, match=f"wavelength is {wavelength:g}: it must be a wavelength of light in m.*{meant}"
+    ):
+        Grid.nyquist(1.0, wavelength, 48)
+
+
 def rows_of(table):
     return {row.split(" | ")[0].removeprefix("| "): row for row in table.splitlines()}
 

@@ -16,13 +16,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from torchmask.folders import free_name, new_folder
 from torchmask.io import (
     as_array,
     as_tensor,
     atomic_write,
-    free_name,
     load_npz,
-    new_folder,
     read_json,
     save_npz,
     to_json,

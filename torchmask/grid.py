@@ -14,6 +14,9 @@ from numbers import Integral
 import torch
 from torch import Tensor
 
+from torchmask.numbers import require_wavelength
+from torchmask.plain import require_plain
+
 ARCSEC = math.pi / 180 / 3600  # rad
 MAS = ARCSEC / 1000  # rad, a thousandth of an arcsecond
 _ROUNDING = 1e-9  # relative tolerance, so that a grid made for exactly Nyquist is accepted
@@ -36,6 +39,13 @@ class Grid:
     ------
     ValueError
         If a number is not finite and positive, or the grid has fewer than 2 pixels on a side.
+    TypeError
+        If a number has a unit of astropy.
+
+    Notes
+    -----
+    Any positive wavelength is taken, as only `wavelength / pixel_scale` counts in a grid; `nyquist`, `read_observation`
+    and the command line refuse what is not a wavelength of light in metres.
 
     Examples
     --------
@@ -57,6 +67,7 @@ class Grid:
         rows, columns = map(int, sides)
         object.__setattr__(self, "n_pixels", (rows, columns) if isinstance(given, tuple | list) else rows)
         for name in ("pixel_scale", "wavelength"):
+            require_plain(name, getattr(self, name))
             value = float(getattr(self, name))
             object.__setattr__(self, name, value)
             if not (math.isfinite(value) and value > 0):
@@ -70,7 +81,13 @@ class Grid:
         """Return the grid that samples the image of an aperture of `diameter` [m] at `oversampling` times Nyquist.
 
         At `oversampling=1` a pixel is wavelength / (2 diameter), the largest without aliasing.
+
+        Raises ValueError if `diameter` is not finite and positive, `oversampling` is below 1, or `wavelength` is not
+        one of light in metres; TypeError if one of them has a unit of astropy.
         """
+        require_plain("diameter", diameter)
+        require_plain("wavelength", wavelength)
+        require_wavelength("wavelength", wavelength)
         if not (math.isfinite(diameter) and diameter > 0):
             raise ValueError(f"diameter is {diameter}: it must be finite and positive, in m")
         if not (math.isfinite(oversampling) and oversampling >= 1):

@@ -20,6 +20,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchmask.plain import require_plain
+
 T = TypeVar("T")
 
 _KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text", Path: "a path"}
@@ -34,9 +36,12 @@ def as_tensor(values: Any, device: torch.device | str | None = None, dtype: torc
     """Convert an array, number or sequence to a tensor, by default on torch's device; a tensor stays where it is.
 
     Arrays may have any strides, as flipped ones do, and any order of bytes, as those of FITS files do.
+
+    Raises TypeError for values with a unit, and ValueError for masked arrays that hide values, see `require_plain`.
     """
     if isinstance(values, Tensor):
         return values.to(device=device, dtype=dtype)
+    require_plain("values", values)
     return torch.as_tensor(_native(np.asarray(values)), dtype=dtype, device=device)
 
 
@@ -93,35 +98,6 @@ def atomic_write(path: str | Path, *, replace: bool = False) -> Iterator[BinaryI
 def _refuse_existing(path: Path) -> None:
     if path.exists():
         raise ValueError(f"{path} exists and is not overwritten: choose another name or move it away")
-
-
-def new_folder(path: str | Path) -> Path:
-    """Create a folder and its parents.
-
-    Raises ValueError if it exists (the message suggests a free name) or cannot be created.
-    """
-    require_new(path := Path(path))
-    try:
-        path.mkdir(parents=True)
-    except OSError as error:
-        raise ValueError(f"{path} cannot be created: {error}") from error
-    return path
-
-
-def require_new(path: Path) -> None:
-    """Raise ValueError if a folder exists; the message suggests a free name."""
-    if path.exists():
-        raise ValueError(f"{path} exists and is not overwritten: choose another, such as {free_name(path)}")
-
-
-def free_name(path: str | Path) -> Path:
-    """Return `path` if it does not exist, or else the first of path-2, path-3, ... that does not."""
-    path = candidate = Path(path)
-    number = 1
-    while candidate.exists():
-        number += 1
-        candidate = path.parent / f"{path.name or 'run'}-{number}"  # the present folder has no name
-    return candidate
 
 
 def save_npz(path: str | Path, arrays: Mapping[str, Any], *, replace: bool = False) -> None:

@@ -32,7 +32,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import torchmask
-from torchmask.io import as_array, atomic_write, extra, new_folder, save_npz, to_json, write_json
+from torchmask.folders import new_folder
+from torchmask.io import as_array, atomic_write, extra, save_npz, to_json, write_json
 from torchmask.record import Record
 from torchmask.viz.figures import stretch
 

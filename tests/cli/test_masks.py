@@ -28,6 +28,14 @@ def test_a_file_is_shown_and_written_as_the_mask_it_holds(tmp_path, capsys):
         torch.testing.assert_close(found.centers, mask.centers, rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("name", ["holes.csv", "holes.txt"])
+def test_a_file_of_another_kind_is_told_which_are_read(tmp_path, capsys, name):
+    for _ in range(2):  # first without the file, which is none of the catalogue either
+        assert main(["masks", str(tmp_path / name)]) == 1
+        assert "its name must end in .json, .dxf, .fits" in capsys.readouterr().err
+        (tmp_path / name).write_text("0.1 0.2")
+
+
 def test_the_wavelength_of_a_mask_goes_with_it(tmp_path, capsys):
     save_json(tmp_path / "first.json", SparseAperture.from_catalog("golay9", 2.0, 0.1), 2.2e-6)
     assert run("masks", tmp_path / "first.json", "--out", tmp_path / "second.json") == 0

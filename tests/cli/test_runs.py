@@ -469,7 +469,8 @@ def test_an_interrupted_restoration_goes_on_to_the_same_result(runs, tmp_path, m
     assert (tmp_path / "rest/config.yaml").read_text() == (tmp_path / "whole/config.yaml").read_text()
     # What cannot be gone on from: other settings, a run without a checkpoint, no run at all.
     capsys.readouterr()
-    refused(["restore", "--resume", tmp_path / "cut", "--tv-weight", "2"], tmp_path, capsys, "other frames or settings")
+    differing = r"cut/resume\.npz is of other frames or settings.*\(here --tv-weight is 2\.0, there 0\.5\)"
+    refused(["restore", "--resume", tmp_path / "cut", "--tv-weight", "2"], tmp_path, capsys, differing)
     refused(["restore", "--resume", runs / "simulate"], tmp_path, capsys, "it is for simulate, not for restore")
     (tmp_path / "rest/resume.npz").unlink()
     refused(["restore", "--resume", tmp_path / "rest"], tmp_path, capsys, "no .*resume.npz to resume from")

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from torchmask.cli.band_options import BandOptions
-from torchmask.cli.stacks import StackOptions, group_files, read_stack
+from torchmask.cli.stacks import StackOptions, group_files, read_stack, require_fine_pixels
 from torchmask.design.manufacture import save_json
-from torchmask.grid import Grid
+from torchmask.grid import ARCSEC, Grid
 from torchmask.observation import Observation
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.band import Band
@@ -71,6 +71,63 @@ def test_frames_of_a_stack_are_skipped_and_those_without_light_left_out(tmp_path
         read_stack([tmp_path / "none.npz"], StackOptions(pixel_fill=2.0))
     with pytest.raises(ValueError, match="skip names frame 6, but the stack has 6 frames, with numbers from 0 to 5"):
         read_stack([tmp_path / "a.npz"], StackOptions(skip=(6,)))
+
+
+def test_frames_alone_are_completed_by_options(tmp_path):
+    mask, path = SparseAperture.from_catalog("golay6", 1.0, 0.15), tmp_path / "mine.npz"
+    save_json(tmp_path / "mask.json", mask, 633e-9)
+    frames, valid = np.full((3, 16, 20), 7.0), np.arange(320).reshape(16, 20) > 5
+    np.savez(path, frames=frames, valid=valid)
+    given = {"mask": tmp_path / "mask.json", "pixel_scale_arcsec": 0.02}
+    seen = read_stack([path], StackOptions(**given, wavelength=550e-9, readout_noise=2.0))
+    assert np.array_equal(seen.frames, frames)
+    assert seen.valid is not None
+    assert np.array_equal(seen.valid, valid)
+    assert torch.equal(seen.aperture.centers, mask.centers)
+    assert (seen.grid, seen.readout_noise) == (Grid((16, 20), 0.02 * ARCSEC, 550e-9), 2.0)
+    assert read_stack([path], StackOptions(**given)).grid.wavelength == 633e-9  # of the mask
+    np.savez(tmp_path / "more.npz", frames=frames, wavelength=2e-6, pixel_scale=1e-7, readout_noise=3.0)
+    told = read_stack([tmp_path / "more.npz"], StackOptions(mask=given["mask"]))
+    assert (told.grid, told.readout_noise) == (Grid((16, 20), 1e-7, 2e-6), 3.0)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "given", "message"),
+    [
+        ({"frames": np.ones((2, 8, 8))}, {}, r"mine\.npz has no 'centers' of a mask: give --mask"),
+        ({"frames": np.ones((2, 8, 8))}, {"mask": "keck_nirc2_9"}, r"mine\.npz has no wavelength: give --wavelength"),
+        ({"frames": np.ones((2, 8, 8)), "wavelength": 2e-6}, {"mask": "keck_nirc2_9"}, "give --pixel-scale-arcsec"),
+        ({"frames": np.ones((8, 8)), "wavelength": 2e-6, "pixel_scale": 1e-7}, {"mask": "keck_nirc2_9"}, "n_frames, 8"),
+        ({"frames": np.ones((2, 8, 8)), "wavelength": 550, "pixel_scale": 1e-7}, {"mask": "keck_nirc2_9"}, "550e-9"),
+        ({"image": np.ones((8, 8))}, {"mask": "keck_nirc2_9"}, r"mine\.npz has no 'frames'; it contains 'image'"),
+        ({"frames": np.ones((2, 8, 8)), "centers": np.ones((3, 2))}, {}, "has no 'subaperture_diameter'"),
+    ],
+)
+def test_what_frames_alone_lack_is_named_with_its_option(tmp_path, arrays, given, message):
+    np.savez(tmp_path / "mine.npz", **arrays)
+    with pytest.raises(ValueError, match=message):
+        read_stack([tmp_path / "mine.npz"], StackOptions(**{name: Path(value) for name, value in given.items()}))
+
+
+def test_what_is_no_stack_is_refused_by_what_it_is(write_fits, fits_cube, tmp_path):
+    cube, stack, array = write_fits("a.fits", fits_cube), tmp_path / "b.npz", tmp_path / "c.npy"
+    np.savez(stack, frames=fits_cube)
+    np.save(array, fits_cube)
+    for files, message in (
+        ([array], r"c\.npy is a bare array: write it as `frames` \[electrons\] to an \.npz file"),
+        ([tmp_path], r"is a folder: give the FITS files in it, such as .*\*\.fits"),
+        ([cube, stack], r"--join is for FITS files, but .*b\.npz is a stack by itself"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            read_stack(files, StackOptions(**FULL))
+
+
+def test_a_pixel_scale_of_the_file_that_undersamples_is_blamed_on_the_file(write_fits, fits_cube):
+    path = write_fits("a.fits", fits_cube, PIXELSCL=20.0)
+    seen = read_stack([path], StackOptions(**FULL))
+    with pytest.raises(ValueError, match=r"a\.fits: the pixel scale .* undersamples .*; correct it in the file"):
+        require_fine_pixels(seen, StackOptions(**FULL), path)
+    require_fine_pixels(seen, StackOptions(**FULL, pixel_scale_arcsec=20.0), path)  # refused in its words elsewhere
 
 
 def test_a_cube_in_adu_needs_a_gain(write_fits, fits_cube):

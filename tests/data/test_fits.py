@@ -65,6 +65,9 @@ def test_damaged_files_are_refused_in_one_line(tmp_path, write_fits, fits_cube):
         assert "\n" not in str(caught.value)
     with pytest.raises(ValueError, match=r"there is no file .*absent\.fits"):
         read_fits(tmp_path / "absent.fits")
+    np.save(tmp_path / "array.npy", fits_cube)
+    with pytest.raises(ValueError, match=r"array\.npy is not a FITS file, .* valid FITS file\.$"):
+        read_fits(tmp_path / "array.npy")
 
 
 @pytest.mark.parametrize(
@@ -86,6 +89,23 @@ def test_extensions_must_agree(write_fits, fits_cube):
         read_fits(write_fits("a.fits", fits_cube, extensions=[quality], sci=True))
     with pytest.raises(ValueError, match=r"2 SCI extensions"):
         read_fits(write_fits("b.fits", fits_cube, extensions=[("SCI", fits_cube)], sci=True))
+
+
+@pytest.mark.parametrize("names", [["", "", ""], ["FRAME", "FRAME"]])
+def test_one_frame_for_each_extension_is_refused_with_their_number(write_fits, fits_cube, names):
+    extensions = list(zip(names, fits_cube, strict=False))
+    with pytest.raises(ValueError, match=rf"holds {len(names)} images of one shape .* as one cube \(T, H, W\)"):
+        read_fits(write_fits("a.fits", None, extensions=extensions))
+
+
+def test_a_primary_image_with_another_like_it_is_refused_but_not_with_one_of_another_name_or_shape(
+    write_fits, fits_cube
+):
+    first, second, _ = fits_cube
+    with pytest.raises(ValueError, match="holds 2 images of one shape"):
+        read_fits(write_fits("a.fits", first, extensions=[("", second)]))
+    others = [("WEIGHT", second), ("", second[:8])]
+    assert np.array_equal(read_fits(write_fits("b.fits", first, extensions=others)).values, [first])
 
 
 @pytest.mark.parametrize("name", ["BADPIX", "BPM", "DQ"])

@@ -1,6 +1,7 @@
 """What the cards of a header mean: pixel scale, wavelength, time, units."""
 
 import math
+import warnings
 
 import pytest
 
@@ -54,7 +55,7 @@ def electrons(header, is_cube=False, unit=None, gain=None, exposure_time=None):
         {"CDELT1": SCALE, "CDELT2": SCALE, "CUNIT1": "arcsec", "CUNIT2": "arcsec"},
         {"CDELT1": SCALE * ARCSEC, "CDELT2": SCALE * ARCSEC, "CUNIT1": "rad", "CUNIT2": "rad"},
         {"PIXSCALE": SCALE},
-        {"PIXELSCL": SCALE, "CDELT1": 1.0, "CDELT2": 1.0, "CUNIT1": "deg", "CUNIT2": "deg"},
+        {"PIXELSCL": SCALE, "CDELT1": 1.009 * SCALE, "CDELT2": SCALE, "CUNIT1": "arcsec", "CUNIT2": "arcsec"},
     ],
 )
 def test_every_way_to_state_the_pixel_scale(cards):
@@ -67,6 +68,17 @@ def test_a_matrix_of_cards_states_the_pixel_scale(sky_cards):
     assert pixel_scale(cards, "a.fits", None) == pytest.approx(SCALE * ARCSEC, rel=1e-12)
     with pytest.raises(ValueError, match=r"a\.fits: pixels of .* arcsec are not square"):
         pixel_scale(cards | {"CD1_1": 2 * cards["CD1_1"]}, "a.fits", None)
+
+
+@pytest.mark.parametrize("name", ["PIXELSCL", "PIXSCALE"])
+def test_a_card_that_contradicts_the_matrix_wins_with_a_warning_of_both(sky_cards, name):
+    cards = sky_cards(0.3, 1.02 * SCALE * ARCSEC) | {name: SCALE}
+    with pytest.warns(UserWarning, match=rf"a\.fits: {name} is 0\.02 arcsec, which is taken, but .* says 0\.0204"):
+        assert pixel_scale(cards, "a.fits", None) == pytest.approx(SCALE * ARCSEC, rel=1e-12)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert pixel_scale(cards, "a.fits", 1e-7) == 1e-7  # what is given decides
+        pixel_scale(cards | {name: 1.013 * SCALE}, "a.fits", None)
 
 
 @pytest.mark.parametrize(
@@ -86,8 +98,12 @@ def test_the_wavelength_is_that_of_its_card_or_of_the_filter():
     assert wavelength(cards | {"WAVELEN": 3.8e-6}, "a.fits", 1e-6) == 1e-6
     with pytest.raises(ValueError, match=r"no WAVELEN.*give wavelength \[m\] \(FILTER is 'V'.*NIRISS F480M"):
         wavelength(cards | {"FILTER": "V"}, "a.fits", None)
-    with pytest.raises(ValueError, match=r"a\.fits: WAVELEN is 550, which is not a wavelength in metres"):
-        wavelength({"WAVELEN": 550.0}, "a.fits", None)
+
+
+@pytest.mark.parametrize("name", ["WAVELEN", "WAVELNTH"])
+def test_a_wavelength_in_nanometres_is_refused_by_the_name_of_its_card(name):
+    with pytest.raises(ValueError, match=rf"a\.fits: {name} is 550: .* 550 nm are 550e-9; correct it, or give wave"):
+        wavelength({name: 550.0}, "a.fits", None)
 
 
 @pytest.mark.parametrize(("unit", "factor"), UNITS.items())

@@ -15,6 +15,7 @@ from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.sky import pixel_matrix
 
 fits = pytest.importorskip("astropy.io.fits")
+units = pytest.importorskip("astropy.units")
 wcs = pytest.importorskip("astropy.wcs")
 
 
@@ -53,6 +54,27 @@ def test_options_stand_for_missing_cards_and_win_over_present_ones(write_fits, m
         assert observation.grid == Grid((16, 20), 1e-7, 2e-6)
         assert observation.readout_noise == 0.5
         assert torch.equal(observation.frames, 2 * torch.from_numpy(cube).double())
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"wavelength": 550.0}, ValueError, "wavelength is 550: .* 550 nm are 550e-9"),
+        (
+            {"pixel_scale": 0.02},
+            ValueError,
+            r"pixel_scale is 0\.02: it must be an angle .* 0\.02 arcsec are 9\.696e-08",
+        ),
+        ({"wavelength": 550 * units.nm}, TypeError, r"wavelength has the unit nm: .* give wavelength\.to_value\('m'\)"),
+        ({"pixel_scale": 0.02 * units.arcsec}, TypeError, r"give pixel_scale\.to_value\('rad'\)"),
+        ({"gain": 1.6 * units.electron / units.adu}, TypeError, r"give gain\.value"),
+        ({"readout_noise": 3 * units.electron}, TypeError, r"give readout_noise\.to_value\('electron'\)"),
+        ({"unit": units.electron}, TypeError, "unit is a .*: it must be text, such as 'electron'"),
+    ],
+)
+def test_numbers_in_other_units_and_with_units_are_refused(write_fits, mask, cube, options, error, message):
+    with pytest.raises(error, match=message):
+        read_observation(write_fits("a.fits", cube), mask, **options)
 
 
 def test_the_masks_wavelength_counts_where_the_header_tells_none(write_fits, mask, cube):
@@ -285,6 +307,7 @@ def test_an_observation_that_was_read_survives_its_own_file(tmp_path, write_fits
     assert torch.equal(back.frames, observation.frames)
 
 
+@pytest.mark.filterwarnings("ignore:.*which is taken, but:UserWarning")  # where damage changes one of two scales
 def test_no_damage_brings_anything_but_one_line(tmp_path, write_fits, mask, cube, sky):
     """Bytes of headers and data changed at random, or the end cut off: read, or refused with a ValueError."""
     extensions = [("ERR", cube / 10), ("DQ", np.eye(16, 20, dtype=np.int16))]

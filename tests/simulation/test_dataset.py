@@ -227,3 +227,8 @@ def test_bad_input_is_refused_when_it_is_made(options, message):
 def test_bad_ranges_are_refused(bad):
     with pytest.raises(ValueError, match=next(iter(bad))):
         StackRanges(**bad)
+
+
+def test_ranges_of_another_type_are_refused():
+    with pytest.raises(TypeError, match="ranges is a dict: it must be StackRanges"):
+        stacks(ranges={"r0": (0.1, 0.2)})

@@ -356,5 +356,9 @@ def test_bad_requests_are_refused(scene, mask, grid):
     for n_frames in (0, -1, 1.5):
         with pytest.raises(ValueError, match="n_frames"):
             simulate(scene, mask, grid, n_frames=n_frames)
+    with pytest.raises(TypeError, match=r"scene is a ndarray: it must be a tensor \(H, W\)"):
+        simulate(scene.numpy(), mask, grid)
+    with pytest.raises(TypeError, match=r"generator is 0: it must be a torch\.Generator"):
+        simulate_observation(scene, mask, grid, None, Detector(), 1, 0)
     with pytest.raises(ValueError, match="n_frames is 1000000000000: that takes at least"):
         simulate(scene, mask, grid, n_frames=10**12)

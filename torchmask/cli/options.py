@@ -234,8 +234,8 @@ def mask_file_wavelength(options: MaskOptions) -> float | None:
 
 
 def is_mask_file(path: Path) -> bool:
-    """Return whether `path` is a file rather than a name in the catalogue."""
-    return path.is_file() or path.suffix.lower() in MASK_SUFFIXES
+    """Return whether `path` is a file, of whatever kind, rather than a name in the catalogue, which has no suffix."""
+    return path.is_file() or path.suffix != ""
 
 
 def load_mask_file(path: str | Path, options: CatalogOptions) -> SparseAperture:

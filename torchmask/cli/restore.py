@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,12 +20,14 @@ from torchmask.cli.oifits import OIFITSOptions, measure_frames, write_frames
 from torchmask.cli.options import RunOptions, WorkerOptions
 from torchmask.cli.outcome import log_outcome, pixel_text, summarise_outcome, write_outcome
 from torchmask.cli.program import NOT_EXPLAINED
+from torchmask.cli.resume import find_checkpoint, resumed
 from torchmask.cli.run import CHECKPOINT, new_run
-from torchmask.cli.stacks import StackOptions, group_files, read_stack
+from torchmask.cli.stacks import StackOptions, group_files, read_stack, require_fine_pixels
+from torchmask.folders import new_folder, require_new
 from torchmask.instrument.instrument import Instrument
 from torchmask.interferometry.calibration import MaskCalibration
 from torchmask.interferometry.observables import Observables
-from torchmask.io import new_folder, require_new, write_json
+from torchmask.io import write_json
 from torchmask.numbers import require_wavelength
 from torchmask.observation import Observation
 from torchmask.restoration.background import Background
@@ -50,10 +51,11 @@ class Options(BandOptions, StackOptions, OIFITSOptions, WorkerOptions, RunOption
 
     A stack is an .npz file, such as `torchmask simulate` writes, or a FITS cube; several are restored in parallel and
     independently. With --join all FITS files, cubes or images of one filter and orientation, form one stack. FITS files
-    need --mask. The command writes restored.fits (with the sky coordinates of the input, and the settings in HISTORY),
-    restored.npz, figures, metrics.json, config.yaml, the log and, with --instrument, instrument.json to a new folder,
-    or for several stacks to a subfolder for each. The last line says whether the restoration explains the frames; the
-    exit status is 3 if it does not.
+    need --mask, and so do .npz files with nothing but frames [electrons], which need --wavelength and
+    --pixel-scale-arcsec too. The command writes restored.fits (with the sky coordinates of the input, and the settings
+    in HISTORY), restored.npz, figures, metrics.json, config.yaml, the log and, with --instrument, instrument.json to a
+    new folder, or for several stacks to a subfolder for each. The last line says whether the restoration explains the
+    frames; the exit status is 3 if it does not.
     """
 
     stacks: tyro.conf.Positional[tuple[Path, ...]] = ()
@@ -141,6 +143,7 @@ def run(options: Options) -> int:
 def read_calibrated(files: Sequence[Path], options: Options, star: MaskCalibration | None) -> Observation:
     """Read one stack, with the mask's geometry, and pixels if asked for, as measured on the star if there is one."""
     observation = read_stack(files, options)
+    require_fine_pixels(observation, options, files[0])
     if star is None:
         return observation
     pixel = star.pixel if options.estimate_pixel else observation.pixel
@@ -150,24 +153,22 @@ def read_calibrated(files: Sequence[Path], options: Options, star: MaskCalibrati
 def restore_one(files: Sequence[Path], options: Options, star: MaskCalibration | None) -> int:
     """Restore one stack on all cores, with a checkpoint for --resume; return the exit status."""
     observation = read_calibrated(files, options, star)
-    checkpoint = None if options.resume is None else options.resume / CHECKPOINT
-    if checkpoint is not None and not checkpoint.is_file():
-        raise ValueError(f"there is no {checkpoint} to resume from: it is first written at the 100th iteration")
+    if options.resume is not None:
+        find_checkpoint(options.resume)  # said before a folder is made
     method = deconvolution(observation, options)
     observables = measure_frames(observation, options, known_sky(options))
     with new_run("restore", options) as output:
         output.keep_instrument(options.known_instrument())
         state = output.directory / CHECKPOINT
-        if checkpoint is not None:
-            shutil.copyfile(checkpoint, state)
-        result = method.restore(
-            observation.frames,
-            valid=observation.valid,
-            errors=observation.errors,
-            n_samples=options.n_samples,
-            checkpoint=state,
-            callback=output.callback,
-        ).with_frame_numbers(observation.frame_numbers)
+        with resumed(options.resume, state, "restore", options):
+            result = method.restore(
+                observation.frames,
+                valid=observation.valid,
+                errors=observation.errors,
+                n_samples=options.n_samples,
+                checkpoint=state,
+                callback=output.callback,
+            ).with_frame_numbers(observation.frame_numbers)
         if star is not None and options.star is not None:
             write_calibration(output, star, [options.star], observation.grid.wavelength)
         output.summary.extend(

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any
 from torchmask.cli.config import CONFIG, save_config, stored
 from torchmask.cli.instrument_used import INSTRUMENT
 from torchmask.cli.options import RunOptions, SweepOptions
+from torchmask.folders import free_name
 from torchmask.instrument.instrument import Instrument
-from torchmask.io import atomic_write, free_name, write_json
+from torchmask.io import atomic_write, write_json
 from torchmask.progress import Progress
 from torchmask.record import Callback, Record, fan_out
 from torchmask.tracking import RunLogger

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 
 from torchmask.cli.agreement import complete, planned_scale, require_time
@@ -18,10 +19,12 @@ from torchmask.cli.options import (
     mask_file_wavelength,
     pixel_angle,
 )
+from torchmask.data.keywords import missing
 from torchmask.data.light import usable_frames
 from torchmask.data.observe import read_observation
 from torchmask.grid import Grid
 from torchmask.instrument.instrument import Instrument
+from torchmask.io import as_tensor, load_npz
 from torchmask.numbers import require_wavelength
 from torchmask.observation import Observation, check_frames
 from torchmask.optics.pixel import jittered, square_pixel
@@ -126,14 +129,17 @@ def _given(options: StackOptions) -> set[str]:
 
 def _read(files: Sequence[Path], options: StackOptions, known: Instrument | None) -> Observation:
     telescope = None if known is None else known.telescope
-    if files[0].suffix.lower() != ".npz":
+    stacks = [path for path in files if path.suffix.lower() in (".npz", ".npy")]
+    if not stacks:
         return _from_fits(files, options, known)
     if len(files) > 1:
-        raise ValueError(f"--join is for FITS files, but {files[0]} is a stack by itself: leave it out")
+        raise ValueError(f"--join is for FITS files, but {stacks[0]} is a stack by itself: leave out one or the other")
+    if files[0].suffix.lower() == ".npy":
+        raise ValueError(f"{files[0]} is a bare array: write it as `frames` [electrons] to an .npz file by numpy.savez")
     _refuse(options, FITSOptions, f"is for FITS files, but {files[0]} is not one: leave it out")
     if options.mask is None:
         _refuse(options, MaskOptions, f"is for --mask, which is not given: {files[0]} has a mask of its own")
-    observation = Observation.load(files[0])
+    observation = _from_npz(files[0], options, known)
     grid, scale = observation.grid, pixel_angle(options.pixel_scale_arcsec)
     changes: dict[str, Any] = {
         "grid": Grid(grid.n_pixels, scale or grid.pixel_scale, options.wavelength or grid.wavelength)
@@ -146,6 +152,61 @@ def _read(files: Sequence[Path], options: StackOptions, known: Instrument | None
     if options.readout_noise is not None:
         changes["readout_noise"] = options.readout_noise
     return _usable(dataclasses.replace(observation, **changes), files[0], options)
+
+
+def _from_npz(path: Path, options: StackOptions, known: Instrument | None) -> Observation:
+    """Read an .npz file: an observation, or frames without a mask.
+
+    Raises ValueError if the file is neither, or holds no wavelength of light in metres.
+    """
+    try:
+        observation = Observation.load(path)
+    except ValueError:
+        stored = load_npz(path, required=("frames",))
+        if "centers" in stored:
+            raise
+        observation = _from_frames(path, stored, options, known)
+    require_wavelength(f"{path}: wavelength", observation.grid.wavelength)
+    return observation
+
+
+def _from_frames(
+    path: Path, stored: Mapping[str, np.ndarray], options: StackOptions, known: Instrument | None
+) -> Observation:
+    """Return frames [electrons], which the arrays of a file hold, with what options say of them, as of FITS files.
+
+    Raises ValueError if neither the file nor an option says what is needed, or an array has a wrong shape.
+    """
+    if options.mask is None:
+        raise ValueError(f"{path} has no 'centers' of a mask: give --mask")
+    aperture = load_aperture(options, None if known is None else known.telescope)
+    planned = (mask_file_wavelength(options), None) if known is None else (known.mean_wavelength, planned_scale(known))
+    told = {name: stored[name].item() for name in ("wavelength", "pixel_scale", "readout_noise") if name in stored}
+    wavelength = options.wavelength or told.get("wavelength") or planned[0]
+    scale = pixel_angle(options.pixel_scale_arcsec) or told.get("pixel_scale") or planned[1]
+    if wavelength is None:
+        raise missing(path, "wavelength", "--wavelength [m]")
+    if scale is None:
+        raise missing(path, "pixel_scale", "--pixel-scale-arcsec [arcsec]")
+    arrays: dict[str, Any] = {
+        name: as_tensor(stored[name], "cpu") for name in ("frames", "valid", "errors") if name in stored
+    }
+    try:
+        grid = Grid(tuple(arrays["frames"].shape[-2:]), scale, wavelength)
+        return Observation(aperture=aperture, grid=grid, readout_noise=told.get("readout_noise"), **arrays)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def require_fine_pixels(observation: Observation, options: StackOptions, path: Path) -> None:
+    """Raise ValueError, which blames the file, if the pixel scale that it states undersamples the image."""
+    if options.pixel_scale_arcsec is not None:
+        return
+    try:
+        observation.grid.require_sampling(observation.aperture.extent)
+    except ValueError as error:
+        told = str(error).replace("pixel_scale", "the pixel scale")  # which `wording` would take for the option
+        raise ValueError(f"{path}: {told}; correct it in the file, or give --pixel-scale-arcsec") from error
 
 
 def _refuse(options: StackOptions, group: type, reason: str) -> None:

@@ -44,8 +44,8 @@ def read_fits(path: str | Path) -> FITSImages:
     Raises
     ------
     ValueError
-        If the file is missing, not FITS, truncated or fails its checksum, has no image of 2 or 3 axes or several SCI
-        extensions, or if the shapes of its extensions disagree.
+        If the file is missing, not FITS, truncated or fails its checksum, has no image of 2 or 3 axes, or several
+        between which neither a name nor a shape decides, or if the shapes of its extensions disagree.
     """
     with extra("data"):
         from astropy.io import fits
@@ -53,6 +53,8 @@ def read_fits(path: str | Path) -> FITSImages:
         from astropy.utils.exceptions import AstropyUserWarning
 
     path = Path(path)
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder: give the FITS files in it, such as {path / '*.fits'}")
     if not path.is_file():
         raise ValueError(f"there is no file {path} (needed: a FITS file)")
     try:
@@ -71,7 +73,8 @@ def read_fits(path: str | Path) -> FITSImages:
 
 
 def _damaged(path: Path, why: Any) -> ValueError:
-    return ValueError(f"{path} is not a FITS file, or is damaged: {' '.join(str(why).split())}")
+    told = " ".join(str(why).split()).partition(" If this is really a FITS file")[0]  # an option of astropy follows
+    return ValueError(f"{path} is not a FITS file, or is damaged: {told}")
 
 
 class _Refused(Exception):
@@ -85,6 +88,12 @@ def _images(path: Path, hdus: Any) -> FITSImages:
         raise _Refused("holds no image")
     if len(science) > 1:
         raise _Refused(f"holds {len(science)} SCI extensions: write the one to use to a file of its own")
+    alike = [hdu for hdu in images if _nature(hdu) == _nature(images[0])]
+    if len(alike) > 1:
+        raise _Refused(
+            f"holds {len(alike)} images of one shape without names that differ: if they are frames, write them as one "
+            "cube (T, H, W), or else write the one to use to a file of its own"
+        )
     values = images[0].data
     if values is None or values.ndim not in (2, 3) or 0 in values.shape:
         shape = None if values is None else values.shape
@@ -111,6 +120,11 @@ def _images(path: Path, hdus: Any) -> FITSImages:
         header,
         values.ndim == 3,
     )
+
+
+def _nature(hdu: Any) -> tuple[str, tuple[int, ...]]:
+    """Return what tells an image from its companions: its name, which a primary image lacks, and its shape."""
+    return "" if hdu.name == "PRIMARY" else hdu.name, hdu.shape
 
 
 def _cards(header: Any) -> dict[str, bool | int | float | str]:

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import math
 import re
+import warnings
 from typing import Any
 
 import numpy as np
 
 from torchmask.grid import ARCSEC
 from torchmask.io import extra
+from torchmask.numbers import require_wavelength
 from torchmask.optics.band import FILTERS, filter_of_header
 from torchmask.optics.pixel import PixelResponse, square_pixel
 from torchmask.optics.sky import celestial_cards, pixel_matrix
@@ -21,6 +23,8 @@ from torchmask.optics.sky import celestial_cards, pixel_matrix
 # al., PASP 136, 2024, doi:10.1088/1538-3873/ad1c98), whose pixels of HgCdTe fill their pitch (Beletic, Laser Focus
 # World, October 2007). Charge that spreads to neighbours blurs a little more, by a share that depends on the light.
 PIXEL_FILL = {"NIRISS": 1.0, "NIRCAM": 1.0}
+
+_SAME_SCALE = 0.01  # relative difference of two statements of the pixel scale that is no contradiction
 
 _ABOUT = ("OBJECT", "TARGNAME", "TARG_RA", "TARG_DEC", "RA", "DEC", "TELESCOP", "INSTRUME", "FILTER", "DATE-OBS")
 _ABOUT += ("TIME-OBS", "MJD-OBS", "MJD-AVG", "OBSERVER")
@@ -36,29 +40,38 @@ def number(header: Any, names: tuple[str, ...], path: Any) -> float | None:
 
     Raises ValueError if the card is not such a number.
     """
-    for name in names:
-        value = header.get(name)
-        if value is None:
-            continue
+    if (name := first_card(header, names)) is not None:
+        value = header[name]
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value < 0:
             raise ValueError(f"{path}: {name} is {value!r}, which is not a positive number")
         return float(value)
     return None
 
 
+def first_card(header: Any, names: tuple[str, ...]) -> str | None:
+    """Return the first of these names that the header has a value for, or None."""
+    return next((name for name in names if header.get(name) is not None), None)
+
+
 def pixel_scale(header: Any, path: Any, given: float | None, fallback: float | None = None) -> float:
     """Return the pixel scale [rad]: PIXELSCL or PIXSCALE [arcsec], else the square root of a pixel's area by the WCS.
 
-    Without either it is `fallback`.
+    Without either it is `fallback`. Warns if both are there and differ by more than 1 %.
 
     Raises ValueError if that is None too, or if pixels differ from squares by more than 2 %.
     """
     if given is not None:
         return given
-    arcsec = number(header, ("PIXELSCL", "PIXSCALE"), path)
-    if arcsec:
+    names, matrix = ("PIXELSCL", "PIXSCALE"), pixel_matrix(header)
+    if arcsec := number(header, names, path):
+        side = arcsec if matrix is None else math.sqrt(abs(np.linalg.det(matrix))) / ARCSEC
+        if abs(side / arcsec - 1) > _SAME_SCALE:
+            warnings.warn(
+                f"{path}: {first_card(header, names)} is {arcsec:.5g} arcsec, which is taken, but the CD matrix or "
+                f"CDELT says {side:.5g} arcsec: correct the wrong one, or give the pixel scale",
+                stacklevel=3,
+            )
         return arcsec * ARCSEC
-    matrix = pixel_matrix(header)
     if matrix is None and fallback is not None:
         return fallback
     if matrix is None:
@@ -76,10 +89,13 @@ def wavelength(header: Any, path: Any, given: float | None, fallback: float | No
     """
     if given is not None:
         return given
-    value = number(header, ("WAVELEN", "WAVELNTH"), path)
+    names = ("WAVELEN", "WAVELNTH")
+    value = number(header, names, path)
     if value is not None:
-        if not 1e-8 < value < 1e-2:
-            raise ValueError(f"{path}: WAVELEN is {value:g}, which is not a wavelength in metres: give wavelength [m]")
+        try:
+            require_wavelength(f"{path}: {first_card(header, names)}", value)
+        except ValueError as error:
+            raise ValueError(f"{error}; correct it, or give wavelength [m]") from error
         return value
     band = filter_of_header(header)
     if band is not None:

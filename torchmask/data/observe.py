@@ -13,14 +13,14 @@ import numpy as np
 import torch
 
 from torchmask.data import keywords
-from torchmask.data.calibration import SELECTIONS, best_frames, calibrate, crop_corner, find_target
+from torchmask.data.calibration import best_frames, calibrate, crop_corner, find_target
+from torchmask.data.checks import check_alike, check_options, check_rotation
 from torchmask.data.fits import FITSImages, read_fits
 from torchmask.data.light import opened_files, usable_frames
 from torchmask.data.reference import reference_image
-from torchmask.grid import ARCSEC, Grid
+from torchmask.grid import Grid
 from torchmask.observation import Observation
 from torchmask.optics.aperture import Aperture
-from torchmask.optics.sky import pixel_matrix
 
 PathLike = str | Path
 
@@ -106,12 +106,15 @@ def read_observation(
     ValueError
         If a file is missing or damaged; a keyword that is needed is missing (the message names it and the option to
         give instead); the files mix filters, wavelengths, pixel scales, shapes or orientations; or an option is out of
-        range.
+        range, such as a wavelength in nm or a pixel scale in arcsec.
+    TypeError
+        If a number has a unit of astropy, or `unit` is no text.
 
     Warns
     -----
     UserWarning
-        If files or frames are left out, pixels are saturated, frames are clouded, or a dark has another exposure time.
+        If files or frames are left out, pixels are saturated, frames are clouded, a dark has another exposure time, or
+        a header states two pixel scales that differ by more than 1 %.
 
     Examples
     --------
@@ -126,7 +129,7 @@ def read_observation(
     (torch.Size([5, 32, 32]), 1.5)
     """
     positive = (wavelength, design_wavelength, pixel_scale, design_pixel_scale, gain, exposure_time, saturation)
-    _check_options(positive, readout_noise, crop, keep, keep_by)
+    check_options(positive, readout_noise, crop, keep, keep_by, unit)
     if target is not None and crop is None:
         raise ValueError(f"target is {target}, but there is no field to cut out around it: give crop [pixels] too")
     files = [read_fits(path) for path in ([paths] if isinstance(paths, str | Path) else list(paths))]
@@ -135,7 +138,7 @@ def read_observation(
     files, numbers, skip = opened_files(files, skip)
     lengths = [keywords.wavelength(file.header, file.path, wavelength, design_wavelength) for file in files]
     scales = [keywords.pixel_scale(file.header, file.path, pixel_scale, design_pixel_scale) for file in files]
-    _check_alike(files, lengths, scales)
+    check_alike(files, lengths, scales)
     options = (unit, gain, exposure_time)
     factors = [keywords.electrons_per_unit(f.header, f.path, f.is_cube, *options) for f in files]
     times = [keywords.exposure_seconds(file.header, file.path, file.is_cube, exposure_time) for file in files]
@@ -157,7 +160,7 @@ def read_observation(
     frames = np.concatenate([stack[0] for stack in stacks])
     valid = np.concatenate([stack[2] for stack in stacks])
     errors = _joined([stack[1] for stack in stacks])
-    _check_rotation(files, frames.shape[-1])
+    check_rotation(files, frames.shape[-1])
     kept = usable_frames(frames, valid, skip, numbers)
     if keep is not None:
         kept = kept[best_frames(frames[kept], valid[kept], keep, keep_by)]
@@ -197,68 +200,6 @@ def _mean_exposure(files: Sequence[FITSImages], times: Sequence[float | None]) -
     if len(known) < len(files):
         return {}
     return {"XPOSURE": sum(time * count for time, count in known) / sum(count for _, count in known)}
-
-
-_POSITIVE = {
-    "wavelength": "m",
-    "design_wavelength": "m",
-    "pixel_scale": "rad",
-    "design_pixel_scale": "rad",
-    "gain": "electrons per adu",
-    "exposure_time": "s",
-    "saturation": "the unit of the file",
-}
-
-
-def _check_options(
-    positive: Sequence[float | None], readout_noise: float | None, crop: int | None, keep: float | None, keep_by: str
-) -> None:
-    for (name, unit), value in zip(_POSITIVE.items(), positive, strict=True):
-        if value is not None and not (math.isfinite(value) and value > 0):
-            raise ValueError(f"{name} is {value}: it must be finite and positive, in {unit}")
-    if readout_noise is not None and not (math.isfinite(readout_noise) and readout_noise >= 0):
-        raise ValueError(f"readout_noise is {readout_noise}: it must be finite and at least 0, in electrons rms")
-    if crop is not None and (not float(crop).is_integer() or crop < 2):
-        raise ValueError(f"crop is {crop}: it must be a whole number of pixels, at least 2")
-    if keep is not None and not 0 < keep <= 1:
-        raise ValueError(f"keep is {keep}: it must be a fraction of the frames, above 0 and at most 1")
-    if keep_by not in SELECTIONS:
-        raise ValueError(f"keep_by is {keep_by!r}: it must be {' or '.join(SELECTIONS)}")
-    if keep is None and keep_by != SELECTIONS[0]:
-        raise ValueError(f"keep_by is {keep_by!r}, but all frames are kept: give keep, the fraction of the best, too")
-
-
-def _check_alike(files: Sequence[FITSImages], wavelengths: Sequence[float], scales: Sequence[float]) -> None:
-    """Raise ValueError unless all files have one filter, wavelength, pixel scale and shape."""
-    kinds: tuple[tuple[str, Sequence[Any], Any], ...] = (
-        ("filters", [str(file.header.get("FILTER", "")).strip() for file in files], str),
-        ("wavelengths", wavelengths, lambda value: f"{value:.5g} m"),
-        ("pixel scales", scales, lambda value: f"{value / ARCSEC:.5g} arcsec"),
-        ("image shapes", [file.values.shape[1:] for file in files], str),
-    )
-    for what, values, format_value in kinds:
-        for file, value in zip(files, values, strict=True):
-            alike = abs(value / values[0] - 1) < 1e-3 if isinstance(value, float) else value == values[0]
-            if not alike:
-                raise ValueError(
-                    f"the files mix {what}: {files[0].path} has {format_value(values[0])} and {file.path} "
-                    f"{format_value(value)}; read them separately"
-                )
-
-
-def _check_rotation(files: Sequence[FITSImages], size: int) -> None:
-    """Raise ValueError if a file is rotated or mirrored relative to the first by more than half a pixel at a corner."""
-    matrices = [pixel_matrix(file.header) for file in files]
-    first = matrices[0]
-    for file, matrix in zip(files, matrices, strict=True):
-        if first is None or matrix is None:
-            continue
-        moved = np.abs((np.linalg.inv(first) @ matrix - np.eye(2)) @ [[1, 1], [1, -1]]).max() * size / 2
-        if moved > 0.5:
-            raise ValueError(
-                f"the files mix orientations: the corner of {file.path} lies {moved:.1f} pixels from that of "
-                f"{files[0].path} on the sky; read files of different orientations separately"
-            )
 
 
 def _stack(

@@ -8,13 +8,16 @@ from __future__ import annotations
 import math
 
 import torch
-from deepinv.optim import Prior  # pyright: ignore[reportMissingImports] -- an extra
-from deepinv.physics import LinearPhysics, PoissonGaussianNoise  # pyright: ignore[reportMissingImports] -- an extra
 from torch import Tensor
 
+from torchmask.io import extra
 from torchmask.observation import Observation
 from torchmask.optics.detector import image_formation, image_formation_adjoint
 from torchmask.restoration.priors import ObjectPrior
+
+with extra("deepinv"):
+    from deepinv.optim import Prior  # pyright: ignore[reportMissingImports] -- an extra
+    from deepinv.physics import LinearPhysics, PoissonGaussianNoise  # pyright: ignore[reportMissingImports] -- an extra
 
 
 class StackPhysics(LinearPhysics):

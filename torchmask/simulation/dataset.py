@@ -108,7 +108,7 @@ class StackDataset(Dataset[dict[str, Tensor]]):
         both `path` and `scene` are given, a scene is black, or `simulate_observation` refuses an argument. Stack 0 is
         drawn at once as a check, which takes as long as drawing any one stack.
     TypeError
-        If `scene` is not callable or returns something other than a tensor.
+        If `scene` is not callable or returns something other than a tensor, or `ranges` is no `StackRanges`.
 
     Notes
     -----
@@ -169,6 +169,10 @@ class StackDataset(Dataset[dict[str, Tensor]]):
             raise ValueError(f"seed is {seed}: it must be a whole number of at least 0")
         if scene is not None and not callable(scene):
             raise TypeError(f"scene is a {type(scene).__name__}: it must be a function of an index and a generator")
+        if not isinstance(ranges, StackRanges | None):
+            raise TypeError(
+                f"ranges is a {type(ranges).__name__}: it must be StackRanges, such as StackRanges(r0=(0.1, 0.2))"
+            )
         if scene is not None and path is not None:
             raise ValueError("both scene and path are given: give only one of them")
         self.aperture: Aperture = aperture.still().to("cpu", dtype)

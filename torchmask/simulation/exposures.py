@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -89,7 +90,8 @@ def simulate_observation(
     Returns
     -------
     Observation
-        Frames and truth with the dtype and device of the scene, detached; phases have the dtype of the aperture.
+        Frames and truth with the dtype and device of the scene, detached; phases have the dtype of the aperture. Where
+        gradients are to flow, chain `psf_from_samples`, `image_formation` and `Detector(noise="gaussian")`.
 
     Raises
     ------
@@ -99,6 +101,8 @@ def simulate_observation(
         grid samples the aperture too coarsely at the shortest wavelength; `exposure_time` is given but the turbulence
         has no wind, or it exceeds the time between frames; or `keep_phases` is combined with `exposure_time`, `band` or
         `told`.
+    TypeError
+        If the scene is no tensor, or `generator` no torch.Generator.
 
     Examples
     --------
@@ -130,6 +134,7 @@ def simulate_observation(
     torch.Size([4])
     """
     conditions = conditions or Conditions()
+    _check_types(scene, generator)
     scene = scene.detach()
     _check(scene, aperture, grid, n_frames)
     require_apart(aperture, allow_overlap)
@@ -209,6 +214,15 @@ def _draw_transmission(n_frames: int, scatter: float, generator: torch.Generator
 
 def _stack_phases(phases: Sequence[Tensor | None], like: Tensor) -> Tensor:
     return torch.stack([torch.zeros_like(like) if phase is None else phase for phase in phases])
+
+
+def _check_types(scene: Any, generator: Any) -> None:
+    if not isinstance(scene, Tensor):
+        raise TypeError(f"scene is a {type(scene).__name__}: it must be a tensor (H, W), such as torch.tensor(scene)")
+    if not isinstance(generator, torch.Generator | None):
+        raise TypeError(
+            f"generator is {generator!r}: it must be a torch.Generator, such as torch.Generator().manual_seed(0)"
+        )
 
 
 def _check(scene: Tensor, aperture: Aperture, grid: Grid, n_frames: int) -> None:

@@ -1,0 +1,100 @@
+"""Checks of the options and of the files of which `read_observation` makes a stack."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from torchmask.data.calibration import SELECTIONS
+from torchmask.data.fits import FITSImages
+from torchmask.grid import ARCSEC
+from torchmask.numbers import require_wavelength
+from torchmask.optics.sky import pixel_matrix
+from torchmask.plain import require_plain
+
+_WIDEST = 0.01  # [rad], above the pixels of any image, and below most numbers of arcseconds
+
+
+_POSITIVE = {
+    "wavelength": "m",
+    "design_wavelength": "m",
+    "pixel_scale": "rad",
+    "design_pixel_scale": "rad",
+    "gain": "electrons per adu",
+    "exposure_time": "s",
+    "saturation": "the unit of the file",
+}
+
+
+def check_options(
+    positive: Sequence[float | None],
+    readout_noise: float | None,
+    crop: int | None,
+    keep: float | None,
+    keep_by: str,
+    unit: str | None,
+) -> None:
+    """Raise ValueError if an option is out of range, TypeError if one is of a wrong type.
+
+    `positive` are the values of the options in `_POSITIVE`; all arguments are as those of `read_observation`.
+    """
+    if not isinstance(unit, str | None):
+        raise TypeError(f"unit is a {type(unit).__name__}: it must be text, such as {str(unit)!r} or 'electron'")
+    for (name, what), value in zip(_POSITIVE.items(), positive, strict=True):
+        require_plain(name, value)
+        if value is not None and not (math.isfinite(value) and value > 0):
+            raise ValueError(f"{name} is {value}: it must be finite and positive, in {what}")
+        if "wavelength" in name:
+            require_wavelength(name, value)
+        if value is not None and "pixel_scale" in name and value > _WIDEST:
+            raise ValueError(
+                f"{name} is {value}: it must be an angle in rad, at most {_WIDEST}; {value:g} arcsec are "
+                f"{value * ARCSEC:.4g} rad"
+            )
+    require_plain("readout_noise", readout_noise)
+    if readout_noise is not None and not (math.isfinite(readout_noise) and readout_noise >= 0):
+        raise ValueError(f"readout_noise is {readout_noise}: it must be finite and at least 0, in electrons rms")
+    if crop is not None and (not float(crop).is_integer() or crop < 2):
+        raise ValueError(f"crop is {crop}: it must be a whole number of pixels, at least 2")
+    if keep is not None and not 0 < keep <= 1:
+        raise ValueError(f"keep is {keep}: it must be a fraction of the frames, above 0 and at most 1")
+    if keep_by not in SELECTIONS:
+        raise ValueError(f"keep_by is {keep_by!r}: it must be {' or '.join(SELECTIONS)}")
+    if keep is None and keep_by != SELECTIONS[0]:
+        raise ValueError(f"keep_by is {keep_by!r}, but all frames are kept: give keep, the fraction of the best, too")
+
+
+def check_alike(files: Sequence[FITSImages], wavelengths: Sequence[float], scales: Sequence[float]) -> None:
+    """Raise ValueError unless all files have one filter, wavelength, pixel scale and shape."""
+    kinds: tuple[tuple[str, Sequence[Any], Any], ...] = (
+        ("filters", [str(file.header.get("FILTER", "")).strip() for file in files], str),
+        ("wavelengths", wavelengths, lambda value: f"{value:.5g} m"),
+        ("pixel scales", scales, lambda value: f"{value / ARCSEC:.5g} arcsec"),
+        ("image shapes", [file.values.shape[1:] for file in files], str),
+    )
+    for what, values, format_value in kinds:
+        for file, value in zip(files, values, strict=True):
+            alike = abs(value / values[0] - 1) < 1e-3 if isinstance(value, float) else value == values[0]
+            if not alike:
+                raise ValueError(
+                    f"the files mix {what}: {files[0].path} has {format_value(values[0])} and {file.path} "
+                    f"{format_value(value)}; read them separately"
+                )
+
+
+def check_rotation(files: Sequence[FITSImages], size: int) -> None:
+    """Raise ValueError if a file is rotated or mirrored relative to the first by more than half a pixel at a corner."""
+    matrices = [pixel_matrix(file.header) for file in files]
+    first = matrices[0]
+    for file, matrix in zip(files, matrices, strict=True):
+        if first is None or matrix is None:
+            continue
+        moved = np.abs((np.linalg.inv(first) @ matrix - np.eye(2)) @ [[1, 1], [1, -1]]).max() * size / 2
+        if moved > 0.5:
+            raise ValueError(
+                f"the files mix orientations: the corner of {file.path} lies {moved:.1f} pixels from that of "
+                f"{files[0].path} on the sky; read files of different orientations separately"
+            )

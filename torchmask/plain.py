@@ -1,0 +1,39 @@
+"""Refusal of values that say more than numbers: those with a unit, and those with some hidden behind a mask."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+_WANTED = ("m", "rad", "s", "electron")  # SI, and electrons for images
+
+
+def require_plain(name: str, values: Any) -> None:
+    """Raise an error if values have a unit of astropy, or are a masked array of NumPy that hides some of them.
+
+    Both would be lost without a word where they become a tensor or a number.
+
+    Raises
+    ------
+    TypeError
+        If the values have a unit; the message says which is wanted.
+    ValueError
+        If a mask hides values.
+
+    Examples
+    --------
+    >>> require_plain("dark", np.ma.masked_greater(np.array([1.0, 9.0]), 5.0))
+    Traceback (most recent call last):
+    ValueError: dark hides 1 of 2 values behind a mask: give dark.filled(0), with valid=~dark.mask for frames
+    """
+    unit = getattr(values, "unit", None)
+    if unit is not None and hasattr(values, "to_value"):
+        wanted = next((f"to_value({known!r})" for known in _WANTED if unit.is_equivalent(known)), "value")
+        raise TypeError(f"{name} has the unit {unit}: plain numbers are needed, give {name}.{wanted}")
+    hidden = int(np.ma.getmaskarray(values).sum()) if isinstance(values, np.ma.MaskedArray) else 0
+    if hidden:
+        raise ValueError(
+            f"{name} hides {hidden} of {values.size} values behind a mask: give {name}.filled(0), with "
+            f"valid=~{name}.mask for frames"
+        )
