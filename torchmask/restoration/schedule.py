@@ -136,7 +136,7 @@ class Schedule:
     first_inflation: float = 30.0
     start_rms: float = 0.7
     start_rms_unwhitened: float = 0.1
-    candidates: tuple[tuple[int, int], ...] = ((16, 30), (8, 70), (4, 100), (2, 100))
+    candidates: tuple[tuple[int, int], ...] = ((4, 50), (2, 100))
     model_errors: float = 2.0
     chance: float = 2.0
     missed: float = 0.0013
