@@ -269,6 +269,8 @@ def test_flow_and_counts_are_checked():
     samples = FullAperture(1.0).samples(Grid.nyquist(1.0, WAVELENGTH, 32))
     with pytest.raises(ValueError, match="n_frames is 0"):
         TurbulencePhase(0.1, 20.0)(samples, 0)
+    with pytest.raises(TypeError, match=r"samples are of type FullAperture: give those of a pupil, aperture\.samples"):
+        TurbulencePhase(0.1, 20.0)(FullAperture(1.0), 1)
     with pytest.raises(ValueError, match=r"n_screens is 2\.5"):
         phase_screens((8, 8), 0.1, 0.1, 20.0, 2.5)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="side of shape is 0"):

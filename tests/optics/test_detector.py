@@ -158,6 +158,13 @@ def test_bad_read_noise_is_refused(readout_noise):
         Detector(readout_noise)
 
 
+def test_what_is_no_light_and_no_pixel_is_refused():
+    with pytest.raises(TypeError, match=r"expected is torch\.int64: .* give expected\.double\(\)"):
+        Detector()(torch.ones(2, 2, dtype=torch.int64))
+    with pytest.raises(TypeError, match=r"pixel is 1\.0: a response such as SquarePixel"):
+        Detector(pixel=1.0)
+
+
 def test_unknown_noise_is_refused():
     with pytest.raises(ValueError, match="noise is 'normal': it must be one of poisson, gaussian"):
         Detector(noise="normal")

@@ -216,8 +216,10 @@ def _require_interval(frame_interval: float | None) -> None:
 def _window(samples: PupilSamples) -> tuple[Tensor, tuple[int, int]]:
     """Return the indices of a pupil's samples in the smallest rectangle around it, and that rectangle's shape.
 
-    The pupil may lie across the border of the raster.
+    The pupil may lie across the border of the raster. Raises TypeError for anything but the samples of a pupil.
     """
+    if not isinstance(samples, PupilSamples):
+        raise TypeError(f"samples are of type {type(samples).__name__}: give those of a pupil, aperture.samples(grid)")
     coordinates, shape = [], []
     places = (samples.index // samples.raster[1], samples.index % samples.raster[1])
     weights = samples.weights.detach()  # holes may be trainable, but the choice of samples is not differentiable

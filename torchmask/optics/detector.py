@@ -97,6 +97,8 @@ class Detector(nn.Module):
     ------
     ValueError
         If `readout_noise` is not finite or is negative, or `noise` is neither of the two.
+    TypeError
+        If `pixel` is no response.
 
     Notes
     -----
@@ -123,6 +125,8 @@ class Detector(nn.Module):
             raise ValueError(f"readout_noise is {readout_noise}: it must be finite and not negative, in electrons rms")
         if noise not in NOISES:
             raise ValueError(f"noise is {noise!r}: it must be one of {', '.join(NOISES)}")
+        if pixel is not None and not callable(getattr(pixel, "transfer", None)):
+            raise TypeError(f"pixel is {pixel!r}: a response such as SquarePixel(0.9) is needed, or None for points")
         self.readout_noise: float = float(readout_noise)
         self.noise: str = noise
         self.pixel: PixelResponse | None = pixel
@@ -132,8 +136,11 @@ class Detector(nn.Module):
 
         A `generator` on the CPU works for any device of `expected`, and gives the same noise on all of them.
 
-        Raises ValueError if a value is not finite, or is negative beyond the rounding error of the FFTs that formed it.
+        Raises TypeError if `expected` is not of floating point, and ValueError if a value is not finite, or is negative
+        beyond the rounding error of the FFTs that formed it.
         """
+        if not expected.is_floating_point():
+            raise TypeError(f"expected is {expected.dtype}: light has fractions of electrons, give expected.double()")
         if not bool(torch.isfinite(expected).all()):
             raise ValueError("expected holds values that are not finite: electrons per pixel are needed")
         rounding = 32 * torch.finfo(expected.dtype).eps * torch.linalg.vector_norm(expected.detach())
