@@ -160,7 +160,7 @@ class Schedule:
     outlying: float = 1.25
     restarts: int = 6
     restart_rounds: int = 3
-    restart_iterations: int = 60
+    restart_iterations: int = 40
     pixel_steps: tuple[float, ...] = (0.4, 0.2)
     pixel_iterations: int = 60
     misplaced_gain: float = 5.0
