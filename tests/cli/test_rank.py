@@ -7,7 +7,7 @@ import pytest
 
 from torchmask.cli.main import main
 from torchmask.cli.rank import Options, name_masks, patterns
-from torchmask.design.manufacture import load_mask, save_json
+from torchmask.design.manufacture import load_mask, save_fits, save_json
 from torchmask.design.pattern import Pattern
 from torchmask.design.ranking import rank_masks
 from torchmask.design.turbulent import TurbulentMSE
@@ -45,6 +45,7 @@ def test_masks_of_catalogue_files_and_searches_are_ranked(tmp_path, capsys):
     assert events == [tmp_path / "run"]  # one run in TensorBoard, in one folder
     said = capsys.readouterr().out
     assert "not ranked: keck_lws_pattern2a_9, as built: 3 pairs of holes overlap" in said
+    assert "give --allow-overlap to accept it" in said
     assert "not ranked: golay9, as built: it has no size of its own" in said
 
 
@@ -70,10 +71,46 @@ def test_masks_are_named_by_their_folders_where_their_files_are_named_alike(tmp_
     assert [pattern.name for pattern in found] == ["one/mask", "other/mask"]
 
 
+def test_files_that_differ_by_their_suffix_alone_keep_it(tmp_path):
+    mask = SparseAperture.from_catalog("golay6", 2.0, 0.05)
+    save_json(tmp_path / "m.json", mask)
+    save_fits(tmp_path / "m.fits", mask, 512)
+    (tmp_path / "other").mkdir()
+    save_json(tmp_path / "other/m.json", mask)
+    files = [str(tmp_path / name) for name in ("m.json", "m.fits", "other/m.json")]
+    assert name_masks(files) == ["m.json", "m.fits", "m"]
+    assert [pattern.name for pattern in patterns(Options(masks=tuple(files[:2])))] == ["m.json", "m.fits"]
+
+
+def test_a_ranking_states_its_light(tmp_path):
+    words = [
+        "golay6",
+        *TINY,
+        "--fill-factor",
+        "0.1",
+        "--n-photons",
+        "3e5",
+        "--readout-noise",
+        "1.5",
+        "--n-pixels",
+        "64",
+    ]
+    turbulent = ["--criterion", "turbulent", "--r0", "0.3", "--wavelength", "550e-9", "--sky", "2"]
+    assert main(["rank", *words, *turbulent, "--out", str(tmp_path / "run")]) == 0
+    text = (tmp_path / "run/ranking.md").read_text()
+    assert "turbulence of r0 = 0.3 m and outer scale infinite" in text
+    assert (
+        "3e+05 photons a frame at N d^2 / D^2 = 0.1, 2 electrons of sky in each of 64 x 64 pixels, read-out noise 1.5 "
+        "electrons rms"
+    ) in text
+    light = {"fill_factor": 0.1, "n_photons": 3e5, "readout_noise": 1.5, "n_pixels": 64, "sky": 2.0}
+    assert json.loads((tmp_path / "run/ranking.json").read_text())["light"] == light
+
+
 def test_the_axis_of_numbers_of_holes_has_whole_ticks(tmp_path):
     patterns = [Pattern.from_catalog("jwst_niriss_ami_7")]
     light = observed(Options(n_frequencies=32, fill_factor=0.05)).criterion()
-    figure = ranking_figure(rank_masks(patterns, lambda _: light, 1.0, 0.05))
+    figure = ranking_figure(rank_masks(patterns, lambda _: light, 1.0, 0.05), "")
     assert [tick for tick in figure.axes[1].get_xticks() if tick % 1] == []
 
 

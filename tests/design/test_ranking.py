@@ -68,6 +68,7 @@ def test_what_overlaps_is_named_with_the_reason(ranking):
     }
     assert ranking.left_out["golay6, as built"] == "it has no size of its own"
     assert "1 and 6 by 0.00412 m" in ranking.left_out["keck_lws_pattern2a_9, as built"]
+    assert "give allow_overlap to accept it" in ranking.left_out["keck_lws_pattern2a_9, as built"]
     assert "at most 0.09167" in ranking.left_out["vlt_naco_18, laid afresh"]
     allowed = rank(allow_overlap=True)
     assert set(allowed.left_out) == {"golay6, as built", "vlt_naco_18, laid afresh"}
@@ -100,7 +101,8 @@ def test_tables_and_picture_say_which_is_which(ranking):
     assert [float(row["relative_mse"]) for row in rows] == [row.relative_mse for row in ranking.rows]
     assert {row["layout"] for row in rows} == {"laid afresh", "searched", "as built"}
     assert set(COLUMNS) < set(rows[0])
-    figure = ranking_figure(ranking)
+    figure = ranking_figure(ranking, "1e8 photons a frame")
+    assert figure.legends[0].get_title().get_text() == "1e8 photons a frame"
     said = [text.get_text() for text in figure.legends[0].get_texts()]
     assert [any(word in line for line in said) for word in ("laid afresh", "searched", "as built")] == [True] * 3
 

@@ -226,7 +226,7 @@ def test_the_files_hold_the_table(small):
 
 def test_prints_as_markdown_with_what_all_rows_share_above(small):
     _, table = small
-    shared, empty, *markdown = str(table).splitlines()
+    _, shared, empty, *markdown = str(table).splitlines()
     assert empty == ""
     assert f"D/r0 = {SMALL.diameter_over_r0[0]:g}, seed = 0." in shared
     assert "N =" not in shared

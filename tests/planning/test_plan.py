@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 import torch
 
+import torchmask.cli.plan
 import torchmask.planning.expectation
 import torchmask.planning.plan
 from torchmask.cli.main import main
-from torchmask.design.constraints import KeepOutDisc, KeepOutSegment, check_mask
+from torchmask.design.constraints import KeepOutDisc, KeepOutSegment, MinimumGap, RimMargin, check_mask
 from torchmask.design.criterion import AsymptoticMSE
 from torchmask.design.manufacture import load_mask
 from torchmask.design.observed import change_light, instant_criterion, instrument_criterion
@@ -23,7 +24,7 @@ from torchmask.instrument.instrument import Instrument
 from torchmask.instrument.parts import Camera, Site, Source, Telescope
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.pixel import SquarePixel
-from torchmask.planning.plan import plan_observation
+from torchmask.planning.plan import PlanInterrupted, plan_observation
 from torchmask.planning.result import Choice, ObservationPlan
 from torchmask.planning.smearing import SmearingMap, phase_spread, smearing_map
 from torchmask.planning.success import BlindOutlook, SuccessMap, success_map
@@ -546,7 +547,48 @@ def test_the_picture_shows_the_map_and_the_exposures(plan):
     assert list(line.get_ydata()) == [choice.blind_mse for choice in plan.full_pupil.choices]
     alone = plan_figure(dataclasses.replace(plan, masks={(best.n_subapertures, best.hole_diameter): MASK}))
     assert len(alone.axes) == 1
-    assert [text.get_text() for text in plan_figure(plan.full_pupil).axes[0].get_legend().get_texts()] == ["full pupil"]
+    assert [text.get_text() for text in plan_figure(plan.full_pupil).legends[0].get_texts()] == ["full pupil"]
+
+
+def test_the_picture_has_no_panel_of_one_value_and_no_error_above_1(plan):
+    figure = plan_figure(plan)
+    highest = max(ax.get_ylim()[1] for ax in figure.axes[1:2])
+    assert highest <= 1.03
+    name = next(text for text in figure.axes[1].texts if text.get_text() == "tau0")
+    assert name.get_position()[0] > 0  # points to the right of the dashed line
+    alone = dataclasses.replace(plan, choices=tuple(c for c in plan.choices if c.exposure == plan.best.exposure))
+    assert [ax.get_ylabel() for ax in plan_figure(alone).axes] == ["number of holes", "relative MSE, blind"]  # its bar
+    assert plan_figure(alone).axes[0].get_title(loc="left").endswith(f"; full pupil: {FULL:.3f}")
+    one = (plan.best.n_subapertures, plan.best.hole_diameter)
+    point = dataclasses.replace(alone, choices=(plan.best,), masks={one: plan.mask})
+    assert [ax.get_xlabel() for ax in plan_figure(point).axes] == ["exposure [ms]"]
+    bad = dataclasses.replace(plan, choices=tuple(dataclasses.replace(c, blind_mse=1.0) for c in plan.choices))
+    assert plan_figure(bad).axes[1].get_ylim()[1] <= 1.03
+
+
+def test_an_interrupted_plan_is_that_of_the_points_reached(quick):
+    told = []
+
+    def stop(record):
+        told.append(record.stage)
+        if told.count("plan/map") == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt) as stopped:
+        plan_observation(make(), **AXES, **TINY, callback=stop)
+    found = stopped.value.plan
+    assert (len(found.choices), len(found.masks)) == (2, 2)
+    assert found.left_out[-1] == "interrupted: 2 of 10 points of the map were reached"
+    assert found.full_pupil is not None
+    texts = {text.get_text() for text in plan_figure(found).axes[0].texts}
+    assert f"{found.best.blind_mse:.3f}" in texts
+
+    def stop_early(record):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt) as stopped:
+        plan_observation(make(), **AXES, **TINY, callback=stop_early)
+    assert not isinstance(stopped.value, PlanInterrupted)
 
 
 def test_the_command_writes_plan_mask_and_instrument(quick, tmp_path, capsys):
@@ -574,8 +616,66 @@ def test_the_command_writes_plan_mask_and_instrument(quick, tmp_path, capsys):
     command = f"--instrument {tmp_path}/plan/instrument.json --n-subapertures 3 --fill-factor {fill_factor:.4g}"
     assert f"design the final mask with: torchmask design {command}" in told
     again = ["plan", "--config", str(tmp_path / "plan/config.yaml"), "--mask", "golay6", "--fill-factor", "0.05"]
-    assert main([*again, "--out", str(tmp_path / "again")]) == 0
+    assert main([*again, "--out", str(tmp_path / "again")]) == 1
+    said = "--n-subapertures is for masks that are searched, but --mask golay6 exists: leave out one of the two"
+    assert said in capsys.readouterr().err
+    instrument = ["--instrument", str(tmp_path / "plan/instrument.json"), "--exposures", "0.004", "--n-frequencies"]
+    assert main(["plan", *instrument, "32", *again[3:], "--out", str(tmp_path / "again")]) == 0
     assert load_mask(tmp_path / "again/mask.json").n_subapertures == 6
+
+
+QUICK = "--telescope.diameter 1 --source.photon-rate 3e8 --site.r0 0.15 --site.wind 10 --wavelength 550e-9 --width 2e-8"
+QUICK += " --exposure 4e-3 --n-frames 20 --exposures 0.002 0.004 --n-frequencies 32"
+SEARCHED = "--n-subapertures 3 --hole-diameters 0.15 --budget 64"
+
+
+def test_the_rules_of_a_workshop_hold_for_the_masks_and_are_handed_on(quick, tmp_path, capsys, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(torchmask.cli.plan, "draw_zones", lambda figure, zones, scale: drawn.append((zones, scale)))
+    rules = "--min-gap 0.05 --rim-margin 0.02 --keep-out 0.3 0.0 0.2 0.0 0.3 0.1"
+    spider = "--telescope.central-obstruction 0.2 --telescope.vane-width 0.02 --telescope.vane-angles 90"
+    words = f"{QUICK} {SEARCHED} {rules} {spider}".split()
+    assert main(["plan", *words, "--out", str(tmp_path / "plan")]) == 0
+    told = [MinimumGap(0.05), RimMargin(0.02), KeepOutDisc(0.2, (0.3, 0.0)), KeepOutDisc(0.1, (0.0, 0.3))]
+    check_mask(load_mask(tmp_path / "plan/mask.json"), 1e-6, told)
+    said = capsys.readouterr().out
+    assert f"--n-subapertures 3 --fill-factor 0.0675 {rules}" in said
+    assert "| outer scale | 20 m |" in said
+    ((zones, scale),) = drawn
+    assert scale == 1.0
+    assert {*told, KeepOutDisc(0.2)} < set(zones)
+    assert sum(isinstance(zone, KeepOutSegment) for zone in zones) == 1
+    assert main(["plan", *words, "--min-gap", "0.9", "--out", str(tmp_path / "none")]) == 1
+    assert "a --min-gap of at most 0.5514 m" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "given", ["--n-subapertures 5", "--hole-diameters 0.2", "--budget 9", "--seed 1", "--min-gap 0.1", "--rim-margin 1"]
+)
+def test_options_of_a_search_are_refused_beside_a_mask(given, tmp_path, capsys):
+    mask = ["--mask", "golay6", "--fill-factor", "0.05", "--out", str(tmp_path / "plan")]
+    assert main(["plan", *QUICK.split(), *mask, *given.split()]) == 1
+    assert f"{given.split()[0]} is for masks that are searched, but --mask golay6 exists" in capsys.readouterr().err
+
+
+def test_an_interrupted_command_leaves_the_plan_of_the_points_reached(quick, tmp_path, capsys, monkeypatch):
+    def stop_at(last):
+        def tell(callback, stage, *numbers):
+            if stage == last:
+                raise KeyboardInterrupt
+
+        monkeypatch.setattr(torchmask.planning.plan, "_tell", tell)
+
+    stop_at("plan/map")
+    assert main(["plan", *f"{QUICK} {SEARCHED}".split(), "--out", str(tmp_path / "plan")]) == 130
+    assert "interrupted: 1 of 2 points of the map were reached" in (tmp_path / "plan/plan.md").read_text()
+    for name in ("plan.json", "plan.png", "mask.json", "instrument.json"):
+        assert (tmp_path / "plan" / name).is_file()
+    assert f"the results so far are in {tmp_path / 'plan'}" in capsys.readouterr().err
+    stop_at("plan/search")
+    assert main(["plan", *f"{QUICK} {SEARCHED}".split(), "--out", str(tmp_path / "early")]) == 130
+    assert "no point of the map was reached: there is no plan and no mask" in capsys.readouterr().err
+    assert not (tmp_path / "early/plan.md").exists()
 
 
 def test_a_full_pupil_is_planned_without_a_mask(tmp_path, monkeypatch):

@@ -107,7 +107,7 @@ class CriterionOptions(ExposureOptions):
     r0: float | None = None
     """Fried parameter of the turbulence at the wavelength [m]; the asymptotic criterion warns of wider holes."""
     outer_scale: float | None = None
-    """Outer scale of the turbulence [m]; None: infinite."""
+    """Outer scale of the turbulence [m]; None: infinite, where `plan`, `table` and `simulate` take 20 m."""
 
     def turbulence(self, wavelength: float, area: float) -> dict[str, Any] | None:
         """Return the options as `TurbulentMSE` takes them, None for the asymptotic criterion.

@@ -4,23 +4,31 @@ from __future__ import annotations
 
 import dataclasses
 import shlex
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
+from torchmask.cli.obstacles import warn_of_blocked_holes
 from torchmask.cli.options import CatalogOptions, InstrumentOptions, MaskOptions, RunOptions, load_aperture
-from torchmask.cli.run import new_run
+from torchmask.cli.report import draw_zones
+from torchmask.cli.run import Run, new_run
 from torchmask.cli.wording import in_options
 from torchmask.design.manufacture import save_json
+from torchmask.design.rules import MaskRules
 from torchmask.instrument.instrument import Instrument
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.pupil import Aperture
-from torchmask.planning.plan import plan_observation
+from torchmask.planning.plan import PlanInterrupted, plan_observation
 from torchmask.planning.result import AXES, ObservationPlan
+from torchmask.viz import style as drawing
 from torchmask.viz.figures import mask_figure
 from torchmask.viz.planning import plan_figure
+
+_WORKSHOP = ("min_gap", "rim_margin", "keep_out")  # rules that the telescope does not set
+_SEARCH = ("n_subapertures", "hole_diameters", *_WORKSHOP, "budget", "seed")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +52,12 @@ class Options(Instrument, CatalogOptions, InstrumentOptions, RunOptions):
     """Exposure times to compare [s]; none: 0.25, 0.5, 1, 2, 4 and 8 times the coherence time tau0."""
     widths: tuple[float, ...] = ()
     """Widths of the band to compare [m]; none: that of the band alone."""
+    min_gap: float = MaskRules.min_gap
+    """Smallest width of material between two holes of a searched mask [m]."""
+    rim_margin: float = MaskRules.rim_margin
+    """Smallest width of material between a hole of a searched mask and its rim [m]."""
+    keep_out: tuple[tuple[float, float, float], ...] = MaskRules.keep_out
+    """Discs to be kept free of holes besides the telescope's, three numbers each: x y of the centre, diameter [m]."""
     n_frequencies: int = 128
     """Frequency grid of the criterion, per side."""
     budget: int = 1000
@@ -67,7 +81,11 @@ def _fields(known: Instrument) -> dict[str, Any]:
 
 
 def existing_mask(options: Options) -> Aperture | None:
-    """Return the mask that --mask names; patterns without a size, and full pupils, are as wide as the telescope."""
+    """Return the mask that --mask names; patterns without a size, and full pupils, are as wide as the telescope.
+
+    Raises ValueError for options of a mask that exists without --mask, and for those of a search beside it. Warns of
+    holes that do not lie in the open pupil.
+    """
     if options.mask is None:
         for name in ("mask_diameter", "fill_factor", "mirrored", "allow_overlap"):
             if (value := getattr(options, name)) is not None and value is not False:
@@ -76,49 +94,83 @@ def existing_mask(options: Options) -> Aperture | None:
                     "that are searched are as wide as the telescope"
                 )
         return None
+    for name in _SEARCH:
+        if getattr(options, name) != getattr(Options, name):
+            raise ValueError(
+                f"--{name.replace('_', '-')} is for masks that are searched, but --mask {options.mask} exists: leave "
+                "out one of the two"
+            )
     names = (item.name for item in dataclasses.fields(CatalogOptions))
-    return load_aperture(
+    aperture = load_aperture(
         MaskOptions(mask=options.mask, **{name: getattr(options, name) for name in names}), options.telescope
     )
+    warn_of_blocked_holes(options.mask, aperture, options.telescope)
+    return aperture
 
 
 def run(options: Options) -> None:
-    """Plan, and write map, picture, mask and instrument."""
+    """Plan, and write map, picture, mask and instrument, of the points reached if interrupted."""
     instrument, aperture = instrument_of(options), existing_mask(options)
+    rules = MaskRules(**{name: getattr(options, name) for name in _WORKSHOP})
+    constraints = rules.constraints()
     with new_run("plan", options, options.seed) as output:
-        plan = plan_observation(
-            instrument,
-            n_subapertures=options.n_subapertures,
-            hole_diameters=options.hole_diameters or None,
-            exposures=options.exposures or None,
-            widths=options.widths or None,
-            aperture=aperture,
-            n_frequencies=options.n_frequencies,
-            budget=options.budget,
-            seed=options.seed,
-            callback=output.callback,
-        )
-        best = plan.best_instrument
-        table = best.describe(float(plan.mask.area))
-        output.report("plan", numbers(plan), f"{plan}\n\n{table}\n", plan_figure(plan))
-        output.keep_instrument(best)
-        if isinstance(plan.mask, SparseAperture):
-            save_json(output.directory / "mask.json", plan.mask, best.mean_wavelength)
-            output.logger.figure("plan_mask", mask_figure(plan.mask))
+        try:
+            plan = plan_observation(
+                instrument,
+                n_subapertures=options.n_subapertures,
+                hole_diameters=options.hole_diameters or None,
+                exposures=options.exposures or None,
+                widths=options.widths or None,
+                aperture=aperture,
+                constraints=constraints,
+                n_frequencies=options.n_frequencies,
+                budget=options.budget,
+                seed=options.seed,
+                callback=output.callback,
+            )
+        except PlanInterrupted as stopped:
+            write(stopped.plan, rules, output)
+            raise
+        except KeyboardInterrupt:
+            print("\nno point of the map was reached: there is no plan and no mask, only the log", file=sys.stderr)
+            raise
+        table = write(plan, rules, output)
         told = str(plan).split("\n\n", 1)[0].splitlines()
         output.summary.extend(
             in_options(line, options) for line in (*told, *(f"left out: {reason}" for reason in plan.left_out))
         )
         output.summary.append(table)
         if options.mask is None and plan.shows_something:
-            output.summary.append(f"design the final mask with: {_design_command(plan.mask, output.directory)}")
+            command = _design_command(plan.mask, rules, output.directory)
+            output.summary.append(f"design the final mask with: {command}")
 
 
-def _design_command(mask: Aperture, folder: Path) -> str:
-    """Return the command that searches a mask of as many holes of this size."""
+def write(plan: ObservationPlan, rules: MaskRules, output: Run) -> str:
+    """Write map, picture, mask and instrument of a plan to its folder; return what follows for its best point."""
+    best = plan.best_instrument
+    table = f"{best.describe(float(plan.mask.area))}\n| outer scale | {best.site.outer_scale:.4g} m |"
+    output.report("plan", numbers(plan), f"{plan}\n\n{table}\n", plan_figure(plan))
+    output.keep_instrument(best)
+    if isinstance(plan.mask, SparseAperture):
+        save_json(output.directory / "mask.json", plan.mask, best.mean_wavelength)
+        figure, telescope = mask_figure(plan.mask), best.telescope
+        zones = dataclasses.replace(
+            rules, central_obstruction=telescope.central_obstruction, spiders=telescope.spiders
+        ).constraints()
+        draw_zones(figure, zones, drawing.length_unit(plan.mask.mask_diameter)[1])
+        output.logger.figure("plan_mask", figure)
+    return table
+
+
+def _design_command(mask: Aperture, rules: MaskRules, folder: Path) -> str:
+    """Return the command that searches a mask of as many holes of this size, under the same rules."""
     file = shlex.quote(str(folder / "instrument.json"))
-    size = f"--n-subapertures {mask.n_subapertures} --fill-factor {mask.fill_factor:.4g}"
-    return f"torchmask design --instrument {file} {size}"
+    words = [f"--n-subapertures {mask.n_subapertures} --fill-factor {mask.fill_factor:.4g}"]
+    words += [f"--min-gap {rules.min_gap}"] * bool(rules.min_gap)
+    words += [f"--rim-margin {rules.rim_margin}"] * bool(rules.rim_margin)
+    if rules.keep_out:
+        words.append(f"--keep-out {' '.join(str(number) for disc in rules.keep_out for number in disc)}")
+    return f"torchmask design --instrument {file} {' '.join(words)}"
 
 
 def numbers(plan: ObservationPlan) -> dict[str, object]:

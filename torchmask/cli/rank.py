@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from torchmask.cli.criterion_options import ObservationOptions, observation_options
+from torchmask.cli.criterion_options import ObservationOptions, Observed, observation_options
 from torchmask.cli.options import RunOptions, is_mask_file
 from torchmask.cli.run import Run, new_run
 from torchmask.cli.wording import in_options
@@ -87,10 +87,11 @@ def patterns(options: Options) -> list[Pattern]:
 def name_masks(masks: Sequence[str], others: Sequence[str] = ()) -> list[str]:
     """Return a name for each mask: that of the catalogue, or that of its file, with its folders where others have it.
 
-    One mask that is given twice has one name.
+    Files of one folder that differ by their suffix alone keep it. One mask that is given twice has one name.
     """
     paths = [Path(mask).absolute() if is_mask_file(Path(mask)) else Path(catalog.entry(mask).name) for mask in masks]
-    parts = [(*path.parts[:-1], path.stem) for path in paths]
+    bare = _repeated([str(path.with_suffix("")) for path in set(paths)])
+    parts = [(*path.parts[:-1], path.name if str(path.with_suffix("")) in bare else path.stem) for path in paths]
     depths = [1] * len(parts)
     while True:
         names = ["/".join(part[-depth:]) for part, depth in zip(parts, depths, strict=True)]
@@ -157,21 +158,46 @@ def ranking(options: Options, output: Run) -> Ranking:
     with atomic_write(output.directory / "ranking.csv") as file:
         file.write(found.csv().encode())
     rows = [asdict(row) | {"layout": row.layout.value} for row in found.rows]
-    numbers = {"rows": rows, "not_ranked": found.left_out, "floor": found.floor}
-    output.report("ranking", numbers, f"{heading(options)}\n\n{found}", ranking_figure(found))
+    light = light_of(options, observed)
+    numbers = {"light": light, "rows": rows, "not_ranked": found.left_out, "floor": found.floor}
+    told = describe(light)
+    output.report("ranking", numbers, f"{heading(options, told)}\n\n{found}", ranking_figure(found, told))
     return found
 
 
-def heading(options: Options) -> str:
+def light_of(options: Options, observed: Observed) -> dict[str, float]:
+    """Return the light through the common collecting area, and the noise [electrons per frame] beside it."""
+    return {
+        "fill_factor": options.fill_factor,
+        "n_photons": observed.object_psd.n_photons,
+        "readout_noise": options.readout_noise,
+        "n_pixels": options.n_pixels,
+        "sky": (observed.turbulence or {}).get("sky", 0.0),
+    }
+
+
+def describe(light: Mapping[str, float]) -> str:
+    """Return the light in words."""
+    return (
+        f"{light['n_photons']:.4g} photons a frame at N d^2 / D^2 = {light['fill_factor']:g}, {light['sky']:.4g} "
+        f"electrons of sky in each of {light['n_pixels']} x {light['n_pixels']} pixels, read-out noise "
+        f"{light['readout_noise']:g} electrons rms"
+    )
+
+
+def heading(options: Options, light: str) -> str:
     """Return what stands above the table."""
-    air = "independent pistons" if options.criterion == "asymptotic" else f"turbulence of r0 = {options.r0:g} m"
+    air = "independent pistons"
+    if options.criterion == "turbulent":
+        outer = "infinite" if options.outer_scale is None else f"{options.outer_scale:g} m"
+        air = f"turbulence of r0 = {options.r0:g} m and outer scale {outer}"
     wavelength = options.observing_wavelength()
-    light = "" if wavelength is None else f"{1e9 * wavelength:g} nm, "
+    at = "" if wavelength is None else f"{1e9 * wavelength:g} nm, "
     return (
         f"# Masks ranked by the error of the restored image\n\nD = {options.mask_diameter:g} m, "
-        f"{light}{air}, K = {options.n_frames}, p = {options.exponent:g}. The common "
-        f"collecting area is N d^2 / D^2 = {options.fill_factor:g} of round holes. The floor is the part no mask can "
-        "change; torchmask_N are searched masks, with which `over our best` compares those of the same N and area."
+        f"{at}{air}, K = {options.n_frames}, p = {options.exponent:g}, {light}: others have the light of their own "
+        "area. That common collecting area is of round holes. The floor is the part no mask can change; torchmask_N "
+        "are searched masks, with which `over our best` compares those of the same N and area."
     )
 
 

@@ -12,6 +12,7 @@ from torchmask.atmosphere.phase import LayeredPhase, TurbulencePhase
 from torchmask.atmosphere.profiles import named_layers
 from torchmask.cli.band_options import FilterOptions
 from torchmask.cli.instrument_used import instrument_used
+from torchmask.cli.obstacles import warn_of_blocked_holes
 from torchmask.cli.options import (
     DEFAULT_PHOTONS,
     InstrumentOptions,
@@ -236,7 +237,10 @@ def used_instrument(known: Instrument, area: float, options: Options) -> Instrum
 def run(options: Options) -> None:
     """Simulate, and write the stack."""
     known = options.known_instrument()
-    told = load_aperture(options, None if known is None else known.telescope)
+    telescope = None if known is None else known.telescope
+    told = load_aperture(options, telescope)
+    assert options.mask is not None  # or it would not be loaded
+    warn_of_blocked_holes(options.mask, told, telescope)
     true = options.true_mask.apply(told)
     aperture = true or told
     wavelength = observing_wavelength(options)

@@ -19,7 +19,7 @@ from torchmask.design.pattern import Pattern
 from torchmask.design.redundancy import analyse_redundancy
 from torchmask.design.rules import MaskRules
 from torchmask.optics.aperture import SparseAperture
-from torchmask.optics.overlaps import check_overlaps
+from torchmask.optics.overlaps import require_apart
 from torchmask.record import Callback, Record
 
 _ROUNDING = 1e-6  # of the mask diameter, by which holes may overlap or break a rule
@@ -207,8 +207,7 @@ def _lay_out(
             left_out[f"{pattern.name}, {Layout.AS_BUILT.value}"] = pattern.unbuilt
         else:
             try:
-                if not allow_overlap:
-                    check_overlaps(built)
+                require_apart(built, allow_overlap)
                 _check_rules(built, constraints)
                 masks.append((pattern.name, Layout.AS_BUILT, built))
             except ValueError as error:

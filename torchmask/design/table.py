@@ -27,7 +27,7 @@ from torchmask.design.space import AXES, Design, DesignSpace
 from torchmask.design.sweep import run_tasks
 from torchmask.design.turbulent import TurbulentMSE
 from torchmask.design.workers import require_backend
-from torchmask.grid import Grid
+from torchmask.grid import ARCSEC, Grid
 from torchmask.io import atomic_write, from_json, to_json, write_json
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.otf import OTF
@@ -49,7 +49,7 @@ _COLUMNS = tuple(field.name for field in fields(Design) if field.name != "center
 
 @dataclass(frozen=True)
 class DesignTable:
-    """A design table with rows in the order of the axes, which `print` shows as Markdown, common values above."""
+    """A design table with rows in the order of the axes, which `print` shows as Markdown, its conditions above."""
 
     space: DesignSpace
     rows: tuple[Design, ...]
@@ -81,7 +81,41 @@ class DesignTable:
         cells.insert(1, ["-" * width for width in widths])
         lines = [" | ".join(map(str.ljust, line, widths)) for line in cells]
         same = ", ".join(f"{_HEADINGS.get(name, name)} = {_cell(name, getattr(self.rows[0], name))}" for name in shared)
-        return "\n".join([*([f"In all rows: {same}.", ""] if same else []), *(f"| {line} |" for line in lines)])
+        above = [f"{self._heading()}.", *([f"In all rows: {same}."] if same else []), ""]
+        return "\n".join([*above, *(f"| {line} |" for line in lines)])
+
+    def _heading(self) -> str:
+        """Return what holds for every row besides the axes, and by which criterion masks are searched."""
+        space, rules = self.space, {field.name: getattr(self.space, field.name) for field in fields(MaskRules)}
+        scale = f"pixels of {space.grid.pixel_scale / ARCSEC:.4g} arcsec at {1e9 * space.grid.wavelength:.4g} nm"
+        told = [
+            f"D = {space.mask_diameter:g} m",
+            "pixels of wavelength / (2 D)" if space.wavelength is None else scale,
+            f"{space.n_pixels} x {space.n_pixels} pixels with read-out noise of {space.readout_noise:g} electrons rms",
+            f"photons at N d^2 / D^2 = {space.reference_fill_factor:g}",
+            f"p = {space.exponent:g}, knee {space.knee:.4g} cycles/pixel",
+            f"criterion: {self._criterion()}",
+            f"{space.method} search",
+        ]
+        told += [f"{name.replace('_', ' ')} {value}" for name, value in rules.items() if value]
+        return "; ".join(told)
+
+    def _criterion(self) -> str:
+        outer = f"outer scale {self.space.outer_scale:g} m"
+        if self.conditions is None:
+            drawn = f", then measured under screens of {outer}" if self.space.diameter_over_r0 else ""
+            return f"asymptotic, instants of independent pistons{drawn}"
+        known, band = self.conditions, self.conditions.wavelengths or ()
+        wind = known.wind if isinstance(known.wind, tuple) else (known.wind,)
+        colours = f"{len(band)} wavelengths from {1e9 * min(band):.4g} to {1e9 * max(band):.4g} nm" if band else ""
+        told = (
+            f"exposure {1e3 * known.exposure:.4g} ms",
+            f"wind {' '.join(f'{speed:g}' for speed in wind)} m/s",
+            colours or "one wavelength",
+            f"pixel fill {known.pixel_fill:g}",
+            f"sky {known.sky:.4g} electrons per pixel and frame",
+        )
+        return ", ".join(("turbulent", outer, *told))
 
 
 def design_table(

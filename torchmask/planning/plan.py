@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from torchmask.design.constraint_base import Constraint, Infeasible
@@ -24,6 +23,14 @@ from torchmask.record import Callback, Record
 
 _HOLES = (0.5, 0.8, 1.2)  # in r0: wider holes hold aberrations that a blind restoration has to find
 _EXPOSURES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # in tau0
+
+
+class PlanInterrupted(KeyboardInterrupt):
+    """An interruption of `plan_observation` after it has reached points of the map; `plan` is that of these points."""
+
+    def __init__(self, plan: ObservationPlan) -> None:
+        super().__init__()
+        self.plan = plan
 
 
 def plan_observation(
@@ -81,6 +88,8 @@ def plan_observation(
     ValueError
         For an axis that is empty or holds what cannot be, an `aperture` that is a population, pixels that undersample
         the image at the shortest wavelength of every band, and if no point can be built: says why.
+    PlanInterrupted
+        If a KeyboardInterrupt comes when points of the map have been reached.
 
     Warns
     -----
@@ -127,34 +136,40 @@ def plan_observation(
             reason, *others = left_out[n_known:]
             more = f"; nor can the other {len(others)}, of more or wider holes" if others else ""
             raise ValueError(f"no point of the map can be built: {reason}{more}")
-        full = _predict(instrument, exposed, _alone(instrument.telescope.pupil()), n_frequencies, callback, beside=True)
+        alone = _alone(instrument.telescope.pupil())
+        reached = list(_measure(exposed, alone, n_frequencies, callback, beside=True))
+        full = _plan_of(instrument, reached, alone)
     else:
         masks, full = _alone(aperture), None
-    plan = _predict(instrument, exposed, masks, n_frequencies, callback)
-    return dataclasses.replace(plan, left_out=tuple(dict.fromkeys(left_out)), full_pupil=full)
+    choices: list[Choice] = []
+    try:
+        for choice in _measure(exposed, masks, n_frequencies, callback, beside=False):
+            choices.append(choice)
+    except KeyboardInterrupt as error:
+        if not choices:
+            raise
+        left_out.append(f"interrupted: {len(choices)} of {len(exposed) * len(masks)} points of the map were reached")
+        raise PlanInterrupted(_plan_of(instrument, choices, masks, left_out, full)) from error
+    return _plan_of(instrument, choices, masks, left_out, full)
 
 
 def _alone(aperture: Aperture) -> dict[tuple[int, float], Aperture]:
     return {(aperture.n_subapertures, aperture.subaperture_diameter): aperture}
 
 
-def _predict(
+def _plan_of(
     instrument: Instrument,
-    exposed: Sequence[Instrument],
+    choices: Sequence[Choice],
     masks: dict[tuple[int, float], Aperture],
-    n_frequencies: int,
-    callback: Callback | None,
-    *,
-    beside: bool = False,
+    left_out: Sequence[str] = (),
+    full: ObservationPlan | None = None,
 ) -> ObservationPlan:
-    """Return the plan of given masks, all of one kind of pupil, or of the full pupil `beside` masks.
-
-    For the latter the prediction is that of instants in narrow light alone, on which what is expected rests: long
-    exposures and bands of a full pupil take minutes each.
-    """
-    choices = tuple(_measure(exposed, masks, n_frequencies, callback, beside))
-    kind = kind_of(next(iter(masks.values())))
-    return ObservationPlan(instrument, choices, masks, tried_up_to=_tried_up_to(instrument, kind))
+    """Return the plan of given points, of masks which are all of one kind of pupil."""
+    points = tuple(sorted(choices, key=lambda choice: tuple(getattr(choice, name) for name in AXES)))
+    reached = {(choice.n_subapertures, choice.hole_diameter) for choice in points}
+    tried = _tried_up_to(instrument, kind_of(next(iter(masks.values()))))
+    kept = {point: mask for point, mask in masks.items() if point in reached}
+    return ObservationPlan(instrument, points, kept, tuple(dict.fromkeys(left_out)), tried, full)
 
 
 def _rules(instrument: Instrument, constraints: Sequence[Constraint]) -> tuple[Constraint, ...]:
@@ -197,10 +212,15 @@ def _measure(
     masks: dict[tuple[int, float], Aperture],
     n_frequencies: int,
     callback: Callback | None,
+    *,
     beside: bool,
-) -> list[Choice]:
-    """Return the predicted error at every point; masks with holes of one size share what is known of the turbulence."""
-    choices, n_steps = [], len(exposed) * len(masks)
+) -> Iterator[Choice]:
+    """Yield the predicted error at every point; masks with holes of one size share what is known of the turbulence.
+
+    For the full pupil `beside` masks the prediction is that of instants in narrow light alone, on which what is
+    expected rests: long exposures and bands of a full pupil take minutes each.
+    """
+    step, n_steps = 0, len(exposed) * len(masks)
     expected = expect_blind(exposed, masks, n_frequencies)
     for place, instrument in enumerate(exposed):
         criterion = None
@@ -213,9 +233,9 @@ def _measure(
                 floor = criterion.relative_floor(instrument.telescope.diameter)
             photons, sky = instrument.photons(area), instrument.sky(area)
             light = instrument.exposure, instrument.width, instrument.frames, photons, sky
-            choices.append(Choice(n, hole, *light, error, error - floor, blind_error, blind))
-            _tell(callback, "plan/full" if beside else "plan/map", len(choices), n_steps, error)
-    return sorted(choices, key=lambda choice: tuple(getattr(choice, name) for name in AXES))
+            yield Choice(n, hole, *light, error, error - floor, blind_error, blind)
+            step += 1
+            _tell(callback, "plan/full" if beside else "plan/map", step, n_steps, error)
 
 
 def _tried_up_to(instrument: Instrument, kind: Pupil) -> dict[str, float]:

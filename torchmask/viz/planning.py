@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_ROOM = 0.35  # above the curves, for the legend, over their own height
+_MOST = 1.03  # of the errors' axis: none exceeds 1, where marks are drawn whole
 _RING: dict[str, Any] = {"markersize": 13, "fillstyle": "none", "color": drawing.COLORS[1]}
 
 
@@ -23,21 +23,34 @@ def plan_figure(plan: ObservationPlan) -> Figure:
     """Draw the predicted error of blind restorations over number and size of holes, exposure and band width.
 
     The exposure has a curve for each number of holes, and one for the full pupil. Each panel is at the best of all
-    else; those of one mask or one width are left out. A ring marks the best point, an arrow upwards a lower limit,
-    where nothing was tried.
+    else; those of one mask, exposure or width are left out, unless there is no other. A ring marks the best point, an
+    arrow upwards a lower limit, where nothing was tried.
     """
-    several, widths = len(plan.masks) > 1, plan.axis("width")
-    panels = [1.25] * several + [1.5] + [1.2] * (len(widths) > 1)
-    figure, axes = drawing.row_of_axes(panels, height=3.6)
+    widths, best = plan.axis("width"), plan.best
+    several, wide = len(plan.masks) > 1, len(widths) > 1
+    exposed = len({choice.exposure for choice in plan.choices}) > 1 or not (several or wide)
+    figure, axes = drawing.row_of_axes([1.25] * several + [1.5] * exposed + [1.2] * wide, height=3.8)
     if several:
         _draw_map(figure, axes[0], plan)
-    _draw_exposures(axes[int(several)], plan)
-    if len(widths) > 1:
-        ax, best = axes[-1], plan.best
+        if plan.full_pupil is not None and not exposed:
+            full = plan.full_pupil.best
+            beside = f"; full pupil: {'> ' * full.is_limit}{full.blind_mse:.3f}"
+            axes[0].set_title(axes[0].get_title(loc="left") + beside)
+    if exposed:
+        _draw_exposures(axes[int(several)], plan)
+    if wide:
+        ax = axes[-1]
         _draw_line(ax, widths, "width", 1e9, drawing.COLORS[0])
         ax.plot(1e9 * (best.width or 0.0), best.blind_mse, "o", **_RING)
         ax.set(xlabel="width of the band [nm]", ylabel="relative MSE, blind", title=f"at {1e3 * best.exposure:.3g} ms")
+        _limit(ax)
+    if exposed:
+        figure.legend(*axes[int(several)].get_legend_handles_labels(), loc="outside lower center", ncols=6)
     return figure
+
+
+def _limit(ax: Axes) -> None:
+    ax.set_ylim(top=min(ax.get_ylim()[1], _MOST))
 
 
 def _draw_line(ax: Axes, line: Sequence[Choice], axis: str, scale: float, color: str, label: str | None = None) -> None:
@@ -63,8 +76,9 @@ def _draw_map(figure: Figure, ax: Axes, plan: ObservationPlan) -> None:
     middle = (np.nanmin(errors) + np.nanmax(errors)) / 2
     for (row, column), error in np.ndenumerate(errors):
         text, color = f"> {error:.3f}" if limits[row, column] else f"{error:.3f}", "white"
-        if np.isnan(error):
-            text, color = "does not fit", drawing.FAINT
+        if np.isnan(error):  # of masks that exist an interrupted plan has not reached all exposures
+            exists = (numbers[row], holes[column]) in plan.masks
+            text, color = "not reached" if exists else "does not fit", drawing.FAINT
         ax.text(column, row, text, ha="center", va="center", fontsize=8, color="black" if error > middle else color)
     place = holes.index(best.hole_diameter), numbers.index(best.n_subapertures)
     ax.plot(*place, "o", markersize=34, fillstyle="none", color=drawing.COLORS[1])
@@ -93,13 +107,12 @@ def _draw_exposures(ax: Axes, plan: ObservationPlan) -> None:
     ax.plot(1e3 * best.exposure, best.blind_mse, "o", **_RING)
     tau0 = plan.instrument.with_exposure(best.exposure).seeing.tau0
     ax.axvline(1e3 * tau0, color=drawing.FAINT, linestyle="--", linewidth=1)
-    ax.annotate("tau0", (1e3 * tau0, 1), xycoords=("data", "axes fraction"), fontsize=8, ha="left", va="top")
+    beside_line: dict[str, Any] = {"xytext": (3, 0), "textcoords": "offset points", "ha": "left", "va": "top"}
+    ax.annotate("tau0", (1e3 * tau0, 1), xycoords=("data", "axes fraction"), fontsize=8, **beside_line)
     ax.set_xscale("log")
     times = sorted({1e3 * choice.exposure for choice in plan.choices})
     ax.set_xticks(times, [f"{time:.3g}" for time in times])
     ax.minorticks_off()
     title = "" if is_full else f"holes of {best.hole_diameter:.3g} m"
     ax.set(xlabel="exposure [ms]", ylabel="relative MSE, blind", title=title)
-    low, high = ax.get_ylim()
-    ax.set_ylim(low, high + _ROOM * (high - low))
-    ax.legend(loc="upper right", ncols=2)
+    _limit(ax)

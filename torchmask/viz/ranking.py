@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import textwrap
+from typing import TYPE_CHECKING, Any
 
 from torchmask.design.ranking import Layout, RankedMask, Ranking
 from torchmask.viz import style as drawing
@@ -11,6 +12,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+_LINE = 100  # characters, as wide as the figure
 _MARKS = {
     Layout.AFRESH: (drawing.COLORS[0], "o", "laid afresh, all with the same collecting area"),
     Layout.SEARCHED: (drawing.COLORS[1], "o", "searched by torchmask, the same area"),
@@ -19,8 +21,11 @@ _MARKS = {
 
 
 @drawing.styled
-def ranking_figure(ranking: Ranking) -> Figure:
-    """Draw the masks in order, each as built and laid afresh on one line, and their error over the number of holes."""
+def ranking_figure(ranking: Ranking, light: str) -> Figure:
+    """Draw the masks in order, each as built and laid afresh on one line, and their error over the number of holes.
+
+    `light` says in words for which light they are ranked.
+    """
     from matplotlib.ticker import MaxNLocator
 
     best: dict[str, float] = {}
@@ -49,7 +54,8 @@ def ranking_figure(ranking: Ranking) -> Figure:
     against.set(xlabel="number of holes", ylabel="relative MSE", title="Against the number of holes")
     against.set_ylim(0)
     against.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
-    figure.legend(*listing.get_legend_handles_labels(), loc="outside upper left", ncols=1)
+    legend: dict[str, Any] = {"title": textwrap.fill(light, _LINE), "title_fontsize": 8, "alignment": "left"}
+    figure.legend(*listing.get_legend_handles_labels(), loc="outside upper left", ncols=1, **legend)
     return figure
 
 
