@@ -205,7 +205,7 @@ def test_which_priors_are_adapted_to_the_object(end, gentle, descends, integrate
     neither in the descent before it, nor where the search has ended in faint frames."""
     objective, state = explained
     asked, told = {True: set(), False: set()}, []
-    monkeypatch.setattr(finish, "shows_gentle_slopes", lambda *given: gentle)
+    monkeypatch.setattr(finish, "shows_gentle_slopes", lambda *given, faint: gentle)
     monkeypatch.setattr(SmoothVariation, "adapted_to", lambda self, image, reach: told.append((image, reach)) or self)
     descend, integrate = finish.descend, finish.integrate_aberrations
 
@@ -262,7 +262,7 @@ def test_a_search_under_a_lighter_prior_descends_under_the_given_one_again(
     monkeypatch.setattr(finish, "descend", descend)
     monkeypatch.setattr(finish, "recalibrate", recalibrate)
     monkeypatch.setattr(finish, "integrate_aberrations", integrate)
-    monkeypatch.setattr(finish, "shows_gentle_slopes", lambda objective, state, change: asked.append(change) or True)
+    monkeypatch.setattr(finish, "shows_gentle_slopes", lambda *given, faint: asked.append((given[2], faint)) or True)
     schedule = Schedule(faint_segments=3, segment=4)
     end_rate, change = 0.8, Change(6.0, 10, 4096)
     state = replace(state, image=state.image * rate_of_slopes(state.image) / end_rate / 2**n_segments)
@@ -274,13 +274,16 @@ def test_a_search_under_a_lighter_prior_descends_under_the_given_one_again(
     *segments, own, image = course
     assert segments == n_segments * ["recalibrated", (prior, 4)]
     assert torch.equal(image, 2**n_segments * state.image)
-    assert asked == [change]  # whether slopes are gentle
+    assert asked == [(change, False)]  # whether slopes are gentle, of frames that change by more than `faint`
     assert repr(own) == repr(prior.suited_to(max(end_rate, change.light / 40)))
     assert own.weight == prior.weight * (change.light / 40 if isinstance(prior, TotalVariation) else 1)
     assert progress.n_evaluations == 7 * n_segments
     assert [(record.stage, record.step) for record in records] == [
         ("before integration", number + 1) for number in range(n_segments)
     ]
+    fainter = replace(finisher, schedule=replace(schedule, faint=7.0))
+    fainter.finish(objective.with_changes(prior=prior), Progress(Candidates(state, 1), rate=rate), End.INTEGRATION)
+    assert asked[1:] == [(change, True)]
 
 
 @pytest.mark.parametrize(("gentle", "too_steep"), [(False, True), (True, False), (True, True)])
@@ -292,7 +295,7 @@ def test_an_object_that_is_steeper_than_its_gentle_slopes_is_integrated_as_astra
     monkeypatch.setattr(
         finish, "integrate_aberrations", lambda *given, astray, **more: told.append(astray) or (state, 0)
     )
-    monkeypatch.setattr(finish, "shows_gentle_slopes", lambda *given: gentle)
+    monkeypatch.setattr(finish, "shows_gentle_slopes", lambda *given, faint: gentle)
     monkeypatch.setattr(finish, "is_too_steep", lambda *given: too_steep)
     ended(objective, state, Setting.of(objective), Schedule(), end=End.INTEGRATION)
     assert told == [gentle and too_steep]
@@ -347,7 +350,7 @@ def test_nothing_follows_the_search_of_a_schedule_without_last_segments(observe,
     assert "TotalVariation" in result.prior
 
 
-def found_rate(objective, state, change, *, full):
+def found_rate(objective, state, change, *, faint, full):
     """The rate of slopes that are gentle."""
     return rate_of_descent(rate_of_slopes(state.image), full=full)
 

@@ -460,7 +460,7 @@ def test_an_explained_object_of_gentle_slopes_is_heated_once(gentle, cooling, ki
         progress.status = Status.CONVERGED
         ends.append(progress.state)
 
-    monkeypatch.setattr(restarts, "shows_gentle_slopes", lambda objective, state, change: gentle)
+    monkeypatch.setattr(restarts, "shows_gentle_slopes", lambda objective, state, change, faint: gentle)
     monkeypatch.setattr(restarts, "temper", heat)
     monkeypatch.setattr(restarts, "twin_of", twin)
     monkeypatch.setattr(Solver, "_advance", stay)
@@ -659,7 +659,7 @@ class Course:
 
     def __init__(self, monkeypatch, truth, rates, gentle=False):
         self.truth, self.rates, self.weights, self.ends = truth, list(rates), [], []
-        monkeypatch.setattr(spectrum, "shows_gentle_slopes", lambda objective, state, change: gentle)
+        monkeypatch.setattr(spectrum, "shows_gentle_slopes", lambda objective, state, change, faint: gentle)
         monkeypatch.setattr(solver, "descend", self.descend)
         monkeypatch.setattr(solver, "recalibrate", lambda objective, state, power, **more: state)
         monkeypatch.setattr(solver.Finisher, "finish", self.finish)
