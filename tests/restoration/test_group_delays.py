@@ -63,11 +63,12 @@ def test_pistons_find_the_fringes_that_a_descent_misses(waves, wide, off):
     """Whole waves and parts of one, the same in all frames, which the object takes over as far as it can."""
     objective, state = wide
     lost = descended(objective, descended(objective, off(objective, state, waves)))
-    assert float(waves_off(objective, lost, state).abs().max()) > 0.3
+    missed = float(waves_off(objective, lost, state).abs().max())
+    assert missed > 0.2  # four times what counts as found
     begun, evaluations = start_from_delays(objective, lost, 30.0, ProjectedLBFGS())
     assert 100 <= evaluations <= 130
     assert (begun.calibration.noise_inflation == 30).all()
-    assert float(waves_off(objective, begun, state).abs().max()) < 0.3  # 0.39 of a wave is what `lost` has
+    assert float(waves_off(objective, begun, state).abs().max()) < min(0.3, missed)
     found = found_from(objective, begun, state)
     assert float(waves_off(objective, found, state).abs().max()) < 0.05
     assert cost(objective, found) < cost(objective, lost) - 10

@@ -21,9 +21,9 @@ def exposures(five_holes):
     """Mask, object, frames, and the true and the measured coefficients."""
     mask = five_holes
     generator = torch.Generator().manual_seed(3)
-    columns = whitening(mask, N_MODES, R0, 20.0)
+    columns = torch.linalg.qr(whitening(mask, N_MODES, R0, 20.0).T).R.T  # unique, as eigenvectors of a ring are not
     z = torch.randn(8, columns.shape[1], dtype=torch.float64, generator=generator)
-    true = (z @ columns.T).unflatten(1, (5, N_MODES))
+    true = (z @ (columns * columns.diagonal().sign()).T).unflatten(1, (5, N_MODES))
     model = ExposureModel(mask, GRID, N_MODES)
     scene = torch.zeros(GRID.shape, dtype=torch.float64)
     scene[16:24, 17:23] = 3

@@ -145,7 +145,6 @@ def number_of_iterations(max_iterations: int) -> int:
 
 def number_of_samples(n_samples: int) -> int:
     """Return a number of samples. Raises ValueError for one that does not allow standard deviations."""
-    n_samples = whole_number("n_samples", n_samples, least=0)
-    if n_samples == 1:
-        raise ValueError("n_samples is 1: it must be 0, for no standard deviations, or at least 2")
-    return n_samples
+    if n_samples == 0:
+        return 0
+    return whole_number("n_samples", n_samples, least=2, note=", or 0 for no standard deviations")
