@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+THROUGH_AIR = 1e-7, 5e-5  # [m] of an observation, from the ultraviolet to beyond the last window of the infrared
+
 
 def require(name: str, value: float | None, unit: str = "", zero: bool = False, most: float = math.inf) -> None:
     """Raise ValueError unless the number is None, or finite, positive (or `zero`) and no more than `most`.
@@ -58,6 +60,20 @@ def require_r0(name: str, r0: float | None) -> None:
     is not of this range; `TurbulencePhase` takes any.
     """
     require_within(name, r0, 1e-3, 20.0, " m", "visible light along the ground to 40 micrometres on the best nights")
+
+
+def require_diameter(name: str, metres: float | None) -> None:
+    """Raise ValueError unless this is None or the diameter [m] of a telescope or a mask; millimetres are recognised.
+
+    >>> require_diameter("mask_diameter", 8200.0)
+    Traceback (most recent call last):
+    ValueError: mask_diameter is 8200.0: it must be from 0.001 to 1000 m (a mask on a bench to the largest telescope \
+thought of; in m, so 8.2 m are 8.2); the nearest possible is 1000 m
+    """
+    require_within(
+        *(name, metres, 1e-3, 1000.0, " m"),
+        "a mask on a bench to the largest telescope thought of; in m, so 8.2 m are 8.2",
+    )
 
 
 def whole_number(name: str, value: float, least: int = 1, most: float = math.inf, note: str = "") -> int:

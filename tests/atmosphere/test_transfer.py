@@ -6,8 +6,9 @@ import pytest
 import torch
 from exact_turbulence import drawn_mean_square, sampled_mean_square
 
+from torchmask.atmosphere import transfer
 from torchmask.atmosphere.seeing import Seeing
-from torchmask.atmosphere.transfer import difference_variance, mean_square_otf
+from torchmask.atmosphere.transfer import difference_variance, mean_square_otf, steady_square_otf
 from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.band import Band
@@ -147,6 +148,36 @@ def test_hexagons_annuli_and_zero_frequency():
         grid_nu = torch.tensor([[column / 32, row / 32]], dtype=torch.float64)
         exact = float(analytic_otf(aperture, NYQUIST).real[row, column]) ** 2
         assert float(mean_square_otf(aperture, NYQUIST, grid_nu, Seeing(1e6))[0]) == pytest.approx(exact, rel=1e-6)
+
+
+def test_separations_that_turbulence_silences_cost_one_evaluation_and_change_nothing(monkeypatch):
+    """A full pupil of 25 r0 in an exposure, where nearly all pairs of points are far apart."""
+    pupil, grid, seeing = FullAperture(1.0), Grid.nyquist(1.0, 550e-9, 64), Seeing(0.04, 20.0, 5e-4, 10.0)
+    frequencies, evaluated = torch.tensor([[0.25, 0.1]]), [0]
+
+    def count(structure, separation, *rest):
+        evaluated[0] += separation[..., 0].numel()
+        return original(structure, separation, *rest)
+
+    original = transfer.difference_variance
+    monkeypatch.setattr(transfer, "difference_variance", count)
+    few = mean_square_otf(pupil, grid, frequencies, seeing)
+    least, evaluated[0] = evaluated[0], 0
+    monkeypatch.setattr(transfer, "_LOST", math.inf)
+    torch.testing.assert_close(few, mean_square_otf(pupil, grid, frequencies, seeing), rtol=1e-9, atol=0)
+    assert least < evaluated[0] / 8
+    steady = steady_square_otf(pupil, grid, frequencies, seeing)
+    monkeypatch.setattr(transfer, "_LOST", 60.0)
+    torch.testing.assert_close(steady_square_otf(pupil, grid, frequencies, seeing), steady, rtol=1e-9, atol=1e-14)
+
+
+def test_separations_far_away_are_taken_together_and_change_little(monkeypatch):
+    """A full pupil of 25 r0 at baselines of 0.25 and 1.25 r0: 0.5 % is what sampling leaves uncertain."""
+    pupil, grid, seeing = FullAperture(1.0, 0.14), Grid.nyquist(1.0, 550e-9, 64), Seeing(0.04, 20.0, 1e-3, 10.0)
+    frequencies = torch.tensor([[0.005, 0.0], [0.02, 0.015]])
+    few = mean_square_otf(pupil, grid, frequencies, seeing)
+    monkeypatch.setattr(transfer, "_FAR", math.inf)
+    torch.testing.assert_close(few, mean_square_otf(pupil, grid, frequencies, seeing), rtol=5e-4, atol=0)
 
 
 def test_a_population_is_refused():

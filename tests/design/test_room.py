@@ -59,21 +59,30 @@ def test_what_is_no_list_of_rules_is_refused(constraints):
 
 
 def test_what_no_area_can_hold_is_refused_at_once():
-    """The number that is stated is that of Oler's inequality, worked out here for the centres, as he has it."""
+    """The number that is proposed has room, at 0.8 of Oler's inequality, worked out here for the centres."""
     told = []
     with pytest.raises(ValueError, match=r"300 holes of 0\.1834 m.*gaps of 0\.5 m.*at most \d+ at") as refusal:
         require_room(300, 8.2, 0.15, [MinimumGap(0.5)], callback=told.append)
     assert not told  # not a single trial
     stated = int(str(refusal.value).split("of at most ")[1].split()[0])
     # Oler: N points at distances of at least t in a disc of radius R; N at this fill factor sets both
-    area = [
-        2 / math.sqrt(3) * math.pi * (radius / apart) ** 2 + math.pi * radius / apart + 1
-        for n in (stated, stated + 1)
-        for hole in [8.2 * math.sqrt(0.15 / n)]
-        for radius, apart in [((8.2 - hole) / 2, hole + 0.5)]
-    ]
-    assert stated <= area[0]
-    assert area[1] < stated + 1
+    hole = 8.2 * math.sqrt(0.15 / stated)
+    radius, apart = (8.2 - hole) / 2, hole + 0.5
+    most = 2 / math.sqrt(3) * math.pi * (radius / apart) ** 2 + math.pi * radius / apart + 1
+    assert 0.75 * most < stated < 0.85 * most
+    check_mask(require_room(stated, 8.2, 0.15, [MinimumGap(0.5)])[1], 1e-9, [MinimumGap(0.5)])
+
+
+def test_holes_too_narrow_for_the_criterion_are_not_proposed():
+    """A hundred holes with such gaps would have to be narrow; at most that many of them are named otherwise."""
+    request, rules = (100, 1.0, 0.3), [MinimumGap(0.05)]
+    with pytest.raises(ValueError, match="a fill_factor of at most"):
+        require_room(*request, rules)
+    with pytest.raises(ValueError, match="n_subapertures of at most") as refusal:
+        require_room(*request, rules, narrowest=0.054)
+    assert "fill_factor of at most" not in str(refusal.value)
+    with pytest.raises(ValueError, match=r"where holes are narrower than a sample .* take fewer holes"):
+        require_room(3, 1.0, 0.15, [KeepOutDisc(0.7)], narrowest=0.2)
 
 
 @pytest.mark.parametrize(

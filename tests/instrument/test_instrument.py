@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import warnings
 
 import pytest
 import torch
@@ -11,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchmask.design.rules import MaskRules
-from torchmask.grid import ARCSEC
+from torchmask.design.turbulent import TurbulentMSE
+from torchmask.grid import ARCSEC, Grid
 from torchmask.instrument.instrument import VEGA_IN_AB, Instrument
 from torchmask.instrument.parts import Camera, Site, Source, Telescope
 from torchmask.io import to_json
@@ -19,6 +21,7 @@ from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.band import Band
 from torchmask.optics.passband import Passband
 from torchmask.optics.shapes import TelescopePupil
+from torchmask.spectra import NoisePSD, PowerLawPSD
 
 BAND = {"wavelength": 550e-9, "width": 50e-9}
 
@@ -177,10 +180,47 @@ def test_observations_that_cannot_be_are_refused(changes, said):
         make(**changes)
 
 
+@pytest.mark.parametrize(("percent", "given", "enough"), [(20, 1, 2), (6, 1, 2), (30, 2, 3), (80, 5, 6)])
+def test_too_few_wavelengths_for_the_band_are_warned_of_with_the_number_that_does(percent, given, enough):
+    band = {"width": 550e-9 * percent / 100}
+    with pytest.warns(
+        UserWarning, match=rf"is {given} for a band {percent} % wide: .*; {enough} wavelengths do"
+    ) as said:
+        make(n_wavelengths=given, **band)
+    assert len(said) == 1
+    make(n_wavelengths=enough, **band)  # a warning would be an error here
+
+
+def test_few_wavelengths_are_warned_of_once_whatever_is_made_of_the_instrument():
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("default")
+        known = make(n_wavelengths=1, width=100e-9)
+        known.with_exposure(4e-3)
+        make(n_wavelengths=1, width=100e-9, exposure=2e-3)
+    assert len(said) == 1
+
+
+@pytest.mark.parametrize("width", [0.05, 0.2, 0.35])
+def test_the_number_of_wavelengths_that_does_tells_errors_to_four_percent(width):
+    """Of masks of wide and narrow holes, against nine wavelengths."""
+    grid = Grid(32, 400e-9 / 2, 550e-9)
+    masks = [SparseAperture.from_catalog(*case) for case in (("golay9", 1.0, 0.15), ("golay6", 1.0, 0.05))]
+
+    def errors(n_wavelengths):
+        band = Band.top_hat(550e-9, width * 550e-9, n_wavelengths)
+        light = {"wavelengths": band.wavelengths, "weights": band.shares}
+        criterion = TurbulentMSE(grid, PowerLawPSD(1.5, 1e6), NoisePSD(1e6), 20, r0=1 / 7, **light)
+        return torch.stack([criterion.relative(mask) for mask in masks])
+
+    enough = 1 + math.ceil((width - 0.05) / 0.15 - 1e-9)
+    torch.testing.assert_close(errors(enough), errors(9), rtol=0.04, atol=0)
+
+
 @pytest.mark.parametrize(
     ("part", "numbers", "said"),
     [
         (Telescope, {"diameter": 0.0}, r"telescope.diameter is 0.0: .*in m"),
+        (Telescope, {"diameter": 8200.0}, r"telescope.diameter is 8200.0: .* to 1000 m .* 8.2 m are 8.2"),
         (Telescope, {"diameter": 1.0, "central_obstruction": 1.0}, "less than the diameter, 1 m"),
         (Telescope, {"diameter": 1.0, "throughput": 1.5}, "at most 1"),
         (Telescope, {"diameter": 1.0, "vane_width": 0.1}, r"vane_angles are \[\] degrees"),

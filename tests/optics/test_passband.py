@@ -82,6 +82,7 @@ def test_a_file_is_the_curve_that_it_holds(tmp_path):
         ("5000 1\n6000 1\n", r"in m: multiply nm by 1e-9, Angstrom by 1e-10"),
         ("5e-7 1 1\n6e-7 1 1\n", "3 columns"),
         ("6e-7 1\n5e-7 1\n", "increasing"),
+        ("5e-7 0\n5.5e-7 93\n6e-7 0\n", "transmission reaches 93: .* at most 1; is it in percent.* divide by 100"),
         ("wavelength transmission\n5e-7 1\n", "holds no transmission curve"),
     ],
 )

@@ -22,17 +22,29 @@ from torchmask.design.criterion import AsymptoticMSE
 from torchmask.design.drawing import LIFE_SIZE, require_scale, save_dxf, save_svg
 from torchmask.design.manufacture import least_pixels, save_fits, save_json
 from torchmask.design.redundancy import analyse_redundancy
+from torchmask.design.room import count_holes
 from torchmask.design.rules import MaskRules
 from torchmask.design.search import SearchResult, search_mask
 from torchmask.design.tolerance import machining_tolerance
 from torchmask.grid import ARCSEC, Grid
 from torchmask.instrument.instrument import Instrument
 from torchmask.io import write_json
+from torchmask.numbers import THROUGH_AIR, require_diameter, require_wavelength
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.packing import hole_diameter
 from torchmask.record import Callback, Record, fan_out
 from torchmask.spectra import PowerLawPSD
 
+_LENGTHS = ("subaperture_diameter", "strict_hole_diameter", "shortest_baseline", "longest_baseline", "largest_gap")
+_TOLERANCES = ("rms_error_tolerated", "rms_error_tolerated_standard_error")
+_UNITS = {  # of metrics.json
+    "mse": "electrons^2",
+    **dict.fromkeys((*_LENGTHS, *_TOLERANCES), "m"),
+    **dict.fromkeys(("fwhm", "fwhm_min", "fwhm_max"), "wavelength / mask_diameter"),
+    "field_arcsec": "arcsec",
+    "seconds": "s",
+    "all others": "1",
+}
 _GROWTH, _SUCCESS = 0.01, 0.95  # tolerated growth of the MSE by machining errors, and fraction of masks below it
 
 
@@ -83,10 +95,13 @@ def search(
 def run(options: Options) -> None:
     """Search, and write the mask, or the best one so far if interrupted."""
     require_scale(options.scale)
+    require_diameter("mask_diameter", options.mask_diameter)
+    require_wavelength("wavelength", options.wavelength, *THROUGH_AIR)
+    rules = options.constraints()
+    options.require_on_pupil(options.mask_diameter)
     knee = PowerLawPSD.knee if options.knee is None else options.knee
     observed = options.observation(options.n_frequencies, options.exponent, knee, options.fill_factor)
     criterion = observed.criterion()
-    rules = options.constraints()
     if options.r0 is not None and observed.turbulence is None:
         warn_of_wide_holes(options, options.r0)
     used = options.used_instrument(observed, options.central_obstruction)
@@ -115,8 +130,9 @@ def run(options: Options) -> None:
         if options.r0 is not None:
             table["hole_over_r0"] = result.aperture.subaperture_diameter / options.r0
         write_json(output.directory / "metrics.json", table)
+        found = result.aperture
         output.summary.append(
-            f"{result.aperture.n_subapertures} holes of {result.aperture.subaperture_diameter:.4g} m: relative MSE "
+            f"{count_holes(found.n_subapertures)} of {found.subaperture_diameter:.4g} m: relative MSE "
             f"{result.relative_mse:.5g}, {table['relative_mse_above_floor']:.5g} above what no mask of this diameter "
             f"can avoid; {result.evaluations} evaluations, {seconds:.0f} s"
         )
@@ -160,6 +176,7 @@ def metrics(result: SearchResult, criterion: AsymptoticMSE) -> dict[str, object]
     """Return the properties of a mask for metrics.json: errors, hole size, baselines."""
     aperture = result.aperture
     table: dict[str, object] = {
+        "units": _UNITS,
         "mse": result.mse,
         "relative_mse": result.relative_mse,
         "relative_mse_above_floor": result.relative_mse - criterion.relative_floor(aperture.mask_diameter),

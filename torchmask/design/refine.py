@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,6 +20,7 @@ from torchmask.record import Callback, Record
 
 PENALTY = 3e3  # weight of the squared shortfalls, in mask diameters, relative to log MSE
 TOLERANCE = 1e-9  # largest shortfall of a result, in mask diameters
+_FEWEST_DRAWN, _MOST_DRAWN, _DRAWN = 3, 30, 150_000  # masks of a stage in its history, and those of one hole
 
 
 @dataclass(frozen=True)
@@ -30,8 +32,9 @@ class SearchResult:
     relative_mse : relative value of the criterion at this mask
     evaluations : number of masks whose error was computed
     history : for each stage, an array (n, 2) of evaluations so far, in all stages, and relative MSE of the best mask.
-        The MSE is that of the mask projected onto the constraints, on the grid of the criterion, whatever grid and
-        penalty the stage used. Masks that could not be projected are left out. `evaluations` does not include these.
+        The MSE is the lowest so far of a few masks projected onto the constraints, on the grid of the criterion,
+        whatever grid and penalty the stage used, so it never rises: the gradient stage begins where the search ended.
+        Masks that could not be projected are left out. `evaluations` does not include these.
 
     Examples
     --------
@@ -53,7 +56,7 @@ class SearchResult:
 class Monitor:
     """Keeps track of the best masks of a stage, and calls the callback about a hundred times.
 
-    `before` is the number of evaluations of earlier stages.
+    `before` is the number of evaluations of earlier stages, and `known` the best feasible mask that they found.
     """
 
     stage: str
@@ -61,10 +64,21 @@ class Monitor:
     holes: Holes
     callback: Callback | None
     before: int
+    known: SparseAperture | None
 
-    def __init__(self, stage: str, budget: int, holes: Holes, callback: Callback | None, before: int = 0) -> None:
-        self.stage, self.budget, self.holes, self.callback, self.before = stage, budget, holes, callback, before
-        self.rows: list[tuple[int, Tensor]] = []  # evaluations, centres
+    def __init__(
+        self,
+        stage: str,
+        budget: int,
+        holes: Holes,
+        callback: Callback | None,
+        before: int = 0,
+        known: SparseAperture | None = None,
+    ) -> None:
+        self.stage, self.budget, self.holes, self.callback = stage, budget, holes, callback
+        self.before, self.known = before, known
+        self._rows: list[tuple[int, Tensor]] = []  # evaluations of this stage, centres; each mask once
+        self._result: float | None = None  # its relative MSE, once the stage has concluded
         self._merit = self._relative = float("inf")
         self._centers: Tensor | None = None
         self._due = 0.0
@@ -77,12 +91,13 @@ class Monitor:
             self._centers = self.holes.aperture(x[index]).centers
         if self._centers is not None and evaluations >= self._due:
             self._due = evaluations + self.budget / 100
-            self.rows.append((self.before + evaluations, self._centers))
+            if not self._rows or self._rows[-1][1] is not self._centers:
+                self._rows.append((evaluations, self._centers))
             self._tell(evaluations, self._relative, self._centers)
 
     def conclude(self, evaluations: int, relative_mse: float, aperture: SparseAperture) -> None:
         """Record the mask that the stage returns."""
-        self.rows.append((self.before + evaluations, aperture.centers))
+        self._result = relative_mse
         self._tell(evaluations, relative_mse, aperture.centers)
 
     def _tell(self, evaluations: int, relative_mse: float, centers: Tensor) -> None:
@@ -95,24 +110,49 @@ class Monitor:
         if self.callback is not None:
             self.callback(Record(stage, step, n_steps, scalars, preparatory=True))
 
-    def history(self, criterion: Criterion) -> dict[str, Tensor]:
-        """Return the entry of the stage in `SearchResult.history`."""
-        distinct = {id(centers): centers for _, centers in self.rows}  # a mask is the best for many rows
-        measured: dict[int, float] = {}
-        for step, (key, centers) in enumerate(distinct.items(), 1):
-            measured[key] = self._measure(criterion, centers)
-            self.tell_after(f"{self.stage}/history", step, len(distinct), {"relative_mse": measured[key]})
-        rows = [(evaluations, measured[id(centers)]) for evaluations, centers in self.rows]
-        found = [row for row in rows if row[1] < float("inf")]
-        return {self.stage: torch.tensor(found, dtype=torch.float64, device="cpu").reshape(-1, 2)}
+    def history(self, criterion: Criterion, used: int) -> tuple[dict[str, Tensor], SparseAperture | None]:
+        """Return the entry of the stage in `SearchResult.history`, and the best mask of it that has been measured.
 
-    def _measure(self, criterion: Criterion, centers: Tensor) -> float:
+        `used` is the number of evaluations of the stage. A few of its masks are projected and measured, the last one
+        among them. If they are its result, as no `conclude` has told another, the callback learns of it.
+        """
+        best = self.known
+        least = float("inf") if best is None else _relative(criterion, best)
+        curve = [(self.before, least)]
+        shown = _thinned(self._rows, self.holes.template.n_subapertures)
+        stage, n_steps = f"{self.stage}/history", len(shown) + 1
+        for step, (evaluations, centers) in enumerate(shown, 1):
+            mask = self._projected(centers)
+            if mask is not None and (found := _relative(criterion, mask)) < least:
+                best, least = mask, found
+            curve.append((self.before + evaluations, least))
+            self.tell_after(stage, step, n_steps, {"relative_mse": least})
+        if self._result is None and best is not None:
+            self.conclude(used, least, best)
+        curve.append((self.before + used, least if self._result is None else self._result))
+        self.tell_after(stage, n_steps, n_steps, {"relative_mse": curve[-1][1]})
+        found_at = [row for row in curve if row[1] < float("inf")]
+        return {self.stage: torch.tensor(found_at, dtype=torch.float64, device="cpu").reshape(-1, 2)}, best
+
+    def _projected(self, centers: Tensor) -> SparseAperture | None:
         try:
-            mask = project(self.holes.template.replace(centers=centers), self.holes.constraints)
+            return project(self.holes.template.replace(centers=centers), self.holes.constraints)
         except Infeasible:
-            return float("inf")
-        with torch.no_grad():
-            return float(criterion.relative(mask))
+            return None
+
+
+def _relative(criterion: Criterion, aperture: SparseAperture) -> float:
+    with torch.no_grad():
+        return float(criterion.relative(aperture))
+
+
+def _thinned(rows: list[tuple[int, Tensor]], n_subapertures: int) -> list[tuple[int, Tensor]]:
+    """Return a few of the masks, evenly spaced from the first to the last, for a history.
+
+    A projection takes time in proportion to N^3, a second for 40 holes: so many that all take a few seconds.
+    """
+    count = min(len(rows), max(_FEWEST_DRAWN, min(_MOST_DRAWN, _DRAWN // n_subapertures**3)))
+    return [rows[round(place)] for place in np.linspace(0, len(rows) - 1, count).tolist()]
 
 
 @torch.inference_mode(False)  # it differentiates, whatever the caller does
@@ -174,9 +214,11 @@ def refine_mask(
     still = aperture.still().to("cpu")
     holes = Holes(still, (InsideDisc(), NoOverlap(), *constraints))
     start = holes.coordinates(still.centers)
-    monitor = Monitor("design/refine", budget, holes, callback)
-    best, evaluations = polish(criterion, holes, start[None], budget, monitor, _if_feasible(still, constraints))
-    return conclude(criterion, best, constraints, evaluations, monitor.history(criterion), device)
+    known = _if_feasible(still, constraints)
+    monitor = Monitor("design/refine", budget, holes, callback, known=known)
+    best, evaluations = polish(criterion, holes, start[None], budget, monitor)
+    history, _ = monitor.history(criterion, evaluations)
+    return conclude(criterion, best, constraints, evaluations, history, device)
 
 
 def _if_feasible(aperture: SparseAperture, constraints: Sequence[Constraint]) -> SparseAperture | None:
@@ -187,20 +229,14 @@ def _if_feasible(aperture: SparseAperture, constraints: Sequence[Constraint]) ->
     return aperture
 
 
-def polish(
-    criterion: Criterion,
-    holes: Holes,
-    x: Tensor,
-    budget: int,
-    monitor: Monitor,
-    known: SparseAperture | None = None,
-) -> tuple[SparseAperture, int]:
+def polish(criterion: Criterion, holes: Holes, x: Tensor, budget: int, monitor: Monitor) -> tuple[SparseAperture, int]:
     """Return the best feasible mask reached from x (P, F), and the number of evaluations used, at most `budget`.
 
     With the multipliers of the augmented Lagrangian, descents converge onto the constraints and not beyond them; a
-    projection removes the remaining shortfall. The result is no worse than `known`, a feasible mask; if there is none
-    and no projection succeeds, `Infeasible` is raised.
+    projection removes the remaining shortfall. The result is no worse than the feasible mask that the monitor
+    knows; if there is none and no projection succeeds, `Infeasible` is raised.
     """
+    known = monitor.known
     merit = Merit(criterion, holes, PENALTY)
     # for one update of the multipliers and the comparison at the end
     reserve = 2 * len(x) + (known is not None)

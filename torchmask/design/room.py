@@ -23,6 +23,10 @@ _STARTS = 16
 _ROUNDS = 150
 _BISECTIONS = 14
 _SPECK = 1e-4  # smallest fraction of a request that is tried; if even that fails, the request is not the obstacle
+# How much wider cells, of a hole and its gap, must be for a search to find room: not at all for up to 20 holes, whose
+# best packings are known; beyond, the bound on their number is more than any packing reaches.
+_SPARE = 1.0, 1.1
+_WELL_PACKED = 20
 _NEAR = 1e-7  # sum of squared shortfalls from which a projection is tried, in mask diameters
 
 
@@ -32,10 +36,12 @@ def require_room(
     fill_factor: float,
     constraints: Sequence[Constraint],
     callback: Callback | None = None,
+    narrowest: float = 0.0,
 ) -> tuple[Holes, SparseAperture]:
     """Return the holes of a request with all their constraints, and a first mask that satisfies them.
 
     Requests that no packing can satisfy are refused at once. Others are tried, with preparatory records for `callback`.
+    Holes below the `narrowest` diameter [m] are not proposed instead.
 
     Raises
     ------
@@ -48,7 +54,8 @@ def require_room(
     """
     hole_diameter(n_subapertures, mask_diameter, fill_factor)
     require_constraints(constraints)
-    _require_area(n_subapertures, mask_diameter, fill_factor, constraints)
+    least_fill = n_subapertures * (narrowest / mask_diameter) ** 2
+    _require_area(n_subapertures, mask_diameter, fill_factor, constraints, least_fill)
     rng = np.random.default_rng(0)
     holes = _holes(n_subapertures, mask_diameter, fill_factor, constraints)
     trials = _Trials(callback)
@@ -66,16 +73,24 @@ def require_room(
 
     rules = ", ".join(map(str, constraints)) or "the mask disc"
     raise Infeasible(
-        f"no mask of {n_subapertures} holes with fill_factor {fill_factor} was found that obeys {rules}; "
-        f"{_advice(fits, fill_factor, list(constraints))}"
+        f"no mask of {count_holes(n_subapertures)} with fill_factor {fill_factor} was found that obeys {rules}; "
+        f"{_advice(fits, fill_factor, list(constraints), least_fill)}"
     )
 
 
-def _require_area(n: int, mask_diameter: float, fill_factor: float, constraints: Sequence[Constraint]) -> None:
+def count_holes(number: int) -> str:
+    """Return "1 hole", "2 holes" and so on."""
+    return f"{number} hole{'s' * (number != 1)}"
+
+
+def _require_area(
+    n: int, mask_diameter: float, fill_factor: float, constraints: Sequence[Constraint], least_fill: float
+) -> None:
     """Raise `Infeasible` if there is too little area for N holes with their gaps beside the largest keep-out disc.
 
     Holes enlarged by half a gap all around do not overlap, and lie in a mask enlarged by half a gap all around. Holes
-    that would fit into the keep-out disc, reduced by half a gap all around, are lost.
+    that would fit into the keep-out disc, reduced by half a gap all around, are lost. What is proposed instead has
+    some area to spare, as a search needs, and a fill factor above `least_fill`.
     """
     width = mask_diameter - 2 * max((rule.margin for rule in constraints if isinstance(rule, RimMargin)), default=0.0)
     gap = max((rule.gap for rule in constraints if isinstance(rule, MinimumGap)), default=0.0)
@@ -88,22 +103,24 @@ def _require_area(n: int, mask_diameter: float, fill_factor: float, constraints:
         cell = hole + gap
         return largest_number(max(0.0, width + gap) / cell) - certain_number(max(0.0, blocked - gap) / cell)
 
-    def may_fit(number: int, fill: float, gap: float) -> bool:
-        return number <= most(mask_diameter * math.sqrt(fill / number), gap)
-
-    if may_fit(n, fill_factor, gap):
-        return
     hole = mask_diameter * math.sqrt(fill_factor / n)
-    fewer = next((number for number in range(n - 1, 0, -1) if may_fit(number, fill_factor, gap)), 0)
-    smaller = _largest(lambda fill: may_fit(n, fill, gap), fill_factor)
-    closer = _largest(lambda gap: may_fit(n, fill_factor, gap), gap) if gap else 0.0
+    if n <= most(hole, gap):
+        return
+
+    def has_room(number: int, fill: float, gap: float) -> bool:
+        cell = (mask_diameter * math.sqrt(fill / number) + gap) * _SPARE[number > _WELL_PACKED]
+        return number <= most(cell - gap, gap)
+
+    fewer = next((number for number in range(n - 1, 0, -1) if has_room(number, fill_factor, gap)), 0)
+    smaller = _largest(lambda fill: has_room(n, fill, gap), fill_factor)
+    closer = _largest(lambda gap: has_room(n, fill_factor, gap), gap) if gap else 0.0
     advice = [f"n_subapertures of at most {fewer} at this fill factor"] if fewer else []
-    advice += [f"a fill_factor of at most {smaller:.4g} for {n} holes"] if smaller else []
+    advice += [f"a fill_factor of at most {smaller:.4g} for {count_holes(n)}"] if smaller > least_fill else []
     advice += [f"a MinimumGap gap of at most {closer:.4g} m"] if closer else []
     beside = f" beside a keep-out disc of {blocked:.4g} m" if blocked else ""
     apart = f" with gaps of {gap:.4g} m" if gap else ""
     raise Infeasible(
-        f"{n} holes of {hole:.4g} m (fill_factor {fill_factor:.4g}){apart} cannot fit into a disc of "
+        f"{count_holes(n)} of {hole:.4g} m (fill_factor {fill_factor:.4g}){apart} cannot fit into a disc of "
         f"{width:.4g} m{beside}, whose area holds {most(hole, gap)} at most; it may have room for "
         f"{' or '.join(advice) or 'none of them: ask for a smaller keep-out disc or rim margin'}"
     )
@@ -127,12 +144,17 @@ class _Trials:
 
 
 def _advice(
-    fits: Callable[[float, Sequence[Constraint]], bool], fill_factor: float, constraints: list[Constraint]
+    fits: Callable[[float, Sequence[Constraint]], bool],
+    fill_factor: float,
+    constraints: list[Constraint],
+    least_fill: float,
 ) -> str:
     """Return what to ask for instead: smaller holes or, if even tiny ones do not fit, less of one rule."""
     largest = _largest(lambda fill: fits(fill, constraints), fill_factor)
     if largest > 0:
-        return f"the largest fill factor at which one was found is {largest:.4g}"
+        found = f"the largest fill factor at which one was found is {largest:.4g}"
+        narrow = ", where holes are narrower than a sample of the criterion's frequencies: take fewer holes"
+        return found + narrow * (largest < least_fill)
     eased = []
     for index, rule in enumerate(constraints):
         if not isinstance(rule, Inequality) or rule.length is None or getattr(rule, rule.length) == 0:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from torchmask.design.constraint_base import Constraint
@@ -52,3 +53,31 @@ class MaskRules:
             return rules + [KeepOutSegment((x, y), (to_x, to_y), width) for x, y, to_x, to_y, width in self.spiders]
         except ValueError as error:
             raise ValueError(f"spiders has a bar whose {error}") from error
+
+    def require_on_pupil(self, mask_diameter: float) -> None:
+        """Raise ValueError if a disc or bar lies wholly outside a mask of this diameter [m], where it forbids nothing.
+
+        Such a rule is most often in millimetres.
+        """
+        for x, y, diameter in self.keep_out:
+            _require_near(f"keep_out has a disc {x:g} {y:g} {diameter:g}", math.hypot(x, y), diameter, mask_diameter)
+        for x, y, to_x, to_y, width in self.spiders:
+            bar = f"spiders has a bar {x:g} {y:g} {to_x:g} {to_y:g} {width:g}"
+            _require_near(bar, _distance_from_centre((x, y), (to_x, to_y)), width, mask_diameter)
+
+
+def _require_near(name: str, distance: float, width: float, mask_diameter: float) -> None:
+    """Raise ValueError if a zone whose middle is `distance` [m] off the centre misses a mask of this diameter [m]."""
+    if distance - width / 2 >= mask_diameter / 2:
+        raise ValueError(
+            f"{name}: it lies outside the mask, of {mask_diameter:g} m around 0 0; give it in m (300 mm are 0.3), or "
+            "leave it out"
+        )
+
+
+def _distance_from_centre(start: tuple[float, float], end: tuple[float, float]) -> float:
+    """Return the distance [m] of the origin from the line between two points [m]."""
+    step = end[0] - start[0], end[1] - start[1]
+    nearest = -(start[0] * step[0] + start[1] * step[1]) / (step[0] ** 2 + step[1] ** 2)
+    share = min(max(nearest, 0.0), 1.0)
+    return math.hypot(start[0] + share * step[0], start[1] + share * step[1])

@@ -20,6 +20,7 @@ from torchmask.record import Callback
 
 DEFAULT_BUDGETS = {"hybrid": 100_000, "cma": 20_000}  # evaluations for up to 11 holes
 METHODS = tuple(DEFAULT_BUDGETS)
+_ALONE = 320  # evaluations for one hole, which has no pattern: a descent of each mask of a batch
 POLISH = 120  # evaluations of the gradient stage for each of its starting masks
 
 
@@ -60,7 +61,8 @@ def search_mask(
     seed : int
         Random seed. The same seed gives the same result on the same machine with the same number of threads.
     budget : int, optional
-        Evaluations of the criterion before the gradient stage, for "hybrid" on the coarse grid.
+        Evaluations of the criterion before the gradient stage, for "hybrid" on the coarse grid. One hole, or holes that
+        are all fixed, take no more than they need.
     constraints : sequence of Constraint
         Constraints in addition to those on the mask disc and on overlaps, which always hold.
     callback : callable, optional
@@ -101,32 +103,40 @@ def search_mask(
         budget = max(1, int(DEFAULT_BUDGETS[method] * min(1.0, 11 / n_subapertures)))
     budget = whole_number("budget", budget, note=", in evaluations")
     seed = whole_number("seed", seed, least=0)
-    _require_sampling(criterion, n_subapertures, mask_diameter, fill_factor)
-    holes, known = require_room(n_subapertures, mask_diameter, fill_factor, constraints, callback=callback)
+    narrowest = _require_sampling(criterion, n_subapertures, mask_diameter, fill_factor)
+    holes, known = require_room(n_subapertures, mask_diameter, fill_factor, constraints, callback, narrowest)
+    if holes.subspace.size == 0:
+        budget = 1  # the only mask
+    elif n_subapertures == 1:
+        budget = min(budget, _ALONE)
     rng = np.random.default_rng(seed)
     monitor = Monitor(f"design/{method}", budget, holes, callback)
     explore = evolve if method == "cma" else basin_hopping
     working = for_processor(criterion if method == "cma" else coarse_criterion(criterion))
     starts, used = explore(working, holes, budget, rng, monitor)
     device, criterion = device_of(criterion), for_processor(criterion)
-    history = monitor.history(criterion)
+    history, best = monitor.history(criterion, used)
     # Without a gradient stage, one evaluation of each candidate is needed to compare them once they are feasible, and
     # one of the mask that the room for them gave.
     allowance = (POLISH if refine else 1) * len(starts) + 1
-    monitor = Monitor("design/refine", allowance, holes, callback, before=used)
-    aperture, polished = polish(criterion, holes, starts, allowance, monitor, known)
-    history |= monitor.history(criterion)
+    monitor = Monitor("design/refine", allowance, holes, callback, before=used, known=known if best is None else best)
+    aperture, polished = polish(criterion, holes, starts, allowance, monitor)
+    history |= monitor.history(criterion, polished)[0]
     return conclude(criterion, aperture, constraints, used + polished, history, device)
 
 
-def _require_sampling(criterion: Criterion, n_subapertures: int, mask_diameter: float, fill_factor: float) -> None:
-    """Raise `Infeasible` for holes narrower than a sample of the criterion's frequencies, if it has a grid.
+def _require_sampling(criterion: Criterion, n_subapertures: int, mask_diameter: float, fill_factor: float) -> float:
+    """Return the width of a sample of the criterion's frequencies in the pupil [m], 0 if it has no grid.
 
-    The light of a baseline lies within a hole diameter of its frequency: that of narrower holes falls in between.
+    The light of a baseline lies within a hole diameter of its frequency: that of narrower holes falls in between, so
+    `Infeasible` is raised for them. Raises ValueError if the grid aliases an image through masks of this diameter.
     """
     hole, grid = hole_diameter(n_subapertures, mask_diameter, fill_factor), getattr(criterion, "grid", None)
-    if grid is None or hole >= (step := grid.period / min(grid.shape)):
-        return
+    if grid is not None:
+        grid.require_sampling(mask_diameter)
+    step = 0.0 if grid is None else grid.period / min(grid.shape)
+    if grid is None or hole >= step:
+        return step
     most, needed = math.floor(fill_factor * (mask_diameter / step) ** 2), math.ceil(grid.period / hole)
     fewer = f", n_subapertures of at most {most} at this fill factor" if most else ""
     raise Infeasible(

@@ -11,6 +11,7 @@ from typing import Any
 from torchmask.design.rules import MaskRules
 from torchmask.design.search import METHODS
 from torchmask.grid import Grid
+from torchmask.numbers import THROUGH_AIR, require_diameter, require_wavelength
 from torchmask.optics.packing import hole_diameter
 
 AXES = ("n_subapertures", "fill_factor", "n_photons", "n_frames", "diameter_over_r0", "seed")
@@ -89,7 +90,10 @@ class DesignSpace(MaskRules):
             raise ValueError(f"n_draws is {self.n_draws}: a standard error needs at least 2")
         if self.pixel_scale is not None and self.wavelength is None:
             raise ValueError(f"pixel_scale is {self.pixel_scale} rad: the wavelength is missing, give it in m")
+        require_diameter("mask_diameter", self.mask_diameter)
+        require_wavelength("wavelength", self.wavelength, *THROUGH_AIR)
         self.constraints()
+        self.require_on_pupil(self.mask_diameter)
         self.grid.require_sampling(self.mask_diameter)
 
     @property

@@ -14,14 +14,12 @@ from torchmask.atmosphere.seeing import Seeing
 from torchmask.grid import ARCSEC, Grid
 from torchmask.instrument.parts import Camera, Site, Source, Telescope
 from torchmask.io import extra, from_json, read_json, to_json, write_json
-from torchmask.numbers import require, require_wavelength, require_within, whole_number
-from torchmask.optics.band import MOST_WAVELENGTHS, Band
+from torchmask.numbers import THROUGH_AIR, require, require_wavelength, require_within, whole_number
+from torchmask.optics.band import MOST_WAVELENGTHS, Band, warn_of_few_wavelengths
 from torchmask.optics.passband import Passband
 from torchmask.spectra import NoisePSD, PowerLawPSD
 
 _FORMAT = "torchmask instrument, version 1"
-
-_THROUGH_AIR = 1e-7, 5e-5  # [m], from the ultraviolet to beyond the last window of the infrared
 
 # AB - Vega magnitudes: Blanton & Roweis, Astron. J. 133, 734 (2007), table 1.
 VEGA_IN_AB = {
@@ -41,7 +39,7 @@ class Instrument:
     """Complete description of an observation, which determines photons, frames and noise for any mask on the telescope.
 
     Raises ValueError if a number is out of range, the band is given twice or not at all, or the observing time is
-    shorter than one frame; the message says what is possible.
+    shorter than one frame; the message says what is possible. Warns if `n_wavelengths` is too small for the band.
 
     Examples
     --------
@@ -82,7 +80,7 @@ class Instrument:
     """Number of frames, instead of the observing time."""
 
     def __post_init__(self) -> None:
-        require_wavelength("wavelength", self.wavelength, *_THROUGH_AIR)
+        require_wavelength("wavelength", self.wavelength, *THROUGH_AIR)
         require("width", self.width, ", in m")
         require_within("exposure", self.exposure, 1e-6, 1e5, " s", "the fastest shutters to a day")
         require("observing_time", self.observing_time, ", in s")
@@ -118,6 +116,7 @@ class Instrument:
                 f"magnitudes of Vega are known for the filters {', '.join(VEGA_IN_AB)}: give the AB magnitude in "
                 f"{self.filter or 'the band'}"
             )
+        warn_of_few_wavelengths(self.passband, self.n_wavelengths, self.source.temperature)
 
     @property
     def passband(self) -> Passband:

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from torchmask.numbers import require, require_r0, require_within, whole_number
+from torchmask.numbers import require, require_diameter, require_r0, require_within, whole_number
 from torchmask.optics.aperture import FullAperture
 from torchmask.optics.detector import Detector
 from torchmask.optics.pixel import PixelResponse, square_pixel
@@ -39,7 +39,7 @@ class Telescope:
     as far as the curve of the filter does not include it."""
 
     def __post_init__(self) -> None:
-        require("telescope.diameter", self.diameter, ", in m")
+        require_diameter("telescope.diameter", self.diameter)
         require("telescope.throughput", self.throughput, "", most=1.0)
         if not 0 <= self.central_obstruction < self.diameter:
             raise ValueError(

@@ -14,6 +14,7 @@ from torchmask.io import extra
 _AB_ZERO = 3631e-26  # W / (m^2 Hz) of AB magnitude 0: Oke & Gunn, Astrophys. J. 266, 713 (1983), as 3631 Jy
 _LIGHT = (1e-8, 1e-2)  # m
 _FILES = (".txt", ".dat", ".csv")
+_ROUNDING = 1e-6  # by which a curve that was scaled to a peak of 1 may exceed it
 _RELATIVE = 1e-3  # a named curve that peaks below has a unit of its own: 2MASS's peak at 4e-5 to 8e-5
 
 
@@ -25,7 +26,7 @@ class Passband:
     unit of their own, are scaled to a peak of 1.
 
     Raises ValueError if the sequences differ in length or have fewer than 2 values, wavelengths do not increase, or the
-    transmission is negative somewhere or positive nowhere.
+    transmission is negative or above 1 somewhere, or positive nowhere.
 
     Examples
     --------
@@ -39,6 +40,11 @@ class Passband:
 
     def __post_init__(self) -> None:
         check_curve(np.asarray(self.wavelengths, dtype=float), np.asarray(self.transmission, dtype=float))
+        if (peak := max(self.transmission)) > 1 + _ROUNDING:
+            raise ValueError(
+                f"the curve's transmission reaches {peak:.4g}: it must be a fraction, at most 1; is it in percent? "
+                "then divide by 100"
+            )
 
     @classmethod
     def top_hat(cls, wavelength: float, width: float) -> Passband:
