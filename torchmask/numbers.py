@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from numbers import Real
 
 THROUGH_AIR = 1e-7, 5e-5  # [m] of an observation, from the ultraviolet to beyond the last window of the infrared
 
@@ -79,7 +80,8 @@ thought of; in m, so 8.2 m are 8.2); the nearest possible is 1000 m
 def whole_number(name: str, value: float, least: int = 1, most: float = math.inf, note: str = "") -> int:
     """Return a count as an int; floats without a fraction pass, as arithmetic makes them.
 
-    Raises ValueError unless it is a whole number from `least` to `most`; a note ends the message.
+    Raises ValueError unless it is a whole number from `least` to `most`, and TypeError if it is no number at all; a
+    note ends the message.
 
     >>> whole_number("n_frames", 20.0)
     20
@@ -87,6 +89,8 @@ def whole_number(name: str, value: float, least: int = 1, most: float = math.inf
     Traceback (most recent call last):
     ValueError: n_frames is 2.5: it must be a whole number of at least 1
     """
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise TypeError(f"{name} is {value!r}: it must be a whole number{note}")
     if float(value).is_integer() and least <= value <= most:
         return int(value)
     among = f"of at least {least}" if math.isinf(most) else f"from {least} to {most:g}"

@@ -64,13 +64,11 @@ def test_rows_on_record_are_never_dropped(tmp_path, capsys):
     names = ["table.md", "table.csv", "table.json", "config.yaml"]
     before = {name: (folder / name).read_bytes() for name in names}
     for given, said in (
-        (
-            ["--n-subapertures", "5"],
-            "as --n-subapertures differ, and nothing is overwritten: give --n-subapertures 3 5",
-        ),
-        (["--diameter-over-r0", "4"], "give --diameter-over-r0 3.0 with what is new, or another folder"),
-        (["--readout-noise", "1"], "as --readout-noise differ, and nothing is overwritten: give the same"),
-        (["--criterion", "turbulent"], "as --criterion differ"),
+        (["--n-subapertures", "5"], "nothing is overwritten: give --n-subapertures 3 5 beside what is new"),
+        (["--diameter-over-r0", "4"], "give --diameter-over-r0 3.0 beside what is new, or another folder"),
+        (["--readout-noise", "1"], "give the same --readout-noise beside what is new"),
+        (["--criterion", "turbulent"], "give the same --criterion beside what is new"),
+        (["--n-subapertures", "5", "--exponent", "2"], "3 5, the same --exponent beside what is new"),
     ):
         assert main([*argv, *given]) == 1
         assert said in capsys.readouterr().err

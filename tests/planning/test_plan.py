@@ -315,7 +315,7 @@ def test_what_blind_restorations_lose_moves_the_best_point(monkeypatch, plan, qu
         grown = choice.relative_mse + (choice.blind.cost**2 - 1) * choice.above_floor
         assert choice.blind_mse == pytest.approx(min(1, grown), rel=1e-12)
     text = str(found)
-    assert "Of blind restorations under such conditions 75 % (50 to 90 %) end within 1.3 times" in text
+    assert "75 % (50 to 90 %) end within 1.3 times" in text
     assert f"the least would be {plan.best.relative_mse:.4g}, with 3 holes of 0.35 m" in text
 
 

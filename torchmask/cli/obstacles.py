@@ -7,7 +7,7 @@ from pathlib import Path
 
 from torchmask.cli.options import is_mask_file
 from torchmask.design.constraint_base import Constraint
-from torchmask.design.constraints import InsideDisc, KeepOutDisc, check_mask
+from torchmask.design.constraints import InsideDisc, KeepOutDisc
 from torchmask.design.rules import MaskRules
 from torchmask.instrument.parts import Telescope
 from torchmask.optics.aperture import SparseAperture
@@ -17,7 +17,7 @@ _ROUNDING = 1e-6  # of the diameter, by which holes may reach out of the pupil
 
 
 def warn_of_blocked_holes(mask: Path, aperture: Aperture, telescope: Telescope | None) -> None:
-    """Warn if holes of --mask lie behind the secondary mirror or its vanes, or outside the pupil, by `check_mask`.
+    """Warn if holes of --mask lie behind the secondary mirror or its vanes, or outside the pupil.
 
     Without a telescope the pupil is the mask's own disc. Masks of the catalogue are not judged by that, as real ones
     exceed their nominal pupils.
@@ -45,12 +45,8 @@ def warn_of_blocked_holes(mask: Path, aperture: Aperture, telescope: Telescope |
 
 def _broken(hole: SparseAperture, rules: list[Constraint]) -> list[tuple[Constraint, float]]:
     """Return what a mask of one hole breaks, and by how much [m]."""
-    try:
-        check_mask(hole, _ROUNDING, rules)
-    except ValueError:
-        depths = [(rule, float(rule.violation(hole))) for rule in (InsideDisc(), *rules)]
-        return [(rule, depth) for rule, depth in depths if depth > _ROUNDING * hole.mask_diameter]
-    return []
+    depths = [(rule, float(rule.violation(hole))) for rule in (InsideDisc(), *rules)]
+    return [(rule, depth) for rule, depth in depths if depth > _ROUNDING * hole.mask_diameter]
 
 
 def _place(rule: Constraint, diameter: float) -> str:

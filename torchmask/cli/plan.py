@@ -112,6 +112,7 @@ def run(options: Options) -> None:
     """Plan, and write map, picture, mask and instrument, of the points reached if interrupted."""
     instrument, aperture = instrument_of(options), existing_mask(options)
     rules = MaskRules(**{name: getattr(options, name) for name in _WORKSHOP})
+    rules.require_on_pupil(instrument.telescope.diameter)
     constraints = rules.constraints()
     with new_run("plan", options, options.seed) as output:
         try:

@@ -144,13 +144,15 @@ def ranking(options: Options, output: Run) -> Ranking:
     chosen = patterns(options)
     observed = options.observation(options.n_frequencies, options.exponent, options.knee, options.fill_factor)
     output.keep_instrument(options.used_instrument(observed, options.central_obstruction))
+    rules = MaskRules(**{name: getattr(options, name) for name in asdict(MaskRules())})
+    rules.require_on_pupil(options.mask_diameter)
     found = rank_masks(
         chosen,
         lambda area: observed.through(area).criterion(),
         options.mask_diameter,
         options.fill_factor,
         searched=search_masks(options, observed.criterion(), output) if options.search else None,
-        rules=MaskRules(**{name: getattr(options, name) for name in asdict(MaskRules())}),
+        rules=rules,
         allow_overlap=options.allow_overlap,
         callback=output.callback,
     )

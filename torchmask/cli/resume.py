@@ -47,7 +47,9 @@ def resumed(folder: Path | None, state: Path, command: str, options: Any) -> Ite
 
 def _differing(config: Path, command: str, options: Any) -> list[str]:
     """Return what differs from the options of a config file, in words."""
-    if not config.is_file():
+    try:
+        before = to_json(stored(load_config(config, type(options), command)))
+    except (OSError, ValueError):  # of another version, which has other options
         return []
-    now, before = (to_json(stored(each)) for each in (options, load_config(config, type(options), command)))
+    now = to_json(stored(options))
     return [f"{name} is {value}, there {before[name]}" for name, value in now.items() if value != before[name]]

@@ -181,7 +181,11 @@ def _from_frames(
         raise ValueError(f"{path} has no 'centers' of a mask: give --mask")
     aperture = load_aperture(options, None if known is None else known.telescope)
     planned = (mask_file_wavelength(options), None) if known is None else (known.mean_wavelength, planned_scale(known))
-    told = {name: stored[name].item() for name in ("wavelength", "pixel_scale", "readout_noise") if name in stored}
+    told = {name: stored[name] for name in ("wavelength", "pixel_scale", "readout_noise") if name in stored}
+    for name, value in told.items():
+        if value.size != 1:
+            raise ValueError(f"{path}: {name} has shape {value.shape}: one number is needed")
+    told = {name: value.item() for name, value in told.items()}
     wavelength = options.wavelength or told.get("wavelength") or planned[0]
     scale = pixel_angle(options.pixel_scale_arcsec) or told.get("pixel_scale") or planned[1]
     if wavelength is None:

@@ -102,13 +102,20 @@ def require_rows_kept(folder: Path, space: DesignSpace, conditions: ExposureCond
     axes = [{name: set(values[name]) or {None} for name in AXES} for values in (before["space"], now)]
     lost = [name for name in AXES if not axes[0][name] <= axes[1][name]]
     other = [name for name in now if name not in AXES and before["space"].get(name) != now[name]]
-    changed = [*lost, *other] + ["criterion"] * (before["conditions"] != to_json(conditions))
-    if changed:
-        again = "".join(f" {_flag(name)} {' '.join(map(str, before['space'][name]))}" for name in lost)
-        raise ValueError(
-            f"the table in {folder} has rows that this one would not have, as {', '.join(map(_flag, changed))} differ, "
-            f"and nothing is overwritten: give{again or ' the same'} with what is new, or another folder"
-        )
+    was, is_now = before["conditions"], to_json(conditions)
+    if was is None or is_now is None:
+        other += ["criterion"] * (was != is_now)
+    else:
+        other += [name for name in is_now if was.get(name) != is_now[name]]
+    if not (lost or other):
+        return
+    needs = [f"{_flag(name)} {' '.join(map(str, before['space'][name]))}" for name in lost if before["space"][name]]
+    needs += [f"no {_flag(name)}" for name in lost if not before["space"][name]]
+    needs += [f"the same {_flag(name)}" for name in other]
+    raise ValueError(
+        f"the table in {folder} has rows that this one would not have, and nothing is overwritten: give "
+        f"{', '.join(needs)} beside what is new, or another folder"
+    )
 
 
 def _flag(name: str) -> str:

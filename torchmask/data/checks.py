@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,6 @@ from torchmask.plain import require_plain
 
 _WIDEST = 0.01  # [rad], above the pixels of any image, and below most numbers of arcseconds
 
-
 _POSITIVE = {
     "wavelength": "m",
     "design_wavelength": "m",
@@ -30,7 +29,7 @@ _POSITIVE = {
 
 
 def check_options(
-    positive: Sequence[float | None],
+    positive: Mapping[str, float | None],
     readout_noise: float | None,
     crop: int | None,
     keep: float | None,
@@ -39,12 +38,12 @@ def check_options(
 ) -> None:
     """Raise ValueError if an option is out of range, TypeError if one is of a wrong type.
 
-    `positive` are the values of the options in `_POSITIVE`; all arguments are as those of `read_observation`.
+    `positive` has the options in `_POSITIVE` by name; all arguments are as those of `read_observation`.
     """
     if not isinstance(unit, str | None):
         raise TypeError(f"unit is a {type(unit).__name__}: it must be text, such as {str(unit)!r} or 'electron'")
-    for (name, what), value in zip(_POSITIVE.items(), positive, strict=True):
-        require_plain(name, value)
+    for name, what in _POSITIVE.items():
+        require_plain(name, value := positive[name])
         if value is not None and not (math.isfinite(value) and value > 0):
             raise ValueError(f"{name} is {value}: it must be finite and positive, in {what}")
         if "wavelength" in name:

@@ -128,7 +128,15 @@ def read_observation(
     >>> observation.frames.shape, observation.readout_noise
     (torch.Size([5, 32, 32]), 1.5)
     """
-    positive = (wavelength, design_wavelength, pixel_scale, design_pixel_scale, gain, exposure_time, saturation)
+    positive = {
+        "wavelength": wavelength,
+        "design_wavelength": design_wavelength,
+        "pixel_scale": pixel_scale,
+        "design_pixel_scale": design_pixel_scale,
+        "gain": gain,
+        "exposure_time": exposure_time,
+        "saturation": saturation,
+    }
     check_options(positive, readout_noise, crop, keep, keep_by, unit)
     if target is not None and crop is None:
         raise ValueError(f"target is {target}, but there is no field to cut out around it: give crop [pixels] too")

@@ -11,8 +11,8 @@ from typing import TypeVar
 Made = TypeVar("Made")
 
 
-class _Stopped(Exception):
-    """Ends a call that nobody waits for any more."""
+class _Stopped(BaseException):
+    """Ends a call that nobody waits for any more; nothing that handles errors takes it for one."""
 
 
 def make_apart(make: Callable[..., Made], *arguments: object) -> Made:

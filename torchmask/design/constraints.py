@@ -219,10 +219,10 @@ class NFoldSymmetry(LinearEquality):
     n_fold: int
 
     def __post_init__(self) -> None:
-        whole_number("n_fold", self.n_fold, least=2)
+        object.__setattr__(self, "n_fold", whole_number("n_fold", self.n_fold, least=2))
 
     def equations(self, n_subapertures: int) -> tuple[np.ndarray, np.ndarray]:
-        n = int(self.n_fold)
+        n = self.n_fold
         left = n_subapertures % n
         if left > 1:
             near = sorted({n_subapertures - left, n_subapertures - left + 1, n_subapertures - left + n} - {0})

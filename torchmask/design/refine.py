@@ -78,7 +78,7 @@ class Monitor:
         self.stage, self.budget, self.holes, self.callback = stage, budget, holes, callback
         self.before, self.known = before, known
         self._rows: list[tuple[int, Tensor]] = []  # evaluations of this stage, centres; each mask once
-        self._result: float | None = None  # its relative MSE, once the stage has concluded
+        self._result: tuple[float, SparseAperture] | None = None  # with its relative MSE, once the stage has concluded
         self._merit = self._relative = float("inf")
         self._centers: Tensor | None = None
         self._due = 0.0
@@ -96,8 +96,8 @@ class Monitor:
             self._tell(evaluations, self._relative, self._centers)
 
     def conclude(self, evaluations: int, relative_mse: float, aperture: SparseAperture) -> None:
-        """Record the mask that the stage returns."""
-        self._result = relative_mse
+        """Record a mask that the stage ends with."""
+        self._result = relative_mse, aperture
         self._tell(evaluations, relative_mse, aperture.centers)
 
     def _tell(self, evaluations: int, relative_mse: float, centers: Tensor) -> None:
@@ -114,12 +114,15 @@ class Monitor:
         """Return the entry of the stage in `SearchResult.history`, and the best mask of it that has been measured.
 
         `used` is the number of evaluations of the stage. A few of its masks are projected and measured, the last one
-        among them. If they are its result, as no `conclude` has told another, the callback learns of it.
+        among them. Where one of them is better than what the stage ended with, the callback learns of it.
         """
         best = self.known
         least = float("inf") if best is None else _relative(criterion, best)
         curve = [(self.before, least)]
-        shown = _thinned(self._rows, self.holes.template.n_subapertures)
+        rows = list(self._rows)
+        if self._centers is not None and (not rows or rows[-1][1] is not self._centers):
+            rows.append((used, self._centers))
+        shown = _thinned(rows, self.holes.template.n_subapertures)
         stage, n_steps = f"{self.stage}/history", len(shown) + 1
         for step, (evaluations, centers) in enumerate(shown, 1):
             mask = self._projected(centers)
@@ -127,10 +130,12 @@ class Monitor:
                 best, least = mask, found
             curve.append((self.before + evaluations, least))
             self.tell_after(stage, step, n_steps, {"relative_mse": least})
-        if self._result is None and best is not None:
+        if self._result is not None and self._result[0] <= least:
+            least, best = self._result
+        elif best is not None:
             self.conclude(used, least, best)
-        curve.append((self.before + used, least if self._result is None else self._result))
-        self.tell_after(stage, n_steps, n_steps, {"relative_mse": curve[-1][1]})
+        curve.append((self.before + used, least))
+        self.tell_after(stage, n_steps, n_steps, {"relative_mse": least})
         found_at = [row for row in curve if row[1] < float("inf")]
         return {self.stage: torch.tensor(found_at, dtype=torch.float64, device="cpu").reshape(-1, 2)}, best
 
@@ -216,9 +221,9 @@ def refine_mask(
     start = holes.coordinates(still.centers)
     known = _if_feasible(still, constraints)
     monitor = Monitor("design/refine", budget, holes, callback, known=known)
-    best, evaluations = polish(criterion, holes, start[None], budget, monitor)
-    history, _ = monitor.history(criterion, evaluations)
-    return conclude(criterion, best, constraints, evaluations, history, device)
+    polished, evaluations = polish(criterion, holes, start[None], budget, monitor)
+    history, best = monitor.history(criterion, evaluations)
+    return conclude(criterion, best or polished, constraints, evaluations, history, device)
 
 
 def _if_feasible(aperture: SparseAperture, constraints: Sequence[Constraint]) -> SparseAperture | None:

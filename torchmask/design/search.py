@@ -121,8 +121,8 @@ def search_mask(
     allowance = (POLISH if refine else 1) * len(starts) + 1
     monitor = Monitor("design/refine", allowance, holes, callback, before=used, known=known if best is None else best)
     aperture, polished = polish(criterion, holes, starts, allowance, monitor)
-    history |= monitor.history(criterion, polished)[0]
-    return conclude(criterion, aperture, constraints, used + polished, history, device)
+    of_polish, best = monitor.history(criterion, polished)
+    return conclude(criterion, best or aperture, constraints, used + polished, history | of_polish, device)
 
 
 def _require_sampling(criterion: Criterion, n_subapertures: int, mask_diameter: float, fill_factor: float) -> float:

@@ -157,7 +157,11 @@ class Instrument:
         return math.floor(self.observing_time / self._cadence * (1 + 1e-9))
 
     def frames_that_differ(self, diameter: float) -> float:
-        """Return how many frames show turbulence of their own, as the wind crosses an opening of a `diameter` [m]."""
+        """Return how many frames show turbulence of their own, as the wind crosses an opening of a `diameter` [m].
+
+        Raises ValueError unless the diameter is finite and positive.
+        """
+        require("diameter", diameter, ", in m")
         return min(self.frames, 1 + (self.frames - 1) * self._cadence * self.site.wind / diameter)
 
     @property

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 from torchmask.design.observed import change_light, instant_criterion
@@ -19,7 +21,8 @@ class Expected(NamedTuple):
     """What is expected at one point.
 
     error : relative mean squared error of a blind restoration
-    blind : what was measured of such restorations under the nearest conditions
+    blind : what was measured of such restorations under the nearest conditions, or with frames or light left out if
+        that gives the smaller error
     instants : relative error that is predicted for known PSFs of instants in narrow light with the photons of a frame
     floor : what of it no mask can avoid
     """
@@ -60,6 +63,7 @@ def _expect(criterion: TurbulentMSE, aperture: Aperture, instrument: Instrument)
     noise, floor = criterion.noise_psd.clone(), criterion.relative_floor(instrument.telescope.diameter)
     least_tried = smearing_map(kind_of(aperture)).n_photons[0]
 
+    @functools.cache  # as points often have a factor in common
     def predict(factor: float) -> float:
         criterion.load_state_dict(criterion.state_dict() | {"noise_psd": factor * noise})
         return float(criterion.relative(aperture))
@@ -75,7 +79,9 @@ def _expect(criterion: TurbulentMSE, aperture: Aperture, instrument: Instrument)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of what lies outside the maps, which the point itself has told
         less = [expect(*point) for point in _less(kind_of(aperture), light, frames)]
-    return own._replace(error=min(one.error for one in (own, *less)))
+    best = min((own, *less), key=lambda one: one.error)
+    blind = replace(best.blind, outside=own.blind.outside, harder=own.blind.harder)
+    return own._replace(error=best.error, blind=blind)
 
 
 def _less(kind: Pupil, light: float, frames: int) -> Iterator[tuple[float, float, float]]:

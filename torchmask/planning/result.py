@@ -34,7 +34,7 @@ class Choice:
         diameter can avoid
     blind_mse : expected where the aberrations have to be found, at least so much where that was not tried, and no more
         than with frames or light left out
-    blind : what was measured of such restorations
+    blind : what was measured of such restorations, with frames or light left out if `blind_mse` is with them left out
     """
 
     n_subapertures: int
@@ -247,7 +247,8 @@ class ObservationPlan:
 
 def _blind_line(blind: BlindOutlook) -> str:
     return (
-        f"Of blind restorations under such conditions {100 * blind.success:.0f} % ({100 * blind.low:.0f} to "
+        f"Of blind restorations under such conditions, with frames or light left out if that is better, "
+        f"{100 * blind.success:.0f} % ({100 * blind.low:.0f} to "
         f"{100 * blind.high:.0f} %) end within {SUCCESS:g} times the score, an error in amplitude, that they have with "
         f"known PSFs; the median is {blind.cost:.3g} times. With known PSFs, at this exposure and in this band, scores "
         f"are {blind.restored:.3g} times those predicted for a linear estimate of instants in narrow light."

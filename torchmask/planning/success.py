@@ -116,7 +116,7 @@ class SuccessMap:
 
         Between the lattice's points the chance is linear, cost and level are geometric, in the logarithms of photons
         and frames and in d / r0, so that at its points they are what was measured and between two of them they lie
-        between the two. Of frames that show the same turbulence more than once, count those that differ.
+        between the two. Each of the frames showed turbulence of its own.
 
         Parameters
         ----------

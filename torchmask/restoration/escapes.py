@@ -92,8 +92,8 @@ def restart_outlier_frames(
         left = calibrate(starts, trial).calibration.noise_inflation
         trial = trial.calibrated(noise_inflation=left)
     rivals = torch.cat([state.z[lost], trial.z])  # the present aberrations first
-    every = lost.repeat(1 + schedule.restarts)
-    costs = objective.of_frames(every).frame_costs(state.image, rivals, state.of_frames(every).calibration)
+    all_rivals = torch.cat([lost, every])
+    costs = objective.of_frames(all_rivals).frame_costs(state.image, rivals, state.of_frames(all_rivals).calibration)
     best = costs.nan_to_num(torch.inf).unflatten(0, (-1, len(lost))).argmin(0)
     spent = n_evaluations * len(now.z) // len(state.z)
     if not best.any():

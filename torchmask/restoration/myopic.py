@@ -243,11 +243,11 @@ class MyopicDeconvolution:
 
         Raises
         ------
-        ValueError
+        ValueError, TypeError
             If a shape is wrong, a valid pixel or a known value is not finite, one of `errors` is not positive, a frame
             or the known object has no light, both object and aberrations are known, `covariance` is not a covariance or
             comes without coefficients or with static modes, the prior is not a finite, differentiable scalar, or the
-            checkpoint is damaged or of other frames, settings, known values or another start.
+            checkpoint is damaged or of other frames, settings, known values or another start; if `start` is no result.
 
         Warns
         -----
