@@ -242,7 +242,7 @@ def test_what_is_given_beside_an_instrument_wins(folder, recorded):
 
 
 def test_a_filter_stays_a_filter_with_the_light_of_the_source(recorded):
-    filtered = dataclasses.replace(recorded, filter="bessell-R", wavelength=None, width=None)
+    filtered = dataclasses.replace(recorded, filter="bessell-R", wavelength=None, width=None, n_wavelengths=5)
     options = design.Options.of_instrument(filtered)
     found = options.turbulence(filtered.mean_wavelength, 0.1)
     assert (options.filter, options.wavelengths) == ("bessell-R", ())
