@@ -364,3 +364,15 @@ def test_a_grid_that_aliases_the_mask_is_refused_before_any_work():
     criterion = AsymptoticMSE(Grid.nyquist(1.0, 550e-9, 64), *psds, n_frames=20)
     with pytest.raises(ValueError, match=r"undersamples an aperture of 2 m .* pixel_scale must be at most"):
         search_mask(criterion, 9, 2.0, 0.15, budget=100)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_refinement_of_few_evaluations_returns_the_best_that_it_has_measured(seed):
+    """From holes that overlap; a mask may be better than the one at which the budget ends."""
+    psds = PowerLawPSD(1.5, 1e7), NoisePSD(1e7)
+    criterion = AsymptoticMSE(Grid.nyquist(1.0, 550e-9, 48), *psds, n_frames=20)
+    centers = 0.7 * torch.rand(5, 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) - 0.35
+    found = refine_mask(criterion, SparseAperture(centers, math.sqrt(0.15 / 5), 1.0), budget=12)
+    curve = found.history["design/refine"][:, 1]
+    assert bool((curve.diff() <= 0).all())
+    assert float(curve[-1]) == pytest.approx(found.relative_mse, rel=1e-12)
