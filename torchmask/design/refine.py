@@ -33,8 +33,7 @@ class SearchResult:
     evaluations : number of masks whose error was computed
     history : for each stage, an array (n, 2) of evaluations so far, in all stages, and relative MSE of the best mask.
         The MSE is the lowest so far of a few masks projected onto the constraints, on the grid of the criterion,
-        whatever grid and penalty the stage used, so it never rises: the gradient stage begins where the search ended.
-        Masks that could not be projected are left out. `evaluations` does not include these.
+        so it never rises: the gradient stage begins where the search ended. `evaluations` does not include these.
 
     Examples
     --------
@@ -113,16 +112,15 @@ class Monitor:
     def history(self, criterion: Criterion, used: int) -> tuple[dict[str, Tensor], SparseAperture | None]:
         """Return the entry of the stage in `SearchResult.history`, and the best mask of it that has been measured.
 
-        `used` is the number of evaluations of the stage. A few of its masks are projected and measured, the last one
-        among them. Where one of them is better than what the stage ended with, the callback learns of it.
+        `used` is its number of evaluations. A few of its masks are projected and measured, the last one among them.
+        The callback learns of one that is better than what the stage ended with.
         """
         best = self.known
         least = float("inf") if best is None else _relative(criterion, best)
         curve = [(self.before, least)]
-        rows = list(self._rows)
-        if self._centers is not None and (not rows or rows[-1][1] is not self._centers):
-            rows.append((used, self._centers))
-        shown = _thinned(rows, self.holes.template.n_subapertures)
+        if self._centers is not None and (not self._rows or self._rows[-1][1] is not self._centers):
+            self._rows.append((used, self._centers))
+        shown = _thinned(self._rows, self.holes.template.n_subapertures)
         stage, n_steps = f"{self.stage}/history", len(shown) + 1
         for step, (evaluations, centers) in enumerate(shown, 1):
             mask = self._projected(centers)
@@ -136,8 +134,8 @@ class Monitor:
             self.conclude(used, least, best)
         curve.append((self.before + used, least))
         self.tell_after(stage, n_steps, n_steps, {"relative_mse": least})
-        found_at = [row for row in curve if row[1] < float("inf")]
-        return {self.stage: torch.tensor(found_at, dtype=torch.float64, device="cpu").reshape(-1, 2)}, best
+        known = [row for row in curve if row[1] < float("inf")]
+        return {self.stage: torch.tensor(known, dtype=torch.float64, device="cpu").reshape(-1, 2)}, best
 
     def _projected(self, centers: Tensor) -> SparseAperture | None:
         try:
@@ -152,10 +150,8 @@ def _relative(criterion: Criterion, aperture: SparseAperture) -> float:
 
 
 def _thinned(rows: list[tuple[int, Tensor]], n_subapertures: int) -> list[tuple[int, Tensor]]:
-    """Return a few of the masks, evenly spaced from the first to the last, for a history.
-
-    A projection takes time in proportion to N^3, a second for 40 holes: so many that all take a few seconds.
-    """
+    """Return a few of the masks, from the first to the last, for a history."""
+    # a projection takes time in proportion to N^3, a second for 40 holes: so many that all take a few seconds
     count = min(len(rows), max(_FEWEST_DRAWN, min(_MOST_DRAWN, _DRAWN // n_subapertures**3)))
     return [rows[round(place)] for place in np.linspace(0, len(rows) - 1, count).tolist()]
 

@@ -32,9 +32,8 @@ class Choice:
     electrons per frame (of the sky, per pixel)
     relative_mse, above_floor : predicted for a linear estimate that knows the PSFs, and that less what no mask of this
         diameter can avoid
-    blind_mse : expected where the aberrations have to be found, at least so much where that was not tried, and no more
-        than with frames or light left out
-    blind : what was measured of such restorations, with frames or light left out if `blind_mse` is with them left out
+    blind_mse : expected where the aberrations have to be found, at least so much where that was not tried
+    blind : what was measured of such restorations; of both, frames or light are left out where that is better
     """
 
     n_subapertures: int
