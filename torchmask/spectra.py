@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchmask.grid import Grid
-from torchmask.numbers import require
+from torchmask.numbers import require, whole_number
 
 PSD = Tensor | Callable[..., Tensor]
 """A tensor that broadcasts to (H, W) in FFT order, or a callable psd(grid, dtype, device) that returns one."""
@@ -95,8 +95,8 @@ class NoisePSD:
     def __post_init__(self) -> None:
         require("n_photons", self.n_photons, ", in photons per exposure")
         require("readout_noise", self.readout_noise, ", in electrons rms per pixel", zero=True)
-        if self.n_pixels is not None and (not float(self.n_pixels).is_integer() or self.n_pixels < 1):
-            raise ValueError(f"n_pixels is {self.n_pixels}: it must be a whole number of at least 1")
+        if self.n_pixels is not None:
+            object.__setattr__(self, "n_pixels", whole_number("n_pixels", self.n_pixels))
 
     def __call__(
         self, grid: Grid, dtype: torch.dtype | None = torch.float64, device: torch.device | str | None = None

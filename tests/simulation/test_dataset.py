@@ -232,3 +232,13 @@ def test_bad_ranges_are_refused(bad):
 def test_ranges_of_another_type_are_refused():
     with pytest.raises(TypeError, match="ranges is a dict: it must be StackRanges"):
         stacks(ranges={"r0": (0.1, 0.2)})
+
+
+def test_whole_numbers_may_be_floats():
+    """As arithmetic makes them."""
+    mask = SparseAperture.from_catalog("golay6", 1.0, 0.15)
+    floats, ints = (StackDataset(mask, GRID, *given)[0] for given in ((2.0, 3.0), (2, 3)))
+    assert floats["frames"].shape == (3, *GRID.shape)
+    assert torch.equal(floats["frames"], ints["frames"])
+    with pytest.raises(ValueError, match=r"n_frames is 2\.5: it must be a whole number of at least 1"):
+        StackDataset(mask, GRID, 2, 2.5)

@@ -31,7 +31,6 @@ _POSITIVE = {
 def check_options(
     positive: Mapping[str, float | None],
     readout_noise: float | None,
-    crop: int | None,
     keep: float | None,
     keep_by: str,
     unit: str | None,
@@ -56,8 +55,6 @@ def check_options(
     require_plain("readout_noise", readout_noise)
     if readout_noise is not None and not (math.isfinite(readout_noise) and readout_noise >= 0):
         raise ValueError(f"readout_noise is {readout_noise}: it must be finite and at least 0, in electrons rms")
-    if crop is not None and (not float(crop).is_integer() or crop < 2):
-        raise ValueError(f"crop is {crop}: it must be a whole number of pixels, at least 2")
     if keep is not None and not 0 < keep <= 1:
         raise ValueError(f"keep is {keep}: it must be a fraction of the frames, above 0 and at most 1")
     if keep_by not in SELECTIONS:

@@ -19,6 +19,7 @@ from torchmask.data.fits import FITSImages, read_fits
 from torchmask.data.light import opened_files, usable_frames
 from torchmask.data.reference import reference_image
 from torchmask.grid import Grid
+from torchmask.numbers import whole_number
 from torchmask.observation import Observation
 from torchmask.optics.aperture import Aperture
 
@@ -137,7 +138,8 @@ def read_observation(
         "exposure_time": exposure_time,
         "saturation": saturation,
     }
-    check_options(positive, readout_noise, crop, keep, keep_by, unit)
+    check_options(positive, readout_noise, keep, keep_by, unit)
+    crop = None if crop is None else whole_number("crop", crop, least=2, note=", in pixels")
     if target is not None and crop is None:
         raise ValueError(f"target is {target}, but there is no field to cut out around it: give crop [pixels] too")
     files = [read_fits(path) for path in ([paths] if isinstance(paths, str | Path) else list(paths))]

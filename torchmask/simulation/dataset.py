@@ -15,6 +15,7 @@ from torch.utils.data import Dataset
 
 from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.grid import Grid
+from torchmask.numbers import whole_number
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.detector import Detector
 from torchmask.simulation.exposures import simulate_observation
@@ -163,10 +164,6 @@ class StackDataset(Dataset[dict[str, Tensor]]):
         dtype: torch.dtype = torch.float32,
         allow_overlap: bool = False,
     ) -> None:
-        if not float(length).is_integer() or length < 1:
-            raise ValueError(f"length is {length}: it must be a whole number of at least 1")
-        if not float(seed).is_integer() or seed < 0:
-            raise ValueError(f"seed is {seed}: it must be a whole number of at least 0")
         if scene is not None and not callable(scene):
             raise TypeError(f"scene is a {type(scene).__name__}: it must be a function of an index and a generator")
         if not isinstance(ranges, StackRanges | None):
@@ -177,13 +174,13 @@ class StackDataset(Dataset[dict[str, Tensor]]):
             raise ValueError("both scene and path are given: give only one of them")
         self.aperture: Aperture = aperture.still().to("cpu", dtype)
         self.grid = grid
-        self.length: int = int(length)
-        self.n_frames = n_frames
+        self.length: int = whole_number("length", length)
+        self.n_frames: int = whole_number("n_frames", n_frames)
         self.ranges: StackRanges = ranges or StackRanges()
         self.size = size
         self.outer_scale = outer_scale
         self.detector: Detector = Detector(readout_noise)
-        self.seed: int = int(seed)
+        self.seed: int = whole_number("seed", seed, least=0)
         self.dtype = dtype
         self.allow_overlap = allow_overlap
         self.scene = scene

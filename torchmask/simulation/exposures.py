@@ -18,6 +18,7 @@ from torch import Tensor
 from torchmask.atmosphere.screens import draw_seed
 from torchmask.grid import Grid
 from torchmask.memory import require_memory
+from torchmask.numbers import whole_number
 from torchmask.observation import Observation
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.detector import Detector, image_formation
@@ -136,7 +137,8 @@ def simulate_observation(
     conditions = conditions or Conditions()
     _check_types(scene, generator)
     scene = scene.detach()
-    _check(scene, aperture, grid, n_frames)
+    n_frames = whole_number("n_frames", n_frames)
+    _check(scene, aperture, grid)
     require_apart(aperture, allow_overlap)
     require_memory("n_frames", n_frames, 2.0 * n_frames * scene.numel() * scene.element_size())  # frames and PSFs
     turbulence = with_layers(turbulence, grid.wavelength)
@@ -225,7 +227,7 @@ def _check_types(scene: Any, generator: Any) -> None:
         )
 
 
-def _check(scene: Tensor, aperture: Aperture, grid: Grid, n_frames: int) -> None:
+def _check(scene: Tensor, aperture: Aperture, grid: Grid) -> None:
     if tuple(scene.shape) != grid.shape:
         raise ValueError(f"scene has shape {tuple(scene.shape)}: the grid needs {grid.shape}")
     if not scene.is_floating_point():
@@ -238,8 +240,6 @@ def _check(scene: Tensor, aperture: Aperture, grid: Grid, n_frames: int) -> None
         raise ValueError("scene is black: scale it so that its sum is the number of photons per frame")
     if aperture.centers.ndim != 2:
         raise ValueError(f"aperture is a population {tuple(aperture.centers.shape[:-2])}: simulate one at a time")
-    if not float(n_frames).is_integer() or n_frames < 1:
-        raise ValueError(f"n_frames is {n_frames}: it must be a whole number of at least 1")
 
 
 def _centre(psfs: Tensor, shape: tuple[int, int]) -> Tensor:
