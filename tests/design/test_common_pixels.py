@@ -29,10 +29,16 @@ def case(most=0.0):
 
 
 def plane_of(plane, lenses, mask, lens, sign):
-    """T of one lens on a plane with the rows and columns of frequencies, turned by half a turn if `sign` is -1."""
+    """T of one lens on a plane with the rows and columns of frequencies, turned by half a turn if `sign` is -1.
+
+    It vanishes from one hole on; the splines that it is made of do not quite.
+    """
     whole = torch.zeros(plane.n_pixels, dtype=torch.float64)
     whole[lenses.index[mask, lens].flatten()] = lenses.values[0, mask, lens].flatten()
-    whole = whole.view(plane.size)
+    (rows, columns), (column, row) = GEOMETRY.grid, lenses.baseline[mask, lens]
+    y = (torch.arange(plane.size[0]) - plane.origin[0] - row) * (GEOMETRY.period / rows)
+    x = (torch.arange(plane.size[1]) - plane.origin[1] - column) * (GEOMETRY.period / columns)
+    whole = whole.view(plane.size) * (torch.hypot(y[:, None], x) <= GEOMETRY.reach)
     if sign < 0:
         y, x = (2 * middle - torch.arange(n) for middle, n in zip(plane.origin, plane.size, strict=True))
         whole = whole[y.clamp(0, plane.size[0] - 1)][:, x.clamp(0, plane.size[1] - 1)]
@@ -49,8 +55,8 @@ def test_what_lenses_share_is_the_product_of_their_planes():
         corner = pixels.corner[number].long()
         for line in (pixels.pair == number).nonzero()[:, 0]:
             y = int(corner[1] + pixels.row[line]) + plane.origin[0]
-            x = torch.arange(plane.size[1], dtype=torch.float64) - plane.origin[1] - corner[0]
-            expected[mask, y] += product[y] * (lines[line, 0] + lines[line, 1] * x + lines[line, 2] * x**2).exp()
+            x = torch.arange(plane.size[1], dtype=torch.float64) - plane.origin[1] - corner[0] - pixels.column[line]
+            expected[mask, y] += product[y] * (lines[line, 0] + lines[line, 1] * x + lines[line, 2] * x**2).exp2()
     torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-15)
 
 

@@ -62,38 +62,38 @@ class LensPairs:
         middle = (first + second) / 2
         step = _NODE * (self.geometry.reach + self.coherence.spread / 2 * middle.abs())
         n_slots = int(entries.slot.max()) + 1
-        nodes = middle.new_zeros(n_slots, 9)
+        shared = middle.new_zeros(n_slots, 9)  # at the nodes of the parabolas
         rich = largest > _RICH
         for some, n in ((rich, 3), (~rich, 1)):
             which = some.nonzero()[:, 0]
             places = (part.index_select(0, which) for part in (first, second, separation, step))
             found = self.coherence.around(*places, n=n).flatten(1)
-            nodes = nodes.index_add(0, entries.slot.index_select(0, which), found.expand(-1, 9))
+            shared = shared.index_add(0, entries.slot.index_select(0, which), found.expand(-1, 9))
         one = torch.zeros_like(entries.slot[:n_slots])
         one[entries.slot] = torch.arange(len(largest), device=one.device)  # an entry of each slot
         pairs = Entries(*(part[one] for part in entries))
         own = pairs.first == pairs.second  # their own opposite
-        nodes = (nodes * torch.where(own, 1.0, 2.0).to(nodes)[:, None]).clamp(min=_NOTHING).log().unflatten(1, (3, 3))
+        shared = shared * torch.where(own, 1.0, 2.0).to(shared)[:, None]
+        logarithm = shared.clamp(min=_NOTHING).log2().unflatten(1, (3, 3))
         middle, step = middle[one], step[one]
         pixels = CommonPixels.of(lenses, self.plane, *pairs[:4])
         start, unit = (pixels.corner * self.pixel - middle) / step, self.pixel / step
-        lines = _lines(nodes, start, unit, pixels)
+        lines = _lines(logarithm, start, unit, pixels)
         found = SharedLight.apply(lenses.values.flatten(1), lines, pixels, n_pixels)
         return found.view(len(centers), -1)  # type: ignore[no-any-return]
 
     def _select(self, lenses: Lenses, centers: Tensor) -> tuple[Entries, Tensor]:
         """Return the pairs that share something, and about the most that each gives anywhere."""
         n, count = centers.shape[1], lenses.baseline.shape[1]
-        one, other = torch.triu_indices(count, count, device=centers.device)
+        numbers = torch.arange(count, device=centers.device)
+        one, other = numbers[:, None], numbers
         x, y = (lenses.baseline * self.pixel).unbind(-1)
         limit, found = (2 * self.geometry.reach) ** 2, []
         # lenses at baseline 0 are their own opposites: what they share with another's opposite, they share with it
-        for sign, allowed in ((1, one < other), (-1, one > 0)):
-            i, j = one[allowed], other[allowed]
-            first, second = ([part.index_select(1, lens) for part in (x, y)] for lens in (i, j))
-            dx, dy = self._between([sign * part for part in first], second)
-            mask, pair = (dx * dx + dy * dy < limit).nonzero().unbind(-1)
-            found.append((mask, mask * count + i[pair], mask * count + j[pair], torch.full_like(mask, sign)))
+        for sign, allowed in ((1, one < other), (-1, (one > 0) & (one <= other))):
+            dx, dy = self._between([sign * part[:, :, None] for part in (x, y)], [part[:, None] for part in (x, y)])
+            mask, i, j = ((torch.addcmul(dx * dx, dy, dy) < limit) & allowed).nonzero().unbind(-1)
+            found.append((mask, mask * count + i, mask * count + j, torch.full_like(mask, sign)))
         columns = [torch.cat(parts) for parts in zip(*found, strict=True)]
         columns.append(torch.arange(len(columns[0]), device=centers.device))
         central = columns[1] % count == 0
@@ -103,7 +103,8 @@ class LensPairs:
         largest = self._largest(*self._places(entries, lenses, centers))
         kept = (largest > _SMALLEST).nonzero()[:, 0]
         entries = Entries(*(column.index_select(0, kept) for column in entries))
-        return entries._replace(slot=torch.unique(entries.slot, return_inverse=True)[1]), largest[kept]
+        changes = entries.slot.diff(prepend=entries.slot[:1]) != 0  # those of one slot follow each other
+        return entries._replace(slot=changes.cumsum(0)), largest[kept]
 
     def _places(self, entries: Entries, lenses: Lenses, centers: Tensor) -> list[Tensor]:
         """Return the baselines of both lenses of each entry and the separation of their middles, (E, 2) [m]."""
@@ -145,12 +146,15 @@ def _lines(nodes: Tensor, start: Tensor, step: Tensor, pixels: CommonPixels) -> 
     """Return the coefficients (R, 3), in powers of the pixel, of a polynomial through 3 x 3 nodes (S, y, x) on the rows
     of pixels.
 
-    The first pixel lies at `start` (S, 2), the others are `step` (S, 2) apart, in units of the nodes' distance.
+    The pairs' corners lie at `start` (S, 2), pixels are `step` (S, 2) apart, in units of the nodes' distance.
     """
     rows = _coefficients(nodes, start[:, 1:], step[:, 1:])  # (S, 3, x)
     both = _coefficients(rows.transpose(1, 2), start[:, :1], step[:, :1])  # (S, 3 of x, 3 of y)
     lines = powers_of(int(pixels.row.max()) + 1, nodes).T @ both.permute(2, 0, 1).flatten(1)  # (rows, S * 3 of x)
-    return lines.view(-1, 3).index_select(0, pixels.row * len(nodes) + pixels.pair)
+    constant, slope, curvature = lines.view(-1, 3).index_select(0, pixels.row * len(nodes) + pixels.pair).unbind(1)
+    x = pixels.column.to(nodes)
+    bent = x * curvature
+    return torch.stack([torch.addcmul(constant, x, slope + bent), slope + 2 * bent, curvature], 1)
 
 
 def _coefficients(nodes: Tensor, start: Tensor, step: Tensor) -> Tensor:

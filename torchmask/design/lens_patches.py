@@ -30,9 +30,10 @@ class Lenses(NamedTuple):
 
     values (M, B, L, rows, columns) T on the pixels of each one's patch, in M modes; `kept` the same times the
     amplitude that turbulence leaves of each wavelength; `index` (B, L, rows, columns) the pixels of the plane;
-    `baseline`, `turns`, `corner`, `size` (B, L, 2) [pixels], that on the frequency torus, with nu_y >= 0 (sign (B, L,
-    1) times that of the pair), what had to be taken off it, the first pixel, and the columns and rows that may hold
-    light; `middle` (B, L, 2) [m] between the holes
+    `baseline`, `turns`, `corner` (B, L, 2) [pixels], that on the frequency torus, with nu_y >= 0 (sign (B, L, 1) times
+    that of the pair), what had to be taken off it, and the first pixel; `ends` (B, L, rows, 2) [pixels] the first
+    column of each row of the patch that may hold light, and the one after the last; `middle` (B, L, 2) [m] between the
+    holes
     """
 
     values: Tensor
@@ -41,7 +42,7 @@ class Lenses(NamedTuple):
     baseline: Tensor
     turns: Tensor
     corner: Tensor
-    size: Tensor
+    ends: Tensor
     sign: Tensor
     middle: Tensor
 
@@ -62,12 +63,13 @@ class Colour(NamedTuple):
 
 class Patch(NamedTuple):
     """The lenses (B, L) of one wavelength: T and what turbulence leaves of it (B, L, rows, columns), the pixels of the
-    plane, and the first pixel (B, L, 2)."""
+    plane, the first pixel (B, L, 2), and where it lies from the middle."""
 
     values: Tensor
     kept: Tensor
     index: Tensor
     corner: Tensor
+    offset: Tensor
 
 
 class LensPatches:
@@ -133,27 +135,28 @@ class LensPatches:
         middle = (one + other) / 2
         patches = [self._patch(colour, baseline, turns) for colour in self.colours]
         if len(patches) == 1:
-            lens, kept, index, corner = patches[0]
-            extent = size.new_tensor(lens.shape[:1:-1]).expand_as(corner)
-            return Lenses(lens[None], kept[None], index, baseline, turns, corner, extent, sign, middle)
-        values, kept, corner, extent = self._merged(patches)
+            lens, kept, index, corner, offset = patches[0]
+            ends = _disc_ends(offset.detach(), self.colours[0].plan)
+            return Lenses(lens[None], kept[None], index, baseline, turns, corner, ends, sign, middle)
+        values, kept, corner, size = self._merged(patches)
         index = self.plane.index(corner, *values.shape[-2:])
-        return Lenses(values, kept, index, baseline, turns, corner, extent, sign, middle)
+        ends = _box_ends(size, values.shape[-2])
+        return Lenses(values, kept, index, baseline, turns, corner, ends, sign, middle)
 
     def _patch(self, colour: Colour, baseline: Tensor, turns: Tensor) -> Patch:
         place = (baseline + turns) * colour.scale - turns
         corner = (place.detach() - colour.plan.reach).ceil()
         offset, shape = corner - place, (len(colour.plan.row), len(colour.plan.column))
-        flat = colour.splines.weights(offset) @ colour.slices
+        flat = colour.splines.patches(colour.slices, offset)
         flat[:, 0] = colour.central  # N holes share it: what a spline makes of its edge would count N times
         values, index = flat.unflatten(-1, shape), self.plane.index(corner, *shape)
         if colour.factors is None:
-            return Patch(values, values, index, corner)
+            return Patch(values, values, index, corner, offset)
         x = ((offset[..., :1] + colour.plan.column) * colour.pixel[0])[..., None, :]
         y = ((offset[..., 1:] + torch.arange(shape[0], device=offset.device)) * colour.pixel[1])[..., :, None]
         pixels, root = index.flatten(), values.clamp(min=_NOTHING).sqrt()
         amplitude = lens_sum((part.index_select(0, pixels).view_as(root) for part in colour.factors), root, x, y)
-        return Patch(values, values * amplitude, index, corner)
+        return Patch(values, values * amplitude, index, corner, offset)
 
     def _merged(self, patches: list[Patch]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return values, what is kept of them, corner and size of the lenses of all wavelengths together."""
@@ -182,6 +185,22 @@ class LensPatches:
             torch.cat([one.flatten() for one in ones]) for ones in zip(*(p[:2] for p in patches), strict=True)
         )
         return merged(values), merged(kept), corner, size
+
+
+def _disc_ends(offset: Tensor, plan: PatchPlan) -> Tensor:
+    """Return the ends (B, L, rows, 2) of the rows of patches whose first pixel lies at `offset` (B, L, 2) [pixels] from
+    the middle of a disc as wide as the plan's patches."""
+    x, y = offset[..., :1], offset[..., 1:] + torch.arange(len(plan.row), device=offset.device)
+    half = plan.reach[0] * (1 - (y / plan.reach[1]) ** 2).clamp(min=0).sqrt()
+    ends = torch.stack([(-half - x).ceil(), (half - x).floor() + 1], -1)
+    return ends.nan_to_num(0.0).clamp(0, len(plan.column)).long()
+
+
+def _box_ends(size: Tensor, n_rows: int) -> Tensor:
+    """Return the ends (B, L, rows, 2) of the rows of patches of which `size` (B, L, 2) columns and rows hold light."""
+    lit = torch.arange(n_rows, device=size.device) < size[..., 1:]
+    last = torch.where(lit, size[..., :1], 0.0).long()
+    return torch.stack([torch.zeros_like(last), last], -1)
 
 
 def _pairs(n: int, device: torch.device) -> Tensor:

@@ -54,18 +54,22 @@ class SplinePatches:
         unfolded = unfolded.unfold(-2, self.parts * (columns - 1) + 1, 1)[:, :, : self.n_rows, :, :: self.parts]
         return unfolded.permute(1, 2, 0, 3, 4).flatten(2).flatten(0, 1).contiguous()
 
-    def weights(self, offset: Tensor) -> Tensor:
-        """Return the weights (..., slices) of the slices for patches whose first pixel lies at `offset` (..., 2)
-        [pixels] from the middle, -reach <= offset < 1 - reach. They are differentiable."""
-        by_axis = []
-        for axis in (0, 1):
-            place = (offset[..., axis] + self.start[axis]) * self.parts
-            start = place.detach().nan_to_num(0.0).floor().clamp(0, self.parts)
-            basis = cubic_basis(place - start)
-            index = start.long()[..., None] + torch.arange(4, device=offset.device)
-            zero = offset.new_zeros(*offset.shape[:-1], self.n_rows)
-            by_axis.append(zero.scatter(-1, index, basis))
-        return (by_axis[1][..., :, None] * by_axis[0][..., None, :]).flatten(-2)
+    def patches(self, slices: Tensor, offset: Tensor) -> Tensor:
+        """Return the functions on the pixels of patches (..., R rows columns), by the matrix of their slices.
+
+        The first pixel of a patch lies at `offset` (..., 2) [pixels] from the middle, -reach <= offset < 1 - reach, in
+        which they are differentiable.
+        """
+        place = (offset.flatten(0, -2) + offset.new_tensor(self.start)) * self.parts
+        start = place.detach().nan_to_num(0.0).floor().clamp(0, self.parts)
+        (by_x, by_y), (column, row) = cubic_basis(place - start).unbind(1), start.long().unbind(1)
+        across = column[:, None] + torch.arange(4, device=offset.device)
+        by_x = offset.new_zeros(len(place), self.n_rows).scatter(-1, across, by_x)
+        weights = (by_y[:, :, None] * by_x[:, None]).flatten(1)  # of the slices of four rows of the lattice
+        order = row.argsort()
+        some = weights.index_select(0, order).split(row.bincount(minlength=self.parts + 1).tolist())
+        found = torch.cat([one @ slices[n * self.n_rows : (n + 4) * self.n_rows] for n, one in enumerate(some)])
+        return found.index_select(0, order.argsort()).unflatten(0, offset.shape[:-1])
 
 
 def cubic_basis(t: Tensor) -> Tensor:

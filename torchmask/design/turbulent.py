@@ -75,11 +75,11 @@ class TurbulentMSE(AsymptoticMSE):
     too. The first call for a kind of hole makes tables, which takes seconds (longer for a wind of known direction and
     for holes that are not round); those of the last 8 kinds are kept. E|OTF|^2 of masks is within 3 % of Korff's
     integral for holes of 0.4 to 1.5 r0, exposures up to 2 tau0 and bands up to 20 % wide, where it is above 2 % of what
-    one pair of holes gives at most (within 5 % below; 3.3 % were seen for 20 holes of 1.5 r0 in the widest band); that
-    of full pupils, which is interpolated, within 2 % where it is above 1e-4 (4 % with vanes of D/25, or with an outer
-    scale of 5 D). Baselines of masks beyond the frequency torus alias as in MSE_a; those of full pupils are refused. A
-    value takes 7 to 18 times as long as that of MSE_a, 35 to 85 times for 7 wavelengths over 20 %, and its gradient two
-    to three times the value.
+    one pair of holes gives at most, and within 5 % below, but for single frequencies (4.9 and 13 % were found by
+    looking for the worst); that of full pupils, which is interpolated, within 2 % where it is above 1e-4 (4 % with
+    vanes of D/25, or with an outer scale of 5 D). Baselines of masks beyond the frequency torus alias as in MSE_a;
+    those of full pupils are refused. A value takes 7 to 20 times as long as that of MSE_a, 35 to 120 times for 7
+    wavelengths over 20 % with an exposure, and its gradient two to three times the value.
 
     Examples
     --------

@@ -191,11 +191,9 @@ class _CircleOverlap(torch.autograd.Function):
 
     @staticmethod
     def forward(distance: Tensor, one: float, other: float) -> Tensor:
-        area = torch.zeros_like(distance)
-        for radius, rest in ((one, other), (other, one)):
-            cosine, sine = _CircleOverlap._half_angle(distance, radius, rest)
-            area = area + radius**2 * (torch.arccos(cosine) - sine * cosine)
-        return area
+        if one == other:
+            return 2 * _CircleOverlap._segment(distance, one, other)
+        return _CircleOverlap._segment(distance, one, other) + _CircleOverlap._segment(distance, other, one)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -208,6 +206,12 @@ class _CircleOverlap(torch.autograd.Function):
         return -2 * ctx.one * _CircleOverlap._half_angle(distance, ctx.one, ctx.other)[1] * grad[0], None, None
 
     @staticmethod
+    def _segment(distance: Tensor, radius: float, rest: float) -> Tensor:
+        """Return the area between the common chord and the arc of one circle beyond it."""
+        cosine, sine = _CircleOverlap._half_angle(distance, radius, rest)
+        return radius**2 * (torch.arccos(cosine) - sine * cosine)
+
+    @staticmethod
     def _half_angle(distance: Tensor, radius: float, rest: float) -> tuple[Tensor, Tensor]:
         """Return cosine and sine of half the angle that the common chord subtends at the centre of one circle."""
         distance = distance.clamp(min=1e-18)
@@ -217,7 +221,8 @@ class _CircleOverlap(torch.autograd.Function):
 
 def _distance(shift: Tensor) -> Tensor:
     """Return the length along the last axis, with gradient 0 at zero."""
-    squared = (shift**2).sum(-1)
+    x, y = shift.unbind(-1)
+    squared = x * x + y * y
     return torch.where(squared > 0, squared, 1).sqrt() * (squared > 0)
 
 
