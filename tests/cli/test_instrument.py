@@ -249,6 +249,18 @@ def test_a_filter_stays_a_filter_with_the_light_of_the_source(recorded):
     assert (found["wavelengths"], found["weights"]) == (filtered.band.wavelengths, filtered.band.shares)
 
 
+def test_a_first_plan_tells_all_that_is_missing_at_once(capsys):
+    words = ["--exposure", "2e-3", "--telescope.diameter", "1", "--site.r0", "0.15", "--site.wind", "10"]
+    assert main(["plan", *words, "--camera.n-pixels", "0"]) == 1
+    assert capsys.readouterr().err == (
+        "torchmask plan: error: "
+        "(1) source: give --source.magnitude or --source.photon-rate [1 / (s m^2)], and not both; "
+        "(2) --camera.n-pixels is 0: it must be a whole number of at least 2; "
+        "(3) the band is missing or given twice: give --filter, or --wavelength and --width [m]; "
+        "give --observing-time [s] or --n-frames, and not both\n"
+    )
+
+
 def test_a_plan_is_made_of_the_whole_file(folder, recorded):
     parsed = parse(plan.Options, "plan", ["--instrument", str(folder / "instrument.json"), "--site.wind", "7"], prog="")
     expected = dataclasses.replace(recorded, site=dataclasses.replace(recorded.site, wind=7.0))

@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 from torchmask.design.rules import MaskRules
 from torchmask.design.turbulent import TurbulentMSE
 from torchmask.grid import ARCSEC, Grid
-from torchmask.instrument.instrument import VEGA_IN_AB, Instrument
+from torchmask.instrument.instrument import Instrument
 from torchmask.instrument.parts import Camera, Site, Source, Telescope
 from torchmask.io import to_json
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.band import Band
-from torchmask.optics.passband import Passband
+from torchmask.optics.passband import VEGA_IN_AB, Passband
 from torchmask.optics.shapes import TelescopePupil
 from torchmask.spectra import NoisePSD, PowerLawPSD
 
@@ -166,6 +166,7 @@ def test_files_that_hold_none_say_why(text, said, tmp_path):
         ),
         ({"camera": Camera(readout_time=1.0)}, r"takes 1.008 s: .* or expose for any time with a faster read-out"),
         ({"n_frames": 3}, "not both"),
+        ({"n_frames": 3, "width": None}, "missing or given twice: .*; give observing_time .* not both"),
         ({"observing_time": None}, "not both"),
         ({"observing_time": None, "n_frames": 0}, "n_frames is 0"),
         ({"observing_time": None, "n_frames": math.inf}, "n_frames is inf: it must be a whole number"),

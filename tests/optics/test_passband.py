@@ -10,9 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from speclite import filters
 
-from torchmask.instrument.instrument import VEGA_IN_AB
 from torchmask.optics.band import Band
-from torchmask.optics.passband import Passband
+from torchmask.optics.passband import VEGA_IN_AB, Passband
 
 
 @pytest.mark.parametrize("name", ["bessell-V", "sdss2010-r", "panstarrs-y"])

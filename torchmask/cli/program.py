@@ -153,7 +153,10 @@ def parse(options: type[T], command: str, argv: Sequence[str], *, prog: str, des
     with _checks_deferred(options) as mistakes:
         found = tyro.cli(options, prog=prog, args=argv, description=description, **default)
     if mistakes:
-        raise ValueError(in_options(str(mistakes[0]), found)) from mistakes[0]
+        told = list(dict.fromkeys(in_options(str(mistake), found) for mistake in mistakes))
+        if len(told) > 1:
+            told = [f"({number}) {message}" for number, message in enumerate(told, 1)]
+        raise ValueError("; ".join(told)) from mistakes[0]
     return found
 
 

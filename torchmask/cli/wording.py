@@ -89,7 +89,7 @@ def in_options(message: str, options: Any) -> str:
 def _by_value(name: str, numbers: list[float], known: list[Option]) -> str | None:
     """Return the option of a parameter with these numbers: one of its name, or else the only one given with them."""
     same = [option for option in known if numbers and _holds(option.numbers, numbers)]
-    named = [option for option in same if name in (option.name, option.flag[2:])]
+    named = [option for option in same if name in (option.name, option.flag[2:].replace("-", "_"))]
     given = [option for option in same if option.is_given]
     for chosen in (named, given, [option for option in given if name in option.name]):
         if len(chosen) == 1:

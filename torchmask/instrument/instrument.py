@@ -16,22 +16,10 @@ from torchmask.instrument.parts import Camera, Site, Source, Telescope
 from torchmask.io import extra, from_json, read_json, to_json, write_json
 from torchmask.numbers import THROUGH_AIR, require, require_wavelength, require_within, whole_number
 from torchmask.optics.band import MOST_WAVELENGTHS, Band, warn_of_few_wavelengths
-from torchmask.optics.passband import Passband
+from torchmask.optics.passband import VEGA_IN_AB, Passband
 from torchmask.spectra import NoisePSD, PowerLawPSD
 
 _FORMAT = "torchmask instrument, version 1"
-
-# AB - Vega magnitudes: Blanton & Roweis, Astron. J. 133, 734 (2007), table 1.
-VEGA_IN_AB = {
-    "bessell-U": 0.79,
-    "bessell-B": -0.09,
-    "bessell-V": 0.02,
-    "bessell-R": 0.21,
-    "bessell-I": 0.45,
-    "twomass-J": 0.91,
-    "twomass-H": 1.39,
-    "twomass-Ks": 1.85,
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,16 +72,19 @@ class Instrument:
         require("width", self.width, ", in m")
         require_within("exposure", self.exposure, 1e-6, 1e5, " s", "the fastest shutters to a day")
         require("observing_time", self.observing_time, ", in s")
-        if (self.width is None) == (self.filter is None):
-            raise ValueError("the band is missing or given twice: give filter, or wavelength and width [m]")
-        if self.wavelength is None and self.filter is None:
-            raise ValueError("wavelength is missing: give it in m, such as 550e-9")
-        if (self.observing_time is None) == (self.n_frames is None):
-            raise ValueError("give observing_time [s] or n_frames, and not both")
+        mistakes = []
+        if (self.width, self.filter).count(None) != 1:
+            mistakes.append("the band is missing or given twice: give filter, or wavelength and width [m]")
+        elif self.wavelength is None and self.filter is None:
+            mistakes.append("wavelength is missing: give it in m, such as 550e-9")
+        if (self.observing_time, self.n_frames).count(None) != 1:
+            mistakes.append("give observing_time [s] or n_frames, and not both")
+        if mistakes:
+            raise ValueError("; ".join(mistakes))
         if self.n_frames is not None:
             object.__setattr__(self, "n_frames", whole_number("n_frames", self.n_frames))
-        n_wavelengths = whole_number("n_wavelengths", self.n_wavelengths, most=MOST_WAVELENGTHS)
-        object.__setattr__(self, "n_wavelengths", n_wavelengths)
+        number = whole_number("n_wavelengths", self.n_wavelengths, most=MOST_WAVELENGTHS)
+        object.__setattr__(self, "n_wavelengths", number)
         self._check_time()
         self._check_band()
 

@@ -97,7 +97,7 @@ class Source:
 
     def __post_init__(self) -> None:
         if (self.magnitude is None) == (self.photon_rate is None):
-            raise ValueError("source: give either its magnitude or its photon_rate [1 / (s m^2)], and not both")
+            raise ValueError("source: give magnitude or photon_rate [1 / (s m^2)], and not both")
         if self.system not in get_args(System):
             raise ValueError(f"source.system is {self.system!r}: known systems are {' and '.join(get_args(System))}")
         require_within(

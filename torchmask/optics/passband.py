@@ -17,6 +17,18 @@ _FILES = (".txt", ".dat", ".csv")
 _ROUNDING = 1e-6  # by which a curve that was scaled to a peak of 1 may exceed it
 _RELATIVE = 1e-3  # a named curve that peaks below has a unit of its own: 2MASS's peak at 4e-5 to 8e-5
 
+# AB - Vega magnitudes: Blanton & Roweis, Astron. J. 133, 734 (2007), table 1.
+VEGA_IN_AB = {
+    "bessell-U": 0.79,
+    "bessell-B": -0.09,
+    "bessell-V": 0.02,
+    "bessell-R": 0.21,
+    "bessell-I": 0.45,
+    "twomass-J": 0.91,
+    "twomass-H": 1.39,
+    "twomass-Ks": 1.85,
+}
+
 
 @dataclass(frozen=True)
 class Passband:
