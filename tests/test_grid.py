@@ -117,3 +117,9 @@ def test_the_table_agrees_with_what_is_refused():
     for arguments in ((0.0,), (math.inf,), (1.0, -0.1)):
         with pytest.raises(ValueError, match="finite and positive, in m"):
             grid.describe(*arguments)
+
+
+def test_takes_whole_numbers_that_arithmetic_made():
+    assert Grid((64.0, np.float64(32)), 1e-7, 5e-7) == Grid((64, 32), 1e-7, 5e-7)
+    with pytest.raises(ValueError, match=r"n_pixels is 64\.5"):
+        Grid(64.5, 1e-7, 5e-7)

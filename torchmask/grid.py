@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from numbers import Integral
+from numbers import Real
 
 import torch
 from torch import Tensor
@@ -61,7 +61,7 @@ class Grid:
     def __post_init__(self) -> None:
         given = self.n_pixels
         sides = tuple(given) if isinstance(given, tuple | list) else (given, given)
-        if len(sides) != 2 or not all(isinstance(side, Integral) and side >= 2 for side in sides):
+        if len(sides) != 2 or not all(isinstance(side, Real) and side >= 2 and side % 1 == 0 for side in sides):
             raise ValueError(f"n_pixels is {given}: it must be one or two whole numbers of at least 2")
         # Python's own numbers: those of NumPy and torch may be of low precision, and a tensor's hash is its identity
         rows, columns = map(int, sides)

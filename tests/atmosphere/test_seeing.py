@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -31,6 +32,14 @@ def test_lags_have_the_moments_of_a_triangle(wind):
     assert float(weights.sum()) == pytest.approx(1, abs=1e-12)
     # mean square of the difference of two uniform instants: T^2 / 6
     assert float(weights @ (steps**2).sum(-1)) == pytest.approx((0.02 * 10) ** 2 / 6, rel=1e-12)
+
+
+@pytest.mark.parametrize("kind", [list, np.array, torch.tensor])
+def test_a_wind_is_a_pair_of_any_kind(kind):
+    seeing = Seeing(0.1, exposure=1e-3, wind=kind([3.0, -4.0]))
+    assert seeing == Seeing(0.1, exposure=1e-3, wind=(3.0, -4.0))
+    assert hash(seeing) == hash(Seeing(0.1, exposure=1e-3, wind=(3.0, -4.0)))
+    assert Seeing(0.1, exposure=1e-3, wind=kind([5.0])[0]) == Seeing(0.1, exposure=1e-3, wind=5.0)
 
 
 def test_a_speed_has_no_direction():

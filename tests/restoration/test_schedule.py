@@ -41,17 +41,17 @@ def test_refuses_candidates_that_do_not_halve(candidates):
 @pytest.mark.parametrize(
     ("name", "wrong", "range_"),
     [
-        ("segment", 0, "a whole number from 1 to inf"),
-        ("segment", 2.5, "a whole number from 1 to inf"),
-        ("starts", 0, "a whole number from 1 to inf"),
-        ("in_vain", -1, "a whole number from 0 to inf"),
-        ("averaged", 0, "a whole number from 1 to inf"),
-        ("rounds", 0, "a whole number from 1 to inf"),
-        ("renewal", 0, "a whole number from 1 to inf"),
-        ("moves", -1, "a whole number from 0 to inf"),
-        ("restarts", -1, "a whole number from 0 to inf"),
-        ("twins", -1, "a whole number from 0 to inf"),
-        ("reflections", math.inf, "a whole number from 0 to inf"),
+        ("segment", 0, "a whole number of at least 1"),
+        ("segment", 2.5, "a whole number of at least 1"),
+        ("starts", 0, "a whole number of at least 1"),
+        ("in_vain", -1, "a whole number of at least 0"),
+        ("averaged", 0, "a whole number of at least 1"),
+        ("rounds", 0, "a whole number of at least 1"),
+        ("renewal", 0, "a whole number of at least 1"),
+        ("moves", -1, "a whole number of at least 0"),
+        ("restarts", -1, "a whole number of at least 0"),
+        ("twins", -1, "a whole number of at least 0"),
+        ("reflections", math.inf, "a whole number of at least 0"),
         ("farthest", 1.5, "a number from 0 to 1"),
         ("farthest", math.nan, "a number from 0 to 1"),
         ("outlying", -1.0, "a number from 0 to inf"),
@@ -63,6 +63,11 @@ def test_refuses_candidates_that_do_not_halve(candidates):
 def test_refuses_numbers_out_of_range(name, wrong, range_):
     with pytest.raises(ValueError, match=f"{name} is {wrong}: it must be {range_}"):
         Schedule(**{name: wrong})
+
+
+def test_takes_whole_numbers_that_arithmetic_made():
+    assert Schedule(segment=50.0).segment == 50
+    assert isinstance(Schedule(segment=50.0).segment, int)
 
 
 def test_refuses_stages_and_steps_that_cannot_be():

@@ -11,6 +11,7 @@ from scipy.special import roots_jacobi
 from torch import Tensor
 
 from torchmask.atmosphere.structure import StructureFunction, coherence_distance
+from torchmask.plain import require_plain
 
 _HOST = {"dtype": torch.float64, "device": "cpu"}  # whatever the default device
 
@@ -52,17 +53,18 @@ class Seeing:
         self.structure()  # checks the scales
         if not (math.isfinite(self.exposure) and self.exposure >= 0):
             raise ValueError(f"exposure is {self.exposure}: it must be finite and not negative, in s")
-        pair = isinstance(self.wind, tuple | list)
-        speeds = tuple(self.wind) if isinstance(self.wind, tuple | list) else (self.wind,)
-        if len(speeds) != 1 + pair or not all(math.isfinite(speed) and (pair or speed >= 0) for speed in speeds):
+        require_plain("wind", self.wind)
+        given = np.asarray(self.wind, dtype=float)
+        if given.shape not in ((), (2,)) or not np.isfinite(given).all() or (given.ndim == 0 and given < 0):
             raise ValueError(f"wind is {self.wind}: it must be a speed of at least 0 or a pair (vx, vy), in m/s")
+        object.__setattr__(self, "wind", float(given) if given.ndim == 0 else tuple(given.tolist()))
         if self.exposure > 0 and self.speed == 0:
             raise ValueError(f"exposure is {self.exposure} s without wind: say how fast the turbulence moves, in m/s")
 
     @property
     def speed(self) -> float:
         """Speed of the wind [m/s]."""
-        return math.hypot(*self.wind) if isinstance(self.wind, tuple | list) else float(self.wind)
+        return math.hypot(*self.wind) if isinstance(self.wind, tuple) else float(self.wind)
 
     @property
     def tau0(self) -> float:
@@ -72,7 +74,7 @@ class Seeing:
     @property
     def is_isotropic(self) -> bool:
         """Whether no direction is distinguished."""
-        return self.exposure == 0 or not isinstance(self.wind, tuple | list)
+        return self.exposure == 0 or not isinstance(self.wind, tuple)
 
     def structure(self, reach: float = math.inf) -> StructureFunction:
         """Return the structure function of the phase, for displacements up to `reach` [m]."""
@@ -87,7 +89,7 @@ class Seeing:
         if self.exposure == 0:
             return torch.zeros(1, 2, **_HOST), torch.ones(1, **_HOST)
         lags, weights = _triangle_quadrature(n_lags)
-        if isinstance(self.wind, tuple | list):
+        if isinstance(self.wind, tuple):
             directions = torch.tensor([self.wind], **_HOST)
         else:
             angle = math.pi * (torch.arange(n_directions, **_HOST) + 0.5) / n_directions

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -118,7 +119,7 @@ class TurbulentMSE(AsymptoticMSE):
                 f"r0 is None, for independent pistons, but outer_scale is {outer_scale}, exposure {exposure} and "
                 f"wavelengths {wavelengths}: they need turbulence, so give its r0 in m at the grid's wavelength"
             )
-        if exposure == 0 and (any(wind) if isinstance(wind, tuple | list) else wind != 0):
+        if exposure == 0 and np.any(np.asarray(wind) != 0):
             raise ValueError(
                 f"wind is {wind} but exposure is 0: an instant feels no wind, so give the exposure in s, or no wind"
             )

@@ -8,6 +8,8 @@ from dataclasses import dataclass, fields
 from itertools import pairwise
 from numbers import Integral
 
+from torchmask.numbers import whole_number
+
 _NO_LIMIT = 10**9  # iterations
 
 # Ranges of the numbers that are not simply at least 0, with both ends.
@@ -208,9 +210,10 @@ class Schedule:
     def _check(self, name: str, whole: bool) -> None:
         """Raise ValueError unless the number of this name is in its range, and whole if it has to be."""
         value, (least, most) = getattr(self, name), _RANGES.get(name, (0, math.inf))
-        if not least <= value <= most or (whole and not isinstance(value, Integral)):
-            kind = "a whole number" if whole else "a number"
-            raise ValueError(f"{name} is {value}: it must be {kind} from {least:.3g} to {most:.3g}")
+        if whole:
+            object.__setattr__(self, name, whole_number(name, value, int(least), most))
+        elif not least <= value <= most:
+            raise ValueError(f"{name} is {value}: it must be a number from {least:.3g} to {most:.3g}")
 
     @classmethod
     def plain(cls) -> Schedule:
