@@ -195,6 +195,12 @@ def test_a_filter_tells_the_wavelength(tmp_path):
     assert options.observation(32, 1.5, 1 / 64, 0.1).grid.wavelength == options.observing_wavelength()
 
 
+def test_few_wavelengths_of_a_filter_are_warned_of():
+    with pytest.warns(UserWarning, match="n_wavelengths is 2 for a band .* 3 wavelengths do"):
+        Options(filter="bessell-V", n_wavelengths=2, criterion="turbulent", r0=0.1).conditions(550e-9, 0.1)
+    Options(filter="bessell-V", n_wavelengths=3, criterion="turbulent", r0=0.1).conditions(550e-9, 0.1)
+
+
 @pytest.mark.parametrize("number", ["1", "2"])
 def test_holes_are_counted_in_english(number, tmp_path, capsys):
     few = ["design", "--n-subapertures", number, "--fill-factor", "0.1", "--n-frequencies", "32", "--budget", "40"]

@@ -17,6 +17,8 @@ from torchmask.design.turbulent import TurbulentMSE
 from torchmask.grid import ARCSEC, Grid
 from torchmask.instrument.instrument import Instrument
 from torchmask.numbers import require_r0
+from torchmask.optics.band import warn_of_few_wavelengths
+from torchmask.optics.passband import Passband
 from torchmask.spectra import NoisePSD, PowerLawPSD
 
 
@@ -64,6 +66,8 @@ class ExposureOptions(BandOptions, InstrumentOptions):
             if self.instrument is None:
                 self._require_turbulence(band["wavelengths"] is not None)
             return None
+        if self.filter is not None:
+            warn_of_few_wavelengths(Passband.find(self.filter), self.n_wavelengths, self.temperature)
         sky = self.sky
         if sky is None:
             known = self.known_instrument()
