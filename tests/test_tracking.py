@@ -353,3 +353,34 @@ def test_closing_twice_is_harmless(tmp_path):
     log.close()
     log.close("failed")
     assert read_json(tmp_path / "run" / "status.json")["status"] == "finished"
+
+
+def test_arrays_and_brain_floats_are_kept(tmp_path):
+    square = np.arange(256.0).reshape(16, 16)
+    given = {"seen": square[::-1], "cast": torch.ones(16, 16, dtype=torch.bfloat16), "list": [1.0, 2.0]}
+    with RunLogger(tmp_path / "run") as log:
+        log(Record("fit", 1, 1, {"loss": torch.tensor(0.5, dtype=torch.bfloat16), "norm": np.float32(2)}, given))
+        log.image("images/cast", given["cast"])
+        square += 1  # as an optimiser does that works in place
+    stored = load_npz(tmp_path / "run" / "checkpoints" / "fit.npz")
+    np.testing.assert_array_equal(stored["seen"], np.arange(256.0).reshape(16, 16)[::-1])
+    assert stored["cast"].dtype == np.float32
+    assert stored["list"].tolist() == [1, 2]
+    assert read_metrics(tmp_path / "run")[0]["scalars"] == {"loss": 0.5, "norm": 2}
+    assert len(events(tmp_path / "run").Images("fit/seen")) == 1
+
+
+def test_nothing_is_logged_after_the_end(tmp_path):
+    with RunLogger(tmp_path / "run") as log:
+        log(record(1))
+    for again in (
+        lambda: log(record(2)),
+        lambda: log.scalar("fit/loss", 1.0),
+        lambda: log.image("x", torch.ones(16, 16)),
+        lambda: log.text("run/note", "late"),
+        lambda: log.figure("late", Figure()),
+    ):
+        with pytest.raises(ValueError, match=r"this RunLogger of .*run has been closed: log before that, or start"):
+            again()
+    assert len(read_metrics(tmp_path / "run")) == 1
+    assert not (tmp_path / "run" / "late.png").exists()

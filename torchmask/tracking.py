@@ -26,14 +26,14 @@ from datetime import UTC, datetime
 from functools import partial
 from importlib import metadata
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 import torchmask
 from torchmask.folders import new_folder
-from torchmask.io import as_array, atomic_write, extra, save_npz, to_json, write_json
+from torchmask.io import as_array, as_tensor, atomic_write, extra, save_npz, to_json, write_json
 from torchmask.record import Record
 from torchmask.viz.figures import stretch
 
@@ -62,7 +62,7 @@ class RunLogger:
     Raises
     ------
     ValueError
-        If `directory` exists (the message suggests a free name) or cannot be created.
+        If `directory` exists (the message suggests a free name) or cannot be created, or more is logged after the end.
 
     Notes
     -----
@@ -95,23 +95,20 @@ class RunLogger:
         self._last_checkpoint = self._start
         self._image_steps: dict[str, int] = {}
         self._session_end: Any = None
-        self._closed = False
         self._conclusion: dict[str, Any] = {}
         self._new_writer = partial(SummaryWriter, flush_secs=_FLUSH_INTERVAL)
         self.writer: Any = self._new_writer(str(self.directory))
         self._writers: dict[str, Any] = {"": self.writer}  # of stages KIND/VARIANT, by VARIANT
         self._metrics = open(self.directory / "metrics.jsonl", "x", encoding="utf-8", buffering=1)  # noqa: SIM115
         self._write_status("running")
-        environment = _environment(seed)
-        write_json(self.directory / "environment.json", environment)
-        self.text("run/environment", _code_block(environment))
+        self._log_json("environment", _environment(seed))
 
     def __call__(self, record: Record) -> None:
         """Log one step of an algorithm."""
         self._write_scalars(record.stage, record.step, record.scalars, n_steps=record.n_steps)
         if not record.arrays:
             return
-        arrays = {name: values.detach().clone() for name, values in record.arrays.items()}  # the algorithm goes on
+        arrays = {name: _copy(values) for name, values in record.arrays.items()}  # the algorithm goes on
         self._last[record.stage] = Record(record.stage, record.step, record.n_steps, record.scalars, arrays)
         self._unsaved.add(record.stage)
         self._log_images(self._last[record.stage], every=math.ceil(record.n_steps / _IMAGES_PER_STAGE))
@@ -127,8 +124,7 @@ class RunLogger:
         from torch.utils.tensorboard.summary import hparams
 
         values = to_json(config)
-        write_json(self.directory / "config.json", values)
-        self.text("run/config", _code_block(values))
+        self._log_json("config", values)
         # Not SummaryWriter.add_hparams, which writes a second run, and a list of hyperparameters and metrics that hides
         # those of later runs. Without that list TensorBoard collects the hyperparameters and scalars of every run.
         _, start, self._session_end = hparams(_flatten(values), {})
@@ -141,7 +137,7 @@ class RunLogger:
 
     def image(self, tag: str, image: Any, step: int = 0) -> None:
         """Log an image (H, W), stretched by `viz.stretch`; tags as in `scalar`. Raises ValueError for other shapes."""
-        values = as_array(image)
+        values = as_array(_copy(image))
         if values.ndim != 2:
             raise ValueError(f"image {tag} has shape {values.shape}: it must be (rows, columns)")
         stage, _, name = tag.rpartition("/")
@@ -150,6 +146,7 @@ class RunLogger:
 
     def figure(self, name: str, figure: Figure, step: int = 0) -> None:
         """Log a figure and write it to NAME.png in the run folder, replacing an earlier one of that name."""
+        writer, kind = self._place("figures")
         with extra("experiments"):
             import matplotlib.image
 
@@ -159,11 +156,11 @@ class RunLogger:
             file.write(picture.getvalue())
         picture.seek(0)
         pixels = matplotlib.image.imread(picture)[..., :3]
-        self.writer.add_image(f"figures/{name}", (255 * pixels + 0.5).astype(np.uint8), step, dataformats="HWC")
+        writer.add_image(f"{kind}/{name}", (255 * pixels + 0.5).astype(np.uint8), step, dataformats="HWC")
 
     def text(self, tag: str, markdown: str, step: int = 0) -> None:
         """Log a text, formatted as Markdown."""
-        self.writer.add_text(tag, markdown, step)
+        self._place("")[0].add_text(tag, markdown, step)
 
     def table(self, tag: str, rows: Sequence[Mapping[str, Any]], step: int = 0) -> None:
         """Log rows, whose keys are the columns, as a table. Raises ValueError if there is no row or columns differ."""
@@ -179,9 +176,8 @@ class RunLogger:
 
     def close(self, status: str = "finished", error: str | None = None) -> None:
         """Write the last states and images and how the run ended. Further calls do nothing."""
-        if self._closed:
+        if self._metrics.closed:
             return
-        self._closed = True
         try:
             for record in self._last.values():
                 self._log_images(record, every=1)
@@ -197,9 +193,7 @@ class RunLogger:
     def __enter__(self) -> RunLogger:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         if error is None:
             self.close()
         elif isinstance(error, KeyboardInterrupt):
@@ -207,17 +201,23 @@ class RunLogger:
         else:
             self.close("failed", f"{type(error).__name__}: {error}")
 
+    def _log_json(self, name: str, values: Any) -> None:
+        write_json(self.directory / f"{name}.json", values)
+        self.text(f"run/{name}", f"```json\n{json.dumps(values, indent=2)}\n```")
+
     def _write_scalars(self, stage: str, step: int, scalars: Mapping[str, float], **more: int) -> None:
-        values = {name: float(as_array(value)) for name, value in scalars.items()}
+        values = {name: float(_copy(value)) for name, value in scalars.items()}
         seconds = round(time.monotonic() - self._start, 3)
+        writer, kind = self._place(stage)
         row = to_json({"stage": stage, "step": step, **more, "seconds": seconds, "scalars": values})
         self._metrics.write(json.dumps(row, allow_nan=False) + "\n")  # line-buffered: on disk at once
-        writer, kind = self._place(stage)
         for name, value in values.items():
             writer.add_scalar(f"{kind}/{name}", value, step)
 
     def _place(self, stage: str) -> tuple[Any, str]:
         """Return the writer of a stage "KIND/VARIANT", and KIND; without a variant, that of the whole run."""
+        if self._metrics.closed:
+            raise ValueError(f"this RunLogger of {self.directory} has been closed: log before that, or start another")
         kind, _, variant = stage.partition("/")
         if variant not in self._writers:
             self._writers[variant] = self._new_writer(str(self.directory / _file_name(variant)))
@@ -255,12 +255,16 @@ def read_metrics(directory: str | Path) -> list[dict[str, Any]]:
     path = Path(directory) / "metrics.jsonl"
     if not path.is_file():
         raise ValueError(f"there is no file {path}: {directory} is not a run folder")
-    *lines, rest = path.read_text(encoding="utf-8").split("\n")
-    del rest  # empty, or an unfinished line
-    try:
-        return [json.loads(line) for line in lines]
+    try:  # all lines but the last, which is empty, or unfinished
+        return [json.loads(line) for line in path.read_text(encoding="utf-8").split("\n")[:-1]]
     except ValueError as error:
         raise ValueError(f"{path} is damaged: {error}") from error
+
+
+def _copy(values: Any) -> torch.Tensor:
+    """Return a detached copy of a tensor, or of an array on the CPU; bfloat16, which NumPy lacks, becomes float32."""
+    copy = (values if isinstance(values, torch.Tensor) else as_tensor(values, device="cpu")).detach().clone()
+    return copy.float() if copy.dtype == torch.bfloat16 else copy
 
 
 def _environment(seed: int | None) -> dict[str, Any]:
@@ -286,10 +290,6 @@ def _flatten(value: Any, prefix: str = "") -> dict[str, float | str]:
     if isinstance(value, bool) or not isinstance(value, int | float | str):
         value = json.dumps(value)
     return {prefix.rstrip(".") or "config": value}
-
-
-def _code_block(value: Any) -> str:
-    return f"```json\n{json.dumps(value, indent=2)}\n```"
 
 
 def _cell(value: Any) -> str:

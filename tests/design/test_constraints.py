@@ -294,3 +294,33 @@ def test_a_whole_number_of_folds_may_be_a_float():
 def test_bad_rules_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_a_mask_that_is_no_mask_any_more_is_not_in_order():
+    mask = SparseAperture([[-0.3, 0.0], [0.3, 0.0]], 0.2, 1.0)
+    mask.centers[1] = torch.nan
+    with pytest.raises(ValueError, match="centers hold values that are not finite"):
+        check_mask(mask)
+    with pytest.raises(TypeError, match="a SparseAperture is needed, not Tensor"):
+        check_mask(mask.centers)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda margins: margins * torch.nan, "is broken by nan m"),
+        (
+            lambda margins: margins > 0,
+            r"dtype torch\.bool .* numbers \[m\] of shape \('M',\) are needed",
+        ),
+        (lambda margins: margins.sum(), r"have shape \(\)"),
+        (lambda margins: margins[None], r"have shape \(1, 2\)"),
+    ],
+)
+def test_rules_of_another_form_are_refused(change, said):
+    class Rule(InsideDisc):
+        def margins(self, aperture):
+            return change(super().margins(aperture))
+
+    with pytest.raises(ValueError, match=said):
+        check_mask(SparseAperture([[-0.3, 0.0], [0.3, 0.0]], 0.2, 1.0), constraints=[Rule()])

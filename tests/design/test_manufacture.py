@@ -50,14 +50,19 @@ def test_json_and_fits_come_back_with_every_bit(tmp_path, name, dtype, suffix):
     assert same_bits(load_mask(tmp_path / f"mask{suffix}"), mask)
 
 
-number = st.floats(-10, 10, allow_nan=False)
-positive = st.floats(1e-6, 1e3, exclude_min=True)
+place = st.floats(-0.3, 0.3, allow_nan=False)
 
 
-@given(st.lists(st.tuples(number, number), min_size=1, max_size=8), positive, positive, number)
+@given(
+    st.lists(st.tuples(place, place), min_size=1, max_size=8),
+    st.floats(1e-6, 0.2),
+    st.floats(1e-3, 1e3),
+    st.floats(-10, 10),
+)
 @settings(max_examples=60, derandomize=True, deadline=None)
 def test_json_is_exact_for_any_mask(tmp_path_factory, centers, hole, diameter, orientation):
-    mask = SparseAperture(torch.tensor(centers, dtype=torch.float64), hole, diameter, "hexagon", orientation)
+    centers = torch.tensor(centers, dtype=torch.float64) * diameter
+    mask = SparseAperture(centers, hole * diameter, diameter, "hexagon", orientation)
     path = tmp_path_factory.mktemp("exact") / "mask.json"
     save_json(path, mask)
     assert same_bits(load_mask(path), mask)
@@ -172,6 +177,46 @@ def test_json_with_wrong_content_is_refused(tmp_path, change, message):
     (tmp_path / "changed.json").write_text(json.dumps(record))
     with pytest.raises(ValueError, match=message):
         load_mask(tmp_path / "changed.json")
+
+
+@pytest.mark.parametrize("suffix", [".json", ".dxf", ".svg", ".fits"])
+def test_masks_that_cannot_be_are_neither_written_nor_read(tmp_path, suffix):
+    mask = SparseAperture([[-0.4, 0.0], [0.4, 0.0]], 0.1, 1.0)
+    for wrong, said in (
+        (mask.replace(centers=1000 * mask.centers), "holes reach 399.6 m beyond the rim of a mask_diameter of 1 m"),
+        (SparseAperture(1200 * mask.centers, 120.0, 1200.0), "mask_diameter is 1200"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            SAVE[suffix](tmp_path / f"mask{suffix}", wrong)
+    path = tmp_path / "small.json"
+    save_json(path, mask)
+    path.write_text(path.read_text().replace('"mask_diameter": 1.0', '"mask_diameter": 0.5'))
+    with pytest.raises(ValueError, match=r"small.json cannot be read as a mask: holes reach 0\.2 m beyond the rim"):
+        load_mask(path)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"subaperture_diamter": 0.1}, "it has 'subaperture_diamter': the keys of such a mask are format"),
+        ({"orientation": 0.1}, "it has 'orientation'"),  # discs have none
+        ({"subaperture_diameter": True}, "its subaperture_diameter is True: it must be a number, in m"),
+        ({"mask_diameter": "1.0"}, "its mask_diameter is '1.0'"),
+    ],
+)
+def test_typing_errors_in_a_mask_file_are_told(tmp_path, given, said):
+    path = tmp_path / "mask.json"
+    save_json(path, SparseAperture([[-0.4, 0.0], [0.4, 0.0]], 0.1, 1.0))
+    path.write_text(json.dumps(json.loads(path.read_text()) | given))
+    with pytest.raises(ValueError, match=said):
+        load_mask(path)
+
+
+def test_a_wavelength_in_nanometres_is_told(tmp_path):
+    path = tmp_path / "mask.json"
+    save_json(path, SparseAperture([[-0.4, 0.0], [0.4, 0.0]], 0.1, 1.0), wavelength=550.0)
+    with pytest.raises(ValueError, match="550 nm are 550e-9"):
+        mask_wavelength(path)
 
 
 def test_maps_too_coarse_for_the_holes_are_refused(golay6):

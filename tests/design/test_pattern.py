@@ -33,6 +33,12 @@ def test_a_pattern_is_laid_as_the_catalogue_lays_it(name):
     assert pattern.afresh(1.0, 0.1).subaperture_diameter == pytest.approx(expected.subaperture_diameter, rel=1e-12)
 
 
+def test_a_pattern_keeps_off_the_rim():
+    mask = Pattern.from_catalog("golay6").afresh(1.2, 0.1, rim_margin=0.03)
+    assert float(InsideDisc().margins(mask).min()) == pytest.approx(0.03, rel=1e-9)
+    assert mask.fill_factor == pytest.approx(0.1, rel=1e-12)
+
+
 def test_a_mask_as_built_is_scaled_with_its_holes():
     built = SparseAperture.from_catalog("jwst_niriss_ami_7")
     scaled = Pattern.from_catalog("jwst_niriss_ami_7").scaled(1.0)

@@ -108,7 +108,7 @@ class Elsewhere(nn.Module):
 
     def forward(self, aperture):
         self.seen.add(aperture.centers.device.type)
-        return torch.ones(aperture.centers.shape[:-2], dtype=torch.float64)
+        return torch.ones(aperture.centers.shape[:-2], dtype=torch.float64, requires_grad=True)
 
     relative = forward
 
@@ -376,3 +376,47 @@ def test_a_refinement_of_few_evaluations_returns_the_best_that_it_has_measured(s
     curve = found.history["design/refine"][:, 1]
     assert bool((curve.diff() <= 0).all())
     assert float(curve[-1]) == pytest.approx(found.relative_mse, rel=1e-12)
+
+
+class Form(torch.nn.Module):
+    """A criterion whose values are what a function makes of good ones."""
+
+    def __init__(self, change):
+        super().__init__()
+        self.change = change
+
+    def forward(self, aperture):
+        return self.change(1 / (1 + aperture.centers.square().sum((-2, -1))))
+
+    relative = forward
+
+
+@pytest.mark.parametrize(
+    ("criterion", "error", "said"),
+    [
+        (lambda _: 1.0, TypeError, "criterion is function: .* a method `relative`"),
+        (Form(lambda values: 1.0), TypeError, "criterion returns float: a tensor is needed"),
+        (Form(torch.sum), ValueError, r"returns shape \(\) for a population of 2 masks, centers \(2, 3, 2\)"),
+        (Form(torch.detach), TypeError, "not differentiable in the centres"),
+    ],
+)
+def test_criteria_of_another_form_are_refused_before_any_work(criterion, error, said):
+    records = []
+    mask = SparseAperture.from_catalog("golay3", 1.0, 0.1)
+    with pytest.raises(error, match=said):
+        search_mask(criterion, 3, 1.0, 0.1, budget=96)
+    with pytest.raises(error, match=said):
+        refine_mask(criterion, mask, callback=records.append)
+    assert records == []
+
+
+def test_a_search_without_gradients_needs_none():
+    found = search_mask(Form(torch.detach), 3, 1.0, 0.1, method="cma", refine=False, budget=96)
+    assert 0 < found.relative_mse < 1
+
+
+@pytest.mark.parametrize("factor", [math.nan, math.inf, 0.0, -1.0])
+def test_a_refinement_needs_a_finite_error_to_begin_with(factor):
+    mask = SparseAperture.from_catalog("golay3", 1.0, 0.1)
+    with pytest.raises(ValueError, match=r"of the given mask is .*: it must be finite and positive"):
+        refine_mask(Form(lambda values: factor * values), mask)

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -9,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.signal import fftconvolve
 from torch.autograd import gradcheck
 
-from torchmask.optics.detector import Detector, image_formation
+from torchmask.optics.detector import Detector, image_formation, image_formation_adjoint
 
 
 def generator(seed=0):
@@ -161,6 +162,8 @@ def test_bad_read_noise_is_refused(readout_noise):
 def test_what_is_no_light_and_no_pixel_is_refused():
     with pytest.raises(TypeError, match=r"expected is torch\.int64: .* give expected\.double\(\)"):
         Detector()(torch.ones(2, 2, dtype=torch.int64))
+    with pytest.raises(TypeError, match=r"expected is of type ndarray: .* give torch\.as_tensor\(expected\)"):
+        Detector()(np.ones((2, 2)))
     with pytest.raises(TypeError, match=r"pixel is 1\.0: a response such as SquarePixel"):
         Detector(pixel=1.0)
 
@@ -168,3 +171,13 @@ def test_what_is_no_light_and_no_pixel_is_refused():
 def test_unknown_noise_is_refused():
     with pytest.raises(ValueError, match="noise is 'normal': it must be one of poisson, gaussian"):
         Detector(noise="normal")
+
+
+def test_no_frames_are_formed_from_no_psfs():
+    scene = torch.ones(4, 4, dtype=torch.float64, requires_grad=True)
+    psfs = torch.zeros(0, 8, 8, dtype=torch.float64, requires_grad=True)
+    frames = Detector(1.5, noise="gaussian")(image_formation(scene, psfs))
+    assert frames.shape == (0, 4, 4)
+    assert image_formation_adjoint(frames, psfs).shape == (0, 4, 4)
+    frames.sum().backward()
+    assert not bool(scene.grad.any())

@@ -6,6 +6,7 @@ from torch import nn
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.otf import OTF
 from torchmask.optics.psf import PSF, fold, psf_from_samples
 from torchmask.optics.zernike import ZernikePhase
 
@@ -120,3 +121,49 @@ def test_a_whole_oversampling_may_be_a_float():
     assert torch.equal(PSF(MASK, grid, 2.0)(), PSF(MASK, grid, 2)())
     with pytest.raises(ValueError, match=r"oversampling is 2\.5: it must be a whole number of at least 1"):
         PSF(MASK, grid, 2.5)
+
+
+def test_no_frames_and_no_masks_make_no_images():
+    grid = Grid.nyquist(1.0, WAVELENGTH, 40)
+    coefficients = torch.zeros(0, 7, 3, dtype=torch.float64, requires_grad=True)
+    none = MASK.replace(centers=torch.zeros(0, 7, 2, dtype=torch.float64, requires_grad=True))
+    for layer in (PSF(MASK, grid), OTF(MASK, grid)):
+        images = layer(ZernikePhase(MASK, grid, 3)(coefficients))
+        assert images.shape == (0, 40, 40)
+        images.abs().sum().backward()
+        assert coefficients.grad is not None
+        assert coefficients.grad.shape == (0, 7, 3)
+        coefficients.grad = None
+    assert OTF(none, grid)().is_complex()
+    images = PSF(none, grid)(ZernikePhase(none, grid, 3)(torch.zeros(0, 4, 7, 3, dtype=torch.float64)))
+    assert images.shape == (0, 4, 40, 40)
+    (PSF(none, grid)().sum() + images.sum()).backward()
+    assert none.centers.grad is not None
+
+
+@pytest.mark.parametrize(
+    ("convert", "message"),
+    [
+        (lambda phase: phase.numpy(), r"phase is of type ndarray: a tensor is needed, give torch\.as_tensor\(phase\)"),
+        (lambda phase: phase.long(), r"phase is torch\.int64: float32 or float64 is needed, give phase\.double\(\)"),
+        (lambda phase: phase + 0j, r"phase is torch\.complex128: float32 or float64 is needed, give phase\.real"),
+        (lambda phase: phase.bfloat16(), r"phase is torch\.bfloat16: float32 or float64 is needed"),
+    ],
+)
+def test_a_phase_is_a_tensor_of_real_numbers(convert, message):
+    model = PSF(MASK, Grid.nyquist(1.0, WAVELENGTH, 40))
+    with pytest.raises(TypeError, match=message):
+        model(convert(torch.zeros_like(model.samples().weights)))
+
+
+def test_a_phase_has_the_axes_of_the_population():
+    grid = Grid.nyquist(1.0, WAVELENGTH, 40)
+    model = PSF(MASK.replace(centers=torch.stack([MASK.centers, -MASK.centers])), grid)
+    phase = torch.zeros_like(model.samples().weights[0])
+    assert model(phase).shape == (2, 40, 40)
+    assert model(phase.expand(3, 1, 1, -1, -1)).shape == (3, 2, 1, 40, 40)
+    for axes in ((3,), (3, 4)):
+        with pytest.raises(ValueError, match=r"phase has shape \(3,.* and the population of masks \(2,\): the axes"):
+            model(phase.expand(*axes, -1, -1))
+    with pytest.raises(ValueError, match=r"coefficients has shape \(3, 7, 2\) and the population of masks \(2,\)"):
+        ZernikePhase(model.aperture, grid, 2)(torch.zeros(3, 7, 2, dtype=torch.float64))

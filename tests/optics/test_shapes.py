@@ -553,3 +553,28 @@ def test_names_tell_shapes_apart():
 def test_impossible_shapes_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+@dataclass(frozen=True)
+class Enclosed(Polygon):
+    """Any strips; without a name, so that no drawing is taken for it."""
+
+    given: tuple[tuple[float, float], ...] = ()
+
+    def strips(self):
+        return self.given
+
+
+@pytest.mark.parametrize(
+    ("strips", "message"),
+    [
+        ([(0.0, 1.0)], r"Enclosed has the strips \[\(0\.0, 1\.0\)\]: at least two"),
+        ([(0.0, 1.0), (1.5, -0.5)], "their widths must be finite and positive"),
+        ([(0.0, math.nan), (1.5, 1.0)], "their widths must be finite and positive"),
+        ([(0.0, 1.0), (0.0, 1.0)], "their angles must ascend from 0 to less than pi"),
+        ([(0.0, 1.0), (math.pi, 1.0)], "their angles must ascend from 0 to less than pi"),
+    ],
+)
+def test_strips_that_enclose_no_polygon_are_refused(strips, message):
+    with pytest.raises(ValueError, match=message):
+        Enclosed(given=strips)

@@ -1,6 +1,7 @@
 import copy
 import math
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -297,6 +298,8 @@ def test_coefficients_must_fit_the_mask():
         module(torch.zeros(6, 3, dtype=torch.float64))
     with pytest.raises(TypeError, match=r"coefficients are torch\.float32 and the aperture is torch\.float64"):
         module(torch.zeros(3, 6))
+    with pytest.raises(TypeError, match=r"coefficients is of type ndarray: a tensor is needed, give torch\.as_tensor"):
+        module(np.zeros((3, 6)))
 
 
 def test_a_thin_ring_has_few_modes():

@@ -368,6 +368,15 @@ def test_a_prior_that_is_none_is_refused_before_the_descent(prior, words, five_h
     assert records == []
 
 
+@pytest.mark.parametrize(("seed", "error"), [(1.5, ValueError), (-1, ValueError), ("a", TypeError), (None, TypeError)])
+def test_seeds_that_are_none_are_refused_before_the_descent(seed, error, observation):
+    records = []
+    method = MyopicDeconvolution(observation.aperture, observation.grid, n_modes=3, max_iterations=1)
+    with pytest.raises(error, match=f"seed is {seed!r}: it must be a whole number"):
+        method.restore(observation.frames, seed=seed, callback=records.append)
+    assert records == []
+
+
 def test_a_prior_that_cannot_be_called_is_refused_at_once(five_holes):
     with pytest.raises(TypeError, match=r"prior is 1\.0: it must be a function or module"):
         MyopicDeconvolution(five_holes, Grid.nyquist(1.0, 550e-9, 32), 3, prior=1.0)

@@ -102,6 +102,14 @@ def test_forward_and_the_fast_gradients_are_one_function(
         assert float((found.aberration_gradient - by_z).abs().max()) < rounding * float(by_z.abs().max())
 
 
+@pytest.mark.parametrize("rows", [1, 2])
+def test_a_row_of_aberrations_for_each_frame_is_needed(rows, three_holes, random_exposures):
+    model, image, z, frames, precision = random_exposures(ExposureModel(three_holes, GRID, 4))
+    objective = MyopicObjective(model, frames, precision, TotalVariation())
+    with pytest.raises(ValueError, match=rf"z has shape \({rows}, \d+\) for 3 frames: it must have a row for each"):
+        objective(image, z[:rows])
+
+
 def test_without_a_calibration_it_is_neutral(three_holes, random_exposures):
     model, image, z, frames, precision = random_exposures(ExposureModel(three_holes, GRID, 4))
     objective = MyopicObjective(model, frames, precision, TotalVariation())

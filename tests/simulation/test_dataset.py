@@ -242,3 +242,32 @@ def test_whole_numbers_may_be_floats():
     assert torch.equal(floats["frames"], ints["frames"])
     with pytest.raises(ValueError, match=r"n_frames is 2\.5: it must be a whole number of at least 1"):
         StackDataset(mask, GRID, 2, 2.5)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"aperture": CENTERS}, "aperture is of type Tensor: it must be of type Aperture, such as SparseAperture"),
+        ({"grid": 32}, r"grid is of type int: it must be of type Grid, such as Grid\.nyquist"),
+        ({"dtype": torch.float16}, r"dtype is torch\.float16: torch\.float32 or torch\.float64 is needed"),
+    ],
+)
+def test_arguments_of_another_type_are_refused(given, message):
+    with pytest.raises(TypeError, match=message):
+        StackDataset(**({"aperture": MASK, "grid": GRID, "length": 2} | given))
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        ({"r0": 0.2}, r"r0 is 0\.2: it must be a range \(lowest, highest\), the same number twice for a constant"),
+        ({"r0": (0.1, 0.2, 0.3)}, r"r0 is \(0\.1, 0\.2, 0\.3\): it must be a range"),
+        ({"r0": ("low", "high")}, r"r0 is \('low', 'high'\): it must be a range"),
+        ({"attitude": (0.0, 0.0, 0.0)}, r"attitude is \(0\.0, 0\.0, 0\.0\): it must be three ranges"),
+        ({"attitude": ((0, 1), (0, 1))}, "it must be three ranges"),
+        ({"attitude": ((0, 1), (0, 1), 2)}, "it must be three ranges"),
+    ],
+)
+def test_what_is_no_pair_is_no_range(bad, message):
+    with pytest.raises(ValueError, match=message):
+        StackRanges(**bad)

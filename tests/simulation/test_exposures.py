@@ -358,6 +358,14 @@ def test_bad_requests_are_refused(scene, mask, grid):
             simulate(scene, mask, grid, n_frames=n_frames)
     with pytest.raises(TypeError, match=r"scene is a ndarray: it must be a tensor \(H, W\)"):
         simulate(scene.numpy(), mask, grid)
+    with pytest.raises(ValueError, match=r"scene has dtype torch\.float16: it must be float32 or float64"):
+        simulate(torch.ones(32, 32, dtype=torch.float16), mask, grid)
+    with pytest.raises(
+        TypeError, match=r"detector is of type NoneType: it must be of type Detector, such as Detector\("
+    ):
+        simulate_observation(scene, mask, grid, None, None, 1)
+    with pytest.raises(TypeError, match="aperture is of type Tensor: it must be of type Aperture"):
+        simulate(scene, mask.centers, grid)
     with pytest.raises(TypeError, match=r"generator is 0: it must be a torch\.Generator"):
         simulate_observation(scene, mask, grid, None, Detector(), 1, 0)
     with pytest.raises(ValueError, match="n_frames is 1000000000000: that takes at least"):

@@ -182,3 +182,26 @@ def test_files_without_an_image_are_refused(tmp_path):
     fits.writeto(tmp_path / "cube.fits", np.ones((3, 4, 4)))
     with pytest.raises(ValueError, match="two-dimensional"):
         load_image(tmp_path / "cube.fits")
+
+
+@pytest.mark.parametrize("name", [None, "l.npz"])
+def test_one_number_is_a_square_and_whole_numbers_may_be_floats(files, name):
+    options = SceneOptions(path=None if name is None else files / name)
+    square = make_scene((32, 32), 1e6, options)
+    for shape in (32, 32.0, (32.0, 32), [32, 32]):
+        assert torch.equal(make_scene(shape, 1e6, options), square)
+
+
+@pytest.mark.parametrize(
+    ("shape", "error", "message"),
+    [
+        ((0, 32), ValueError, r"rows is 0: it must be a whole number of at least 1, as shape is \(rows, columns\)"),
+        ((32, 2.5), ValueError, r"columns is 2\.5: it must be a whole number"),
+        (0, ValueError, "rows is 0"),
+        ((1, 2, 3), ValueError, r"shape is \(1, 2, 3\): it must be \(rows, columns\), or one number"),
+        (None, TypeError, "rows is None: it must be a whole number"),
+    ],
+)
+def test_fields_of_no_pixels_are_refused(shape, error, message):
+    with pytest.raises(error, match=message):
+        make_scene(shape, 1e6)

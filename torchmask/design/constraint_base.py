@@ -60,8 +60,18 @@ class Inequality(Constraint):
     def margins(self, aperture: SparseAperture) -> Tensor:
         """Return the signed clearances (..., M) [m]."""
 
+    def checked_margins(self, aperture: SparseAperture) -> Tensor:
+        """Return the margins (..., M) [m]; raises ValueError unless they are numbers, in a row for each mask."""
+        margins, leading = self.margins(aperture), aperture.centers.shape[:-2]
+        if margins.shape[:-1] != leading or margins.ndim == 0 or not margins.is_floating_point():
+            raise ValueError(
+                f"margins of {self} have shape {tuple(margins.shape)} and dtype {margins.dtype} for centers of shape "
+                f"{tuple(aperture.centers.shape)}: floating-point numbers [m] of shape {(*leading, 'M')} are needed"
+            )
+        return margins
+
     def residuals(self, aperture: SparseAperture) -> Tensor:
-        return (-self.margins(aperture)).clamp(min=0)
+        return (-self.checked_margins(aperture)).clamp(min=0)
 
 
 class LinearEquality(Constraint):
@@ -143,7 +153,7 @@ def require_constraints(constraints: Sequence[Constraint]) -> None:
 
 def all_margins(aperture: SparseAperture, constraints: Sequence[Constraint]) -> Tensor:
     """Return the margins of all inequalities, concatenated (..., M) [m]."""
-    margins = [c.margins(aperture) for c in constraints if isinstance(c, Inequality)]
+    margins = [c.checked_margins(aperture) for c in constraints if isinstance(c, Inequality)]
     return torch.cat(margins, dim=-1) if margins else aperture.centers.flatten(-2)[..., :0]
 
 

@@ -260,11 +260,16 @@ def check_mask(aperture: SparseAperture, tolerance: float = 1e-9, constraints: S
     --------
     >>> check_mask(SparseAperture([[-0.4, 0.0], [0.4, 0.0]], subaperture_diameter=0.2, mask_diameter=1.0))
     """
+    if not isinstance(aperture, SparseAperture):
+        raise TypeError(f"a SparseAperture is needed, not {type(aperture).__name__}")
     require_constraints(constraints)
+    if not aperture.centers.isfinite().all():
+        raise ValueError("centers hold values that are not finite: a training that diverged may have put them there")
     check_overlaps(aperture, tolerance)
     for constraint in (InsideDisc(), *constraints):
-        worst = max(constraint.violation(aperture).flatten().tolist(), default=0.0)
-        if worst > tolerance * aperture.mask_diameter:
+        violation = constraint.violation(aperture)
+        worst = float(violation.max()) if violation.numel() else 0.0
+        if not worst <= tolerance * aperture.mask_diameter:  # NaN is no mask in order either
             raise ValueError(
                 f"{constraint} is broken by {worst:.3g} m ({worst / aperture.mask_diameter:.3g} of the mask "
                 f"diameter; the tolerance is {tolerance:.3g})"

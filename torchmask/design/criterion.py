@@ -231,7 +231,8 @@ def wiener_mse(otfs: Tensor, object_psd: PSD, noise_psd: PSD) -> Tensor:
     -------
     Tensor
         (...), the mean over nu of S_o S_n / (S_o sum_k |h_k|^2 + S_n), and of S_o where no light and no noise arrive.
-        Its average over random pistons is at least MSE_a.
+        Its average over random pistons is at least MSE_a; OTFs that are sampled in the pupil (`OTF`) need an
+        oversampling of 4 or more for that, since what they leak beyond the baselines counts as signal.
 
     Raises
     ------

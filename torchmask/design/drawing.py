@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from torchmask.io import atomic_write, extra
+from torchmask.numbers import require_diameter
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.overlaps import require_apart
 from torchmask.optics.shape_base import Array, Circle, Contour, Corners, Shape
@@ -24,6 +25,7 @@ from torchmask.optics.shapes import outlined_shape
 
 LIFE_SIZE = 1000.0  # [mm on the plate for a metre of the pupil]
 _SCALE = "torchmask mm per m"
+_BEYOND = 0.1  # of its diameter: holes of some real masks reach 0.05 beyond their nominal pupil
 _NANOMETRE = 1e-6  # [mm], tolerance for rounding
 
 
@@ -170,12 +172,22 @@ def _alike(hole: tuple[Shape, float], other: tuple[Shape, float]) -> bool:
 
 
 def require_one_mask(aperture: SparseAperture) -> Tensor:
-    """Return the centres (N, 2) of one mask, on the CPU. Raises TypeError or ValueError for anything else."""
+    """Return the centres (N, 2) of one mask, on the CPU.
+
+    Raises TypeError or ValueError for anything else, a diameter that no mask has, and holes far outside it.
+    """
     if not isinstance(aperture, SparseAperture):
         raise TypeError(f"a SparseAperture is needed, not {type(aperture).__name__}")
     if aperture.centers.ndim != 2:
         raise ValueError(
             f"centers has shape {tuple(aperture.centers.shape)}: a file holds one mask, (n_subapertures, 2)"
+        )
+    require_diameter("mask_diameter", aperture.mask_diameter)
+    beyond = aperture.reach - aperture.mask_diameter / 2
+    if not beyond <= _BEYOND * aperture.mask_diameter:
+        raise ValueError(
+            f"holes reach {beyond:.4g} m beyond the rim of a mask_diameter of {aperture.mask_diameter:.4g} m: correct "
+            "it, or the centers, which are in m from the middle of the mask"
         )
     return aperture.centers.detach().cpu()
 

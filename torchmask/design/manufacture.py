@@ -20,7 +20,7 @@ from torch import Tensor
 from torchmask.design.drawing import load_dxf, require_one_mask
 from torchmask.grid import Grid
 from torchmask.io import atomic_write, extra
-from torchmask.numbers import whole_number
+from torchmask.numbers import require_wavelength, whole_number
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.records import aperture_record, read_mask
 
@@ -154,7 +154,9 @@ def load_mask(path: str | Path) -> SparseAperture:
     if not path.is_file():
         raise ValueError(f"there is no mask file {path}")
     try:
-        return readers[path.suffix.lower()](path)
+        mask = readers[path.suffix.lower()](path)
+        require_one_mask(mask)
+        return mask
     except (ValueError, TypeError, LookupError, OSError) as error:
         raise ValueError(f"{path} cannot be read as a mask: {error}") from error
 
@@ -182,6 +184,7 @@ def mask_wavelength(path: str | Path) -> float | None:
     value = _json_record(path).get("wavelength")
     if value is not None and not (type(value) in (int, float) and math.isfinite(value) and value > 0):
         raise ValueError(f"{path}: its wavelength is {value!r}: it must be a positive number, in m")
+    require_wavelength("wavelength", value)
     return value
 
 
@@ -191,8 +194,16 @@ def _read_json(path: Path) -> SparseAperture:
     missing = [key for key in needed if key not in record]
     if missing:
         raise ValueError(f"it lacks {', '.join(map(repr, missing))}")
+    for name, unit in (("subaperture_diameter", "m"), ("mask_diameter", "m"), ("orientation", "rad")):
+        if type(value := record.get(name, 0.0)) not in (int, float):
+            raise ValueError(f"its {name} is {value!r}: it must be a number, in {unit}")
     centers = torch.tensor(record["centers"], dtype=torch.float64).to(_dtype(record["dtype"]))
-    return read_mask(record | {"centers": centers})
+    mask = read_mask(record | {"centers": centers})
+    known = ["format", "units", *needed, *mask.shape.parameters, "wavelength"]
+    unknown = [key for key in record if key not in known]
+    if unknown:  # typing errors, or what this shape does not have: the mask would be another than is meant
+        raise ValueError(f"it has {', '.join(map(repr, unknown))}: the keys of such a mask are {', '.join(known)}")
+    return mask
 
 
 def _json_record(path: Path) -> dict[str, Any]:

@@ -72,11 +72,11 @@ class Pattern:
         relative = gap / (2 * radius + self.shape.outer_diameter(gap))
         return len(self.centers) * relative**2 * self._area_over_disc
 
-    def afresh(self, mask_diameter: float, fill_factor: float) -> SparseAperture:
+    def afresh(self, mask_diameter: float, fill_factor: float, rim_margin: float = 0.0) -> SparseAperture:
         """Return the pattern fitted into a disc [m] with holes of the area of round ones with N d^2 / D^2.
 
-        Its smallest enclosing circle is centred, and its outermost holes touch the rim. Raises ValueError if its holes
-        would overlap, and says how large a fill factor it can carry.
+        Its smallest enclosing circle is centred, and its outermost holes are the margin [m] off the rim. Raises
+        ValueError if its holes would overlap, and says how large a fill factor it can carry.
         """
         if not (math.isfinite(fill_factor) and fill_factor > 0):
             raise ValueError(f"fill_factor is {fill_factor}: it must be finite and positive")
@@ -85,7 +85,7 @@ class Pattern:
             raise ValueError(f"its holes would overlap: it carries a fill factor of at most {most:.4g}")
         hole = mask_diameter * math.sqrt(fill_factor / self._area_over_disc / len(self.centers))
         middle, radius = catalog.smallest_enclosing_circle(self.centers)
-        room = (mask_diameter - self.shape.outer_diameter(hole)) / 2
+        room = (mask_diameter - self.shape.outer_diameter(hole)) / 2 - rim_margin
         centers = torch.from_numpy((self.centers - middle) * (room / radius))
         return SparseAperture(centers, hole, mask_diameter, self.shape)
 

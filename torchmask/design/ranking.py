@@ -213,7 +213,7 @@ def _lay_out(
             except ValueError as error:
                 left_out[f"{pattern.name}, {Layout.AS_BUILT.value}"] = str(error)
         try:
-            afresh = pattern.afresh(mask_diameter, fill_factor)
+            afresh = pattern.afresh(mask_diameter, fill_factor, rules.rim_margin)
             check_mask(afresh, _ROUNDING, constraints)
             masks.append((pattern.name, Layout.AFRESH, afresh))
         except ValueError as error:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchmask.design.constraint_base import Constraint, Infeasible, project, require_constraints
 from torchmask.design.constraints import InsideDisc, NoOverlap, check_mask
+from torchmask.design.criterion_check import require_criterion, require_finite
 from torchmask.design.descent import BatchedBFGS
 from torchmask.design.merit import Criterion, Holes, Merit, device_of, for_processor
 from torchmask.numbers import whole_number
@@ -57,13 +58,6 @@ class Monitor:
 
     `before` is the number of evaluations of earlier stages, and `known` the best feasible mask that they found.
     """
-
-    stage: str
-    budget: int
-    holes: Holes
-    callback: Callback | None
-    before: int
-    known: SparseAperture | None
 
     def __init__(
         self,
@@ -189,9 +183,9 @@ def refine_mask(
     Raises
     ------
     ValueError
-        If the aperture is a population, the budget is below 1, or no feasible mask is found near the given one.
+        If the aperture is a population or has no finite error, the budget is below 1, or no feasible mask is near it.
     TypeError
-        If the aperture is not a `SparseAperture`, or `constraints` is not a sequence of constraints.
+        If the aperture is not a `SparseAperture`, `constraints` not a sequence of them, or as `require_criterion`.
 
     Examples
     --------
@@ -214,6 +208,7 @@ def refine_mask(
     device, criterion = device_of(criterion), for_processor(criterion)
     still = aperture.still().to("cpu")
     holes = Holes(still, (InsideDisc(), NoOverlap(), *constraints))
+    require_finite(require_criterion(criterion, still))
     start = holes.coordinates(still.centers)
     known = _if_feasible(still, constraints)
     monitor = Monitor("design/refine", budget, holes, callback, known=known)

@@ -10,11 +10,13 @@ import torch
 
 from torchmask.design.cma import evolve
 from torchmask.design.constraint_base import Constraint, Infeasible
+from torchmask.design.criterion_check import require_criterion
 from torchmask.design.hybrid import basin_hopping, coarse_criterion
 from torchmask.design.merit import Criterion, device_of, for_processor
 from torchmask.design.refine import Monitor, SearchResult, conclude, polish
 from torchmask.design.room import require_room
 from torchmask.numbers import whole_number
+from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.packing import hole_diameter
 from torchmask.record import Callback
 
@@ -80,7 +82,7 @@ def search_mask(
         If an argument is out of range, the holes are narrower than a sample of the criterion's frequencies, no mask
         that fulfils the request is found, or the criterion has no finite logarithm at any mask.
     TypeError
-        If `constraints` is not a sequence of constraints.
+        If `constraints` is not a sequence of constraints, or as `require_criterion`.
 
     Examples
     --------
@@ -105,6 +107,8 @@ def search_mask(
     seed = whole_number("seed", seed, least=0)
     narrowest = _require_sampling(criterion, n_subapertures, mask_diameter, fill_factor)
     holes, known = require_room(n_subapertures, mask_diameter, fill_factor, constraints, callback, narrowest)
+    trial, needs_gradient = _ring(holes.template), refine or method == "hybrid"
+    require_criterion(for_processor(criterion), trial, differentiable=needs_gradient)
     if holes.subspace.size == 0:
         budget = 1  # the only mask
     elif n_subapertures == 1:
@@ -123,6 +127,13 @@ def search_mask(
     aperture, polished = polish(criterion, holes, starts, allowance, monitor)
     of_polish, best = monitor.history(criterion, polished)
     return conclude(criterion, best or aperture, constraints, used + polished, history | of_polish, device)
+
+
+def _ring(template: SparseAperture) -> SparseAperture:
+    """Return the mask with its holes evenly on a ring, on which a criterion can be tried."""
+    number = torch.arange(template.n_subapertures, device="cpu").to(template.centers)
+    angle = 2 * math.pi / template.n_subapertures * number
+    return template.replace(centers=0.35 * template.mask_diameter * torch.stack([angle.cos(), angle.sin()], -1))
 
 
 def _require_sampling(criterion: Criterion, n_subapertures: int, mask_diameter: float, fill_factor: float) -> float:

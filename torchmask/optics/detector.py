@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import torch
 from torch import Tensor, nn
 
+from torchmask.optics.fourier import transform_images
+from torchmask.optics.inputs import require_tensor
 from torchmask.optics.pixel import PixelResponse
 
 NOISES = ("poisson", "gaussian")
@@ -41,9 +44,8 @@ def image_formation(scene: Tensor, psfs: Tensor) -> Tensor:
     >>> image_formation(scene, psf).round().nonzero().tolist()  # the second half has left the field
     [[3, 3]]
     """
-    raster, (height, width) = _wide_raster(psfs, scene), scene.shape[-2:]
-    spectrum = torch.fft.rfft2(scene, s=raster) * torch.fft.rfft2(psfs)
-    return torch.fft.irfft2(spectrum, s=raster)[..., :height, :width]
+    spectrum, transfer = _spectra(scene, psfs)
+    return _cropped_image(spectrum * transfer, psfs, scene)
 
 
 def image_formation_adjoint(frames: Tensor, psfs: Tensor) -> Tensor:
@@ -61,13 +63,12 @@ def image_formation_adjoint(frames: Tensor, psfs: Tensor) -> Tensor:
     >>> torch.allclose(there, back)
     True
     """
-    raster, (height, width) = _wide_raster(psfs, frames), frames.shape[-2:]
-    spectrum = torch.fft.rfft2(frames, s=raster) * torch.fft.rfft2(psfs).conj()
-    return torch.fft.irfft2(spectrum, s=raster)[..., :height, :width]
+    spectrum, transfer = _spectra(frames, psfs)
+    return _cropped_image(spectrum * transfer.conj(), psfs, frames)
 
 
-def _wide_raster(psfs: Tensor, image: Tensor) -> tuple[int, int]:
-    """Return rows and columns of the PSFs, after checking that no wrapped light falls inside the image."""
+def _spectra(image: Tensor, psfs: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the transforms of an image and of PSFs on their raster, where no wrapped light falls inside the image."""
     rows, columns = psfs.shape[-2:]
     height, width = image.shape[-2:]
     if rows < 2 * height - 1 or columns < 2 * width - 1:
@@ -75,7 +76,14 @@ def _wide_raster(psfs: Tensor, image: Tensor) -> tuple[int, int]:
             f"PSFs of {rows} x {columns} pixels are too small for a scene of {height} x {width}: at least "
             f"{2 * height - 1} x {2 * width - 1} are needed, unfolded (sample the pupil with more oversampling)"
         )
-    return rows, columns
+    on_raster = partial(torch.fft.rfft2, s=(rows, columns))
+    return transform_images(on_raster, image), transform_images(on_raster, psfs)
+
+
+def _cropped_image(spectrum: Tensor, psfs: Tensor, like: Tensor) -> Tensor:
+    """Return the part of the image with this spectrum, on the raster of the PSFs, that has the size of another."""
+    image = transform_images(partial(torch.fft.irfft2, s=psfs.shape[-2:]), spectrum)
+    return image[..., : like.shape[-2], : like.shape[-1]]
 
 
 class Detector(nn.Module):
@@ -136,9 +144,10 @@ class Detector(nn.Module):
 
         A `generator` on the CPU works for any device of `expected`, and gives the same noise on all of them.
 
-        Raises TypeError if `expected` is not of floating point, and ValueError if a value is not finite, or is negative
-        beyond the rounding error of the FFTs that formed it.
+        Raises TypeError if `expected` is no tensor of floating point, and ValueError if a value is not finite, or is
+        negative beyond the rounding error of the FFTs that formed it.
         """
+        require_tensor("expected", expected)
         if not expected.is_floating_point():
             raise TypeError(f"expected is {expected.dtype}: light has fractions of electrons, give expected.double()")
         if not bool(torch.isfinite(expected).all()):

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchmask.grid import Grid
+from torchmask.optics.fourier import transform_images
 from torchmask.optics.phasor import phasor
 from torchmask.optics.psf import PSF
 from torchmask.optics.pupil import Aperture
@@ -27,7 +28,7 @@ class OTF(PSF):
     """
 
     def forward(self, phase: Tensor | None = None) -> Tensor:
-        return torch.fft.fft2(super().forward(phase))
+        return transform_images(torch.fft.fft2, super().forward(phase))
 
 
 def analytic_otf(aperture: Aperture, grid: Grid, pistons: Tensor | None = None) -> Tensor:

@@ -7,7 +7,7 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 import torch
@@ -23,6 +23,7 @@ from torchmask.optics.shape_base import (
     half_plane_coverage,
     no_pullback,
 )
+from torchmask.optics.strips import StripArea, require_strips
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,8 @@ class Polygon(Shape):
     Raises
     ------
     ValueError
-        If `orientation` is not finite.
+        If `orientation` is not finite, or the strips enclose no polygon: fewer than two, angles that do not ascend from
+        0 to less than pi, or a width that is not finite and positive.
     """
 
     orientation: float = 0.0
@@ -48,6 +50,7 @@ class Polygon(Shape):
     def __post_init__(self) -> None:
         if not math.isfinite(self.orientation):
             raise ValueError(f"orientation is {self.orientation}: it must be a finite angle in rad")
+        require_strips(type(self).__name__, self.strips())
 
     @abstractmethod
     def strips(self) -> Sequence[tuple[float, float]]:
@@ -133,7 +136,7 @@ class Polygon(Shape):
         angles, widths = zip(*self.strips(), strict=True)
         across = (shift[..., None, :] / diameter * shift.new_tensor(self._normals()[: len(widths)])).sum(-1)
         half_widths = ((shift.new_tensor(widths) - across.abs()) / 2).clamp(min=0)
-        return _StripArea.apply(half_widths, angles) / self.area(1.0)  # type: ignore[no-any-return]
+        return StripArea.apply(half_widths, angles) / self.area(1.0)  # type: ignore[no-any-return]
 
     def quadrature(self, degree: int, diameter: float) -> tuple[Tensor, Tensor]:
         """Return a product of Gauss rules on each of the triangles between the centre and a side."""
@@ -222,45 +225,6 @@ class Square(Polygon):
 def _snapped(cosine: float) -> float:
     """Round a cosine that should be 0 to exactly 0, so that sides along an axis, and their gradients, are exact."""
     return 0.0 if abs(cosine) < 1e-15 else cosine
-
-
-class _StripArea(torch.autograd.Function):
-    """Area of the intersection of concentric strips with `half_widths` (..., S) and normals at `angles` (S,).
-
-    It is the sum of half-width times side length over the strips, and its derivative by a half-width is the length of
-    the strip's two sides. Autograd would have no unique gradient where three sides meet in a corner.
-    """
-
-    generate_vmap_rule = True
-
-    @staticmethod
-    def forward(half_widths: Tensor, angles: Sequence[float]) -> Tensor:
-        return (half_widths * _StripArea._side(half_widths, angles)).sum(-1)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        half_widths, ctx.angles = inputs
-        ctx.save_for_backward(half_widths)
-
-    @staticmethod
-    def backward(ctx: Any, *grad: Tensor) -> tuple[Tensor, None]:
-        (half_widths,) = ctx.saved_tensors
-        return 2 * _StripArea._side(half_widths, ctx.angles) * grad[0][..., None], None
-
-    @staticmethod
-    def _side(half_widths: Tensor, angles: Sequence[float]) -> Tensor:
-        """Return the length (..., S) of each of the two sides of a strip, between the edges of the other strips."""
-        others = [[k for k in range(len(angles)) if k != own] for own in range(len(angles))]  # S times S - 1
-        turns = [[(angles[k] - angle) % math.pi for k in row] for row, angle in zip(others, angles, strict=True)]
-        cosine, sine = (
-            half_widths.new_tensor([[f(turn) for turn in row] for row in turns]) for f in (math.cos, math.sin)
-        )
-        beyond, across = (
-            half_widths[..., torch.tensor(others, device=half_widths.device)],
-            half_widths[..., None] * cosine,
-        )
-        ends = ((beyond - across) / sine).amin(-1) + ((beyond + across) / sine).amin(-1)
-        return ends.clamp(min=0)
 
 
 def _hexagon_patches(x: Tensor, y: Tensor, differentiate: bool, normals: Tensor) -> tuple[Tensor, Pullback]:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import torch
 from torch import Tensor, nn
 
 from torchmask.grid import Grid
+from torchmask.optics.fourier import transform_images
+from torchmask.optics.inputs import require_masks, require_real
 from torchmask.optics.phasor import phasor
 from torchmask.optics.pupil import Aperture, PupilSamples
 
@@ -43,12 +46,8 @@ def focal_intensity(samples: PupilSamples, phase: Tensor | None = None) -> Tenso
     phase changes. If all light lies within the raster, the sum is that of the squared open fractions.
     """
     weights, index = samples.weights, samples.index
-    needed = tuple(weights.shape[-2:])
-    if phase is not None and any(n not in (1, m) for n, m in zip(phase.shape[-2:], needed, strict=False)):
-        raise ValueError(
-            f"phase has shape {tuple(phase.shape)}: its last two axes must be (sub-apertures, samples) = {needed}, on "
-            "samples of the same aperture, grid and oversampling"
-        )
+    if phase is not None:
+        _check(phase, weights)
     if phase is not None and phase.ndim > weights.ndim:
         weights, index = weights.unsqueeze(-3), index.unsqueeze(-3)
     if phase is None:
@@ -58,8 +57,20 @@ def focal_intensity(samples: PupilSamples, phase: Tensor | None = None) -> Tenso
     field, index = field.flatten(-2), index.expand(field.shape).flatten(-2)
     pupil = torch.zeros(*field.shape[:-1], math.prod(samples.raster), dtype=field.dtype, device=field.device)
     pupil = pupil.scatter_add(-1, index, field).unflatten(-1, samples.raster)
-    amplitude = torch.fft.fft2(pupil, norm="ortho")
+    amplitude = transform_images(partial(torch.fft.fft2, norm="ortho"), pupil)
     return (amplitude.real**2 + amplitude.imag**2) / _cell_transfer(samples)
+
+
+def _check(phase: Tensor, weights: Tensor) -> None:
+    """Raise TypeError or ValueError unless a phase (..., [frame,] N, P) suits samples of `weights` (..., N, P)."""
+    require_real("phase", phase)
+    needed = tuple(weights.shape[-2:])
+    if any(n not in (1, m) for n, m in zip(phase.shape[-2:], needed, strict=False)):
+        raise ValueError(
+            f"phase has shape {tuple(phase.shape)}: its last two axes must be (sub-apertures, samples) = {needed}, on "
+            "samples of the same aperture, grid and oversampling"
+        )
+    require_masks("phase", phase, weights.shape[:-2])
 
 
 def _cell_transfer(samples: PupilSamples) -> Tensor:
@@ -93,7 +104,9 @@ class PSF(nn.Module):
     ------
     ValueError
         If the grid aliases the image or a sub-aperture is narrower than two pupil samples; in a call, if the phase lies
-        on other samples.
+        on other samples or its leading axes are not those of a population of masks.
+    TypeError
+        In a call, if the phase is no tensor of float32 or float64.
 
     Notes
     -----

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from torchmask.grid import Grid
 from torchmask.numbers import whole_number
+from torchmask.optics.inputs import require_masks, require_tensor
 from torchmask.optics.pupil import Aperture, PupilSamples, can_be_read
 
 _INDEPENDENT = 1e-9  # smallest rms of the part of a mode that is orthogonal to the modes before it
@@ -121,7 +122,7 @@ class ZernikePhase(nn.Module):
         If `n_modes` is not a whole number of at least 1, or the aperture cannot be sampled on the grid; in a call, if
         coefficients have a wrong shape.
     TypeError
-        If coefficients have another dtype than the aperture.
+        If coefficients are no tensor, or have another dtype than the aperture.
 
     Notes
     -----
@@ -155,6 +156,7 @@ class ZernikePhase(nn.Module):
         return zernike_basis(self.aperture.samples(self.grid, self.oversampling), self.aperture, self.n_modes)
 
     def forward(self, coefficients: Tensor) -> Tensor:
+        require_tensor("coefficients", coefficients)
         expected = (self.aperture.n_subapertures, self.n_modes)
         if coefficients.shape[-2:] != expected:
             raise ValueError(
@@ -169,6 +171,7 @@ class ZernikePhase(nn.Module):
                 f"coefficients are {coefficients.dtype} and the aperture is {basis.dtype}: convert one of them, for "
                 "example by aperture.to(torch.float32)"
             )
+        require_masks("coefficients", coefficients, basis.shape[:-3])
         if coefficients.ndim >= basis.ndim:
             basis = basis.unsqueeze(-4)
         return torch.einsum("...npj,...nj->...np", basis, coefficients)

@@ -180,10 +180,11 @@ class MyopicObjective(nn.Module):
     def forward(self, image: Tensor, z: Tensor, calibration: Calibration | None = None) -> Tensor:
         calibration = calibration or self.neutral_calibration()
         frames, precision, unit = self.scaled_data(calibration)
+        if len(z) != len(frames):
+            raise ValueError(f"z has shape {tuple(z.shape)} for {len(frames)} frames: it must have a row for each")
         residual = self.model.background.residual(frames - self.model(image, z), precision, unit)
         misfit = 0.5 * (precision * residual**2).sum().to(image.dtype)
-        away = z - self.centre
-        hold = 0.5 * (self.aberration_weight(calibration, z) * away**2).sum()
+        hold = 0.5 * (self.aberration_weight(calibration, z) * (z - self.centre) ** 2).sum()
         return misfit + self.prior_copies * (self.prior(image) + self.model.background.price * image.sum()) + hold
 
     def value_and_gradients(self, image: Tensor, z: Tensor, calibration: Calibration | None = None) -> CostAndGradients:

@@ -104,6 +104,9 @@ class Traits:
     seed: int
     refinement: Refinement
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "seed", whole_number("seed", self.seed, least=0))
+
     @property
     def aberration_weight(self) -> float:
         """Weight of the aberrations' prior at first: 0 without one."""

@@ -18,7 +18,7 @@ from torchmask.grid import Grid
 from torchmask.numbers import whole_number
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.detector import Detector
-from torchmask.simulation.exposures import simulate_observation
+from torchmask.simulation.exposures import require_instruments, simulate_observation
 from torchmask.simulation.render import Mesh, load_mesh, render_mesh
 from torchmask.simulation.satellite import satellite_mesh
 
@@ -33,8 +33,8 @@ Scene = Callable[[int, torch.Generator], Tensor]
 class StackRanges:
     """Ranges of the quantities that are drawn at random for each stack.
 
-    Angles are drawn uniformly, other quantities log-uniformly. Raises ValueError for a range that is not finite, in
-    descending order, or out of bounds.
+    Angles are drawn uniformly, other quantities log-uniformly. Raises ValueError for a range that is no pair of
+    numbers, not finite, in descending order, or out of bounds.
 
     Examples
     --------
@@ -56,13 +56,27 @@ class StackRanges:
         for field in fields(self):
             lowest, highest = bounds.get(field.name, (np.nextafter(0.0, 1.0), math.inf))
             value = getattr(self, field.name)
-            for low, high in value if field.name == "attitude" else [value]:
+            for low, high in _pairs(field.name, value):
                 if not (math.isfinite(low) and math.isfinite(high) and lowest <= low <= high <= highest):
                     raise ValueError(
                         f"{field.name} is {value}: a range is (lowest, highest), both finite"
                         + (", within 0 to 180 degrees" if field.name == "sun_angle" else "")
                         + (", above 0" if field.name in ("n_photons", "r0") else "")
                     )
+
+
+def _pairs(name: str, value: Any) -> list[list[float]]:
+    """Return the range, or the three of an attitude, as (lowest, highest); raises ValueError for anything else."""
+    wanted, needed = (2,), "it must be a range (lowest, highest), the same number twice for a constant"
+    if name == "attitude":
+        wanted, needed = (3, 2), "it must be three ranges (lowest, highest), about the axes right, up and to the viewer"
+    try:
+        numbers = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        numbers = np.empty(0)
+    if numbers.shape != wanted:
+        raise ValueError(f"{name} is {value!r}: {needed}")
+    return numbers.reshape(-1, 2).tolist()
 
 
 class StackDataset(Dataset[dict[str, Tensor]]):
@@ -109,7 +123,8 @@ class StackDataset(Dataset[dict[str, Tensor]]):
         both `path` and `scene` are given, a scene is black, or `simulate_observation` refuses an argument. Stack 0 is
         drawn at once as a check, which takes as long as drawing any one stack.
     TypeError
-        If `scene` is not callable or returns something other than a tensor, or `ranges` is no `StackRanges`.
+        If `aperture`, `grid` or `ranges` are of another type than they must be, `dtype` is neither float32 nor float64,
+        or `scene` is not callable or returns something other than a tensor.
 
     Notes
     -----
@@ -170,8 +185,12 @@ class StackDataset(Dataset[dict[str, Tensor]]):
             raise TypeError(
                 f"ranges is a {type(ranges).__name__}: it must be StackRanges, such as StackRanges(r0=(0.1, 0.2))"
             )
+        if dtype not in (torch.float32, torch.float64):
+            raise TypeError(f"dtype is {dtype}: torch.float32 or torch.float64 is needed")
         if scene is not None and path is not None:
             raise ValueError("both scene and path are given: give only one of them")
+        self.detector: Detector = Detector(readout_noise)
+        require_instruments(aperture, grid, self.detector)
         self.aperture: Aperture = aperture.still().to("cpu", dtype)
         self.grid = grid
         self.length: int = whole_number("length", length)
@@ -179,7 +198,6 @@ class StackDataset(Dataset[dict[str, Tensor]]):
         self.ranges: StackRanges = ranges or StackRanges()
         self.size = size
         self.outer_scale = outer_scale
-        self.detector: Detector = Detector(readout_noise)
         self.seed: int = whole_number("seed", seed, least=0)
         self.dtype = dtype
         self.allow_overlap = allow_overlap

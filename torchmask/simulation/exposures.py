@@ -103,7 +103,7 @@ def simulate_observation(
         has no wind, or it exceeds the time between frames; or `keep_phases` is combined with `exposure_time`, `band` or
         `told`.
     TypeError
-        If the scene is no tensor, or `generator` no torch.Generator.
+        If the scene is no tensor, or `aperture`, `grid`, `detector` or `generator` of another type than it must be.
 
     Examples
     --------
@@ -136,6 +136,7 @@ def simulate_observation(
     """
     conditions = conditions or Conditions()
     _check_types(scene, generator)
+    require_instruments(aperture, grid, detector)
     scene = scene.detach()
     n_frames = whole_number("n_frames", n_frames)
     _check(scene, aperture, grid)
@@ -218,6 +219,19 @@ def _stack_phases(phases: Sequence[Tensor | None], like: Tensor) -> Tensor:
     return torch.stack([torch.zeros_like(like) if phase is None else phase for phase in phases])
 
 
+def require_instruments(aperture: Any, grid: Any, detector: Any) -> None:
+    """Raise TypeError unless these are an aperture, a grid and a detector."""
+    for name, given, kind, example in (
+        ("aperture", aperture, Aperture, "SparseAperture.from_catalog('golay6', 1.0, 0.15)"),
+        ("grid", grid, Grid, "Grid.nyquist(1.0, 550e-9, 128)"),
+        ("detector", detector, Detector, "Detector(readout_noise=1.5)"),
+    ):
+        if not isinstance(given, kind):
+            raise TypeError(
+                f"{name} is of type {type(given).__name__}: it must be of type {kind.__name__}, such as {example}"
+            )
+
+
 def _check_types(scene: Any, generator: Any) -> None:
     if not isinstance(scene, Tensor):
         raise TypeError(f"scene is a {type(scene).__name__}: it must be a tensor (H, W), such as torch.tensor(scene)")
@@ -230,8 +244,8 @@ def _check_types(scene: Any, generator: Any) -> None:
 def _check(scene: Tensor, aperture: Aperture, grid: Grid) -> None:
     if tuple(scene.shape) != grid.shape:
         raise ValueError(f"scene has shape {tuple(scene.shape)}: the grid needs {grid.shape}")
-    if not scene.is_floating_point():
-        raise ValueError(f"scene has dtype {scene.dtype}: it must be floating point, in electrons per frame")
+    if scene.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"scene has dtype {scene.dtype}: it must be float32 or float64, in electrons per frame")
     if not bool(torch.isfinite(scene).all()):
         raise ValueError("scene holds values that are not finite")
     if float(scene.min()) < 0:

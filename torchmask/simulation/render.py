@@ -17,6 +17,7 @@ from torch import Tensor
 
 from torchmask.io import extra
 from torchmask.memory import require_memory
+from torchmask.numbers import whole_number
 
 Array = NDArray[np.float64]
 
@@ -79,9 +80,24 @@ def _albedo(part: Any) -> Array:
     return np.broadcast_to(np.asarray(colours, dtype=float)[..., :3].mean(-1) / 255, len(part.faces))
 
 
+def rows_and_columns(shape: int | tuple[int, int]) -> tuple[int, int]:
+    """Return rows and columns of an image; one number means a square, as of a `Grid`.
+
+    Raises ValueError unless they are whole numbers of at least 1, and TypeError if they are no numbers.
+
+    >>> rows_and_columns(32), rows_and_columns((24.0, 32))
+    ((32, 32), (24, 32))
+    """
+    sides = tuple(shape) if isinstance(shape, Sequence) else (shape, shape)
+    if len(sides) != 2:
+        raise ValueError(f"shape is {shape}: it must be (rows, columns), or one number for a square")
+    note = ", as shape is (rows, columns)"
+    return whole_number("rows", sides[0], note=note), whole_number("columns", sides[1], note=note)
+
+
 def render_mesh(
     mesh: Mesh,
-    shape: tuple[int, int],
+    shape: int | tuple[int, int],
     *,
     attitude: Sequence[float] = (0.0, 0.0, 0.0),
     sun: Sequence[float] = (0.0, 0.0, 1.0),
@@ -100,8 +116,8 @@ def render_mesh(
     ----------
     mesh : Mesh
         Triangles and their reflectance.
-    shape : (int, int)
-        Rows and columns of the image.
+    shape : int or (int, int)
+        Rows and columns of the image; one number means a square.
     attitude : (float, float, float)
         Rotation [degrees] about the fixed axes x (to the right), then y (up), then z (towards the viewer,
         anticlockwise in the image).
@@ -124,8 +140,8 @@ def render_mesh(
     Raises
     ------
     ValueError
-        If the mesh has no extent, the attitude is not finite, the sun is not a direction, `size` lies outside (0, 1],
-        `ambient` is negative, or no light reaches the viewer.
+        If `shape` is not one or two whole numbers of at least 1, the mesh has no extent, the attitude is not finite,
+        the sun is not a direction, `size` lies outside (0, 1], `ambient` is negative, or no light reaches the viewer.
 
     Examples
     --------
@@ -134,6 +150,7 @@ def render_mesh(
     >>> round(float(image.sum()))  # half of 8 x 8 pixels
     32
     """
+    shape = rows_and_columns(shape)
     rotation, towards_sun = _check_view(attitude, sun)
     if not 0 < size <= 1:
         raise ValueError(f"size is {size}: it is a fraction of the field, above 0 and at most 1")

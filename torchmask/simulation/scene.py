@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchmask.io import extra, load_npz
-from torchmask.simulation.render import load_mesh, render_mesh
+from torchmask.simulation.render import load_mesh, render_mesh, rows_and_columns
 from torchmask.simulation.satellite import satellite_mesh
 
 IMAGE_SUFFIXES = (".npz", ".png", ".fits")
@@ -52,7 +52,7 @@ class SceneOptions:
 
 
 def make_scene(
-    shape: tuple[int, int],
+    shape: int | tuple[int, int],
     n_photons: float,
     options: SceneOptions | None = None,
     *,
@@ -63,8 +63,8 @@ def make_scene(
 
     Parameters
     ----------
-    shape : (int, int)
-        Rows and columns of the field (`grid.shape`).
+    shape : int or (int, int)
+        Rows and columns of the field (`grid.shape`); one number means a square.
     n_photons : float
         Sum of the scene [electrons per frame], including light that blur will carry out of the field.
     options : SceneOptions, optional
@@ -82,9 +82,9 @@ def make_scene(
     Raises
     ------
     ValueError
-        If `n_photons` is not finite and positive; the file is missing, damaged or of an unknown kind; the target is
-        empty, negative or not finite; no light reaches the viewer; or `sun`, or a rotation out of its plane, is given
-        for an image.
+        If `shape` is not one or two whole numbers of at least 1; `n_photons` is not finite and positive; the file is
+        missing, damaged or of an unknown kind; the target is empty, negative or not finite; no light reaches the
+        viewer; or `sun`, or a rotation out of its plane, is given for an image.
 
     Examples
     --------
@@ -92,7 +92,7 @@ def make_scene(
     >>> round(float(scene.sum())), bool(scene.min() == 0)
     (10000000, True)
     """
-    options = options or SceneOptions()
+    options, shape = options or SceneOptions(), rows_and_columns(shape)
     if not (math.isfinite(n_photons) and n_photons > 0):
         raise ValueError(f"n_photons is {n_photons}: it must be finite and positive, electrons per frame")
     if options.path is not None and Path(options.path).suffix.lower() in IMAGE_SUFFIXES:
