@@ -368,6 +368,22 @@ def test_a_prior_that_is_none_is_refused_before_the_descent(prior, words, five_h
     assert records == []
 
 
+@pytest.mark.parametrize(
+    ("given", "error", "said"),
+    [
+        ({"pixel": 0.9}, TypeError, r"pixel is 0\.9: a response such as SquarePixel"),
+        ({"minimizer": torch.optim.Adam}, TypeError, r"minimizer is Adam: an instance is needed, .* TorchMinimizer"),
+        ({"minimizer": 3}, TypeError, "minimizer is 3"),
+        ({"schedule": 3}, TypeError, "schedule is of type int: it must be of type Schedule"),
+        ({"dtype": "float32"}, ValueError, "dtype is 'float32': take torch.float32"),
+        ({"wavelengths": 550e-9}, TypeError, r"wavelengths is 5\.5e-07: a sequence is needed, such as \[5\.5e-07\]"),
+    ],
+)
+def test_settings_of_another_type_are_named(given, error, said, five_holes):
+    with pytest.raises(error, match=said):
+        MyopicDeconvolution(five_holes, Grid.nyquist(1.0, 550e-9, 32), 3, **given)
+
+
 @pytest.mark.parametrize(("seed", "error"), [(1.5, ValueError), (-1, ValueError), ("a", TypeError), (None, TypeError)])
 def test_seeds_that_are_none_are_refused_before_the_descent(seed, error, observation):
     records = []

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from torchmask.optics.fourier import transform_images
 from torchmask.optics.inputs import require_tensor
-from torchmask.optics.pixel import PixelResponse
+from torchmask.optics.pixel import PixelResponse, require_response
 
 NOISES = ("poisson", "gaussian")
 
@@ -133,8 +133,7 @@ class Detector(nn.Module):
             raise ValueError(f"readout_noise is {readout_noise}: it must be finite and not negative, in electrons rms")
         if noise not in NOISES:
             raise ValueError(f"noise is {noise!r}: it must be one of {', '.join(NOISES)}")
-        if pixel is not None and not callable(getattr(pixel, "transfer", None)):
-            raise TypeError(f"pixel is {pixel!r}: a response such as SquarePixel(0.9) is needed, or None for points")
+        require_response(pixel)
         self.readout_noise: float = float(readout_noise)
         self.noise: str = noise
         self.pixel: PixelResponse | None = pixel

@@ -19,6 +19,12 @@ class PixelResponse(Protocol):
         ...
 
 
+def require_response(pixel: PixelResponse | None) -> None:
+    """Raise TypeError unless a pixel is a response, or None."""
+    if pixel is not None and not callable(getattr(pixel, "transfer", None)):
+        raise TypeError(f"pixel is {pixel!r}: a response such as SquarePixel(0.9) is needed, or None for points")
+
+
 @dataclass(frozen=True)
 class SquarePixel:
     """Pixels that are uniformly sensitive within a square, whose transfer function is a product of two sincs.

@@ -145,7 +145,7 @@ class MyopicDeconvolution:
         dtype: torch.dtype = torch.float32,
         device: torch.device | str | None = None,
     ) -> None:
-        check_given(aperture, grid, readout_noise, tolerance, aberration_prior)
+        check_given(aperture, grid, readout_noise, tolerance, aberration_prior, schedule, minimizer)
         if wavelengths is None and weights is not None:
             raise ValueError("weights are given without wavelengths: give both")
         self.many_minima, self.known_r0 = aperture.n_subapertures == 1, r0 is not None

@@ -13,7 +13,7 @@ from torchmask.grid import Grid
 from torchmask.numbers import whole_number
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.band import Band
-from torchmask.optics.pixel import PixelResponse
+from torchmask.optics.pixel import PixelResponse, require_response
 from torchmask.optics.pupil import sample_holes
 from torchmask.restoration.aberrations import (
     AberrationBasis,
@@ -71,8 +71,9 @@ class ModelRecipe:
         shape = tuple(self.aperture.centers.shape)
         if len(shape) != 2:
             raise ValueError(f"centers has shape {shape}: one mask (n_subapertures, 2) is needed")
-        if self.dtype in (torch.float16, torch.bfloat16):  # FFTs do not know them, and frames would overflow
-            raise ValueError(f"dtype is {self.dtype}: take torch.float32 or torch.float64")
+        if self.dtype not in (torch.float32, torch.float64):  # FFTs know no half, in which frames would overflow
+            raise ValueError(f"dtype is {self.dtype!r}: take torch.float32 or torch.float64")
+        require_response(self.pixel)
         for name, value in (("r0", self.r0), ("outer_scale", self.outer_scale)):
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{name} is {value}: it must be finite and positive, in m")

@@ -10,6 +10,7 @@ from torchmask.grid import Grid
 from torchmask.numbers import whole_number
 from torchmask.optics.aperture import Aperture, SparseAperture
 from torchmask.restoration.objective import Free
+from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.schedule import Schedule
 
 
@@ -123,16 +124,28 @@ class Traits:
 
 
 def check_given(
-    aperture: Aperture, grid: Grid, readout_noise: float | None, tolerance: float, aberration_prior: bool
+    aperture: Aperture,
+    grid: Grid,
+    readout_noise: float | None,
+    tolerance: float,
+    aberration_prior: bool,
+    schedule: Schedule | None,
+    minimizer: Minimizer | None,
 ) -> None:
     """Check what a method is given. `readout_noise` is in electrons rms.
 
-    Raises TypeError for an aperture, a grid or a switch of another type, and ValueError for a read-out noise or a
-    tolerance out of range.
+    Raises TypeError for an aperture, a grid, a schedule, a minimiser or a switch of another type, and ValueError for a
+    read-out noise or a tolerance out of range.
     """
-    for name, value, kind in (("aperture", aperture, Aperture), ("grid", grid, Grid)):
-        if not isinstance(value, kind):
+    for name, value, kind in (("aperture", aperture, Aperture), ("grid", grid, Grid), ("schedule", schedule, Schedule)):
+        if not isinstance(value, kind) and (value is not None or name != "schedule"):
             raise TypeError(f"{name} is of type {type(value).__name__}: it must be of type {kind.__name__}")
+    if isinstance(minimizer, type) or not (minimizer is None or callable(minimizer)):
+        given = minimizer.__name__ if isinstance(minimizer, type) else repr(minimizer)
+        raise TypeError(
+            f"minimizer is {given}: an instance is needed, such as ProjectedLBFGS(), or, for an optimiser of PyTorch, "
+            "TorchMinimizer(partial(torch.optim.Adam, lr=0.1))"
+        )
     if not isinstance(aberration_prior, bool):
         raise TypeError(f"aberration_prior is {aberration_prior!r}: it must be True or False")
     if readout_noise is not None and not (math.isfinite(readout_noise) and readout_noise >= 0):
