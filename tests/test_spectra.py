@@ -66,6 +66,8 @@ def test_numbers_out_of_range_are_refused(bad: float) -> None:
         PowerLawPSD(1.5, bad)
     with pytest.raises(ValueError, match="knee"):
         PowerLawPSD(1.5, 1.0, knee=bad)
+    with pytest.raises(ValueError, match=r"knee is 3\.0: .* at most 0\.5, in cycles/pixel; .* 64 pixels it is 1/64"):
+        PowerLawPSD(1.5, 1.0, knee=3.0)
     with pytest.raises(ValueError, match="n_photons"):
         NoisePSD(bad)
     if bad != 0:

@@ -16,6 +16,8 @@ from torchmask.numbers import require, whole_number
 PSD = Tensor | Callable[..., Tensor]
 """A tensor that broadcasts to (H, W) in FFT order, or a callable psd(grid, dtype, device) that returns one."""
 
+NYQUIST = 0.5  # largest frequency that pixels show along either axis [cycles/pixel]
+
 
 @dataclass(frozen=True)
 class PowerLawPSD:
@@ -28,7 +30,7 @@ class PowerLawPSD:
     n_photons : float
         Number of photons in the whole image. S_o(0) = n_photons^2 on any grid.
     knee : float
-        Frequency below which the PSD is flat, one over the size of the object [cycles/pixel].
+        Frequency below which the PSD is flat, one over the size of the object [cycles/pixel], at most 0.5.
 
     Raises
     ------
@@ -51,7 +53,7 @@ class PowerLawPSD:
     def __post_init__(self) -> None:
         require("exponent", self.exponent, ", a pure number", zero=True)
         require("n_photons", self.n_photons, ", in photons per image")
-        require("knee", self.knee, ", in cycles/pixel")
+        require("knee", self.knee, ", in cycles/pixel; of an object of 64 pixels it is 1/64", most=NYQUIST)
 
     def __call__(
         self, grid: Grid, dtype: torch.dtype | None = torch.float64, device: torch.device | str | None = None

@@ -17,7 +17,7 @@ def golay():
 def recorded():
     return Instrument(
         telescope=Telescope(diameter=1.2, central_obstruction=0.2, throughput=0.5),
-        source=Source(magnitude=2.0, size=3.0, exponent=2.0, temperature=3000.0),
+        source=Source(magnitude=2.0, size=0.5, exponent=2.0, temperature=3000.0),
         site=Site(r0=0.3, wind=5.0, sky=4.0, outer_scale=30.0),
         camera=Camera(n_pixels=24, readout_noise=2.5, pixel_fill=0.9),
         wavelength=700e-9,

@@ -203,7 +203,7 @@ def test_a_mask_is_designed_for_the_instrument(folder, recorded):
     assert float(mask.centers.norm(dim=-1).min()) >= (0.2 + mask.subaperture_diameter) / 2 - 1e-9
     config = yaml.safe_load((folder / "run/config.yaml").read_text())
     assert (config["n_frames"], config["readout_noise"], config["r0"], config["exponent"]) == (9, 2.5, 0.3, 2.0)
-    assert config["knee"] == pytest.approx(recorded.pixel_scale / (3.0 * ARCSEC))
+    assert config["knee"] == pytest.approx(recorded.pixel_scale / (0.5 * ARCSEC))
     metrics = json.loads((folder / "run/metrics.json").read_text())
     photons = recorded.photons(math.pi / 4 * 0.1 * 1.2**2)
     # of any criterion the error is at most 1, and its scale is the object's power, photons^2 times the mean spectrum

@@ -14,7 +14,7 @@ from torchmask.optics.aperture import FullAperture, SparseAperture
 
 pytestmark = pytest.mark.usefixtures("coarse_figures")
 
-BLOCKED = SparseAperture([[-0.3, 0.0], [0.9, 0.0], [0.1, 0.2], [0.0, -0.4]], 0.1, 1.0)
+BLOCKED = SparseAperture([[-0.3, 0.0], [0.66, 0.0], [0.1, 0.2], [0.0, -0.4]], 0.1, 1.2)
 OPEN = SparseAperture([[0.0, 0.35], [0.3, 0.2]], 0.1, 1.0)
 
 
@@ -32,7 +32,7 @@ def test_holes_are_named_with_what_is_in_their_way_and_by_how_much(files):
     (said,) = (str(warning.message) for warning in caught)
     assert (
         "blocked.json lie in the open pupil: hole 0 reaches 0.05 m into the central obstruction of 0.6 m, hole 1 "
-        "reaches 0.45 m beyond the rim of the pupil of 1 m, hole 2 reaches 0.126 m into the central obstruction of "
+        "reaches 0.21 m beyond the rim of the pupil of 1 m, hole 2 reaches 0.126 m into the central obstruction of "
         "0.6 m, hole 3 reaches 0.07 m into a vane (counted from 0)"
     ) in said
     with pytest.warns(UserWarning, match=r"hole 0 reaches 0\.1 m beyond the rim of the pupil of 0\.6 m"):
@@ -50,7 +50,7 @@ def test_nothing_is_said_of_holes_in_the_open_of_full_pupils_and_of_real_masks_o
 
 def test_a_plan_warns_of_them(files, recorded):
     options = dataclasses.replace(plan.Options.of_instrument(recorded), mask=files / "blocked.json")
-    with pytest.warns(UserWarning, match=r"hole 1 reaches 0\.35 m beyond the rim of the pupil of 1\.2 m"):
+    with pytest.warns(UserWarning, match=r"hole 1 reaches 0\.11 m beyond the rim of the pupil of 1\.2 m"):
         plan.existing_mask(options)
 
 
@@ -60,6 +60,6 @@ def test_a_simulation_warns_of_them(files, capsys):
     assert main(["simulate", *words, "--mask", str(files / "blocked.json"), "--out", str(files / "run")]) == 0
     said = capsys.readouterr().err
     assert "torchmask simulate: warning: not all holes of --mask" in said
-    assert "hole 1 reaches 0.45 m beyond the rim of the pupil of 1 m (counted from 0)" in said
+    assert "hole 1 reaches 0.11 m beyond the rim of the pupil of 1.2 m (counted from 0)" in said
     assert main(["simulate", *words, "--mask", str(files / "open.json"), "--out", str(files / "other")]) == 0
     assert "warning" not in capsys.readouterr().err

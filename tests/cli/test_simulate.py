@@ -1,5 +1,6 @@
 """`torchmask simulate` with all that a telescope adds, in the units of its options, and what it refuses."""
 
+import dataclasses
 import math
 import re
 
@@ -8,11 +9,12 @@ import torch
 
 from torchmask.atmosphere.profiles import named_layers
 from torchmask.cli.main import main
-from torchmask.cli.simulate import Options, TurbulenceOptions
+from torchmask.cli.simulate import ConditionOptions, Options, TurbulenceOptions
 from torchmask.design.manufacture import save_json
 from torchmask.grid import ARCSEC
 from torchmask.observation import Observation
 from torchmask.optics.aperture import SparseAperture
+from torchmask.tracking import RunLogger
 
 pytestmark = pytest.mark.usefixtures("coarse_figures")
 
@@ -82,6 +84,8 @@ def test_options_are_the_turbulence_that_they_name():
         (["--scene.path", "none.png"], "none.png"),
         (["--pixel-fill", "1.5"], r"--pixel-fill is 1\.5"),
         (["--jitter", "-1"], r"--jitter is -1\.0"),
+        (["--jitter", "9"], r"--jitter is 9\.0: .* at most 8, in pixels, which is half the field"),
+        (["--turbulence.wind", "800", "0"], r"--turbulence\.wind is 800\.0: .* the nearest possible is 200 m/s"),
         (["--true-mask.magnification", "0"], "--true-mask.magnification is"),
     ],
 )
@@ -130,6 +134,36 @@ def test_a_filter_gives_the_band_and_without_a_wavelength_its_mean(tmp_path):
     assert main([*MASK, *SMALL, *even, "--out", str(tmp_path / "by_width")]) == 0
     assert stack.grid.wavelength == pytest.approx(550e-9, rel=1e-12)
     torch.testing.assert_close(stack.frames, Observation.load(tmp_path / "by_width/stack.npz").frames)
+
+
+@pytest.mark.parametrize("band", [{"band_width": 600e-9}, {"filter": "bessell-V", "n_wavelengths": 2}])
+def test_few_wavelengths_of_a_band_are_warned_of(band):
+    with pytest.warns(UserWarning, match="n_wavelengths is .* for a band .* wavelengths do"):
+        ConditionOptions(**band).make(0.0, 550e-9)
+
+
+def test_the_figure_without_turbulence_is_of_the_same_light_and_pixels(tmp_path, monkeypatch):
+    drawn = {}
+
+    def keep(self, name, figure):
+        drawn[name] = {line.get_label(): line.get_ydata() for line in figure.axes[-2].lines} if "mtf" in name else {}
+
+    monkeypatch.setattr(RunLogger, "figure", keep)
+    broad = ["--conditions.band-width", "2e-7", "--conditions.n-wavelengths", "4", "--r0", "inf", "--pixel-fill", "0.9"]
+    turned = ["--true-mask.rotation-deg", "20"]
+    assert main([*MASK, *SMALL, "--n-pixels", "64", *broad, *turned, "--out", str(tmp_path / "run")]) == 0
+    still, exposed = (drawn["observation/mtf"][name][1:] for name in ("no turbulence", "exposures"))
+    assert exposed == pytest.approx(still, abs=0.01)  # but at 0, which light outside the field lacks
+
+
+def test_the_scene_has_the_size_of_the_instruments_target(recorded):
+    for size, share in ((0.5, 0.5 * ARCSEC / recorded.field_of_view), (None, 0.7)):
+        known = dataclasses.replace(recorded, source=dataclasses.replace(recorded.source, size=size))
+        assert Options.of_instrument(known).scene.size == pytest.approx(share, rel=1e-12)
+    for size in (30.0, 3e-6):  # neither fits
+        with pytest.warns(UserWarning, match="source.size"):
+            known = dataclasses.replace(recorded, source=dataclasses.replace(recorded.source, size=size))
+        assert Options.of_instrument(known).scene.size == 0.7
 
 
 @pytest.mark.parametrize(

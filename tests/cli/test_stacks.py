@@ -114,12 +114,32 @@ def test_what_is_no_stack_is_refused_by_what_it_is(write_fits, fits_cube, tmp_pa
     np.savez(stack, frames=fits_cube)
     np.save(array, fits_cube)
     for files, message in (
+        ([tmp_path / "none.fits"], r"there is no file .*none\.fits \(needed: a stack of exposures"),
         ([array], r"c\.npy is a bare array: write it as `frames` \[electrons\] to an \.npz file"),
         ([tmp_path], r"is a folder: give the FITS files in it, such as .*\*\.fits"),
         ([cube, stack], r"--join is for FITS files, but .*b\.npz is a stack by itself"),
     ):
         with pytest.raises(ValueError, match=message):
             read_stack(files, StackOptions(**FULL))
+
+
+def test_a_path_without_frames_is_refused_before_a_mask_is_asked_for(write_fits, fits_cube, tmp_path):
+    save_json(tmp_path / "mask.json", SparseAperture.from_catalog("golay6", 1.0, 0.15))
+    design, simulated = tmp_path / "design", tmp_path / "simulated"
+    for run in (design, simulated):
+        run.mkdir()
+        (run / "config.yaml").touch()
+    (design / "mask.fits").touch()
+    (simulated / "stack.npz").touch()
+    for path, message in (
+        (tmp_path / "none.fits", r"there is no file .*none\.fits"),
+        (tmp_path / "mask.json", r"mask\.json is not a stack of frames: give an \.npz or FITS file"),
+        (simulated, r"simulated is a folder: give the stack in it, .*stack\.npz"),
+        (design, r"design is a folder: it holds no stack of frames, so give an \.npz file"),
+        (write_fits("a.fits", fits_cube), "--mask is missing"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            read_stack([path], StackOptions())
 
 
 def test_a_pixel_scale_of_the_file_that_undersamples_is_blamed_on_the_file(write_fits, fits_cube):

@@ -149,7 +149,7 @@ def test_conditions_that_cannot_be_are_refused_before_any_work(tmp_path):
 def test_an_instrument_gives_all_but_the_axes(tmp_path, monkeypatch):
     known = Instrument(
         telescope=Telescope(diameter=1.2, central_obstruction=0.2),
-        source=Source(magnitude=2.0, size=3.0),
+        source=Source(magnitude=2.0, size=0.5),
         site=Site(r0=0.3, wind=5.0, sky=4.0, outer_scale=30.0),
         camera=Camera(n_pixels=24, readout_noise=2.5, pixel_fill=0.9, pixel_scale=0.04),
         wavelength=700e-9,

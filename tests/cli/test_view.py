@@ -158,6 +158,21 @@ def test_a_run_is_its_last_values_and_its_result(tmp_path, capsys):
     assert is_picture(tmp_path / "run.png")
 
 
+def test_a_run_whose_result_is_a_table_shows_that(tmp_path, capsys):
+    with RunLogger(tmp_path / "rank") as logger:
+        logger(Record("ranking", 1, 1, {"relative_mse": 0.5}, {}))
+    (tmp_path / "table").mkdir()
+    for folder in ("rank", "table"):  # `torchmask table` keeps no log
+        (tmp_path / folder / "found.md").write_text("| N |\n|---|\n| 6 |\n")
+        (tmp_path / folder / "found.json").write_text("{}")
+    shown = f"{tmp_path / 'table' / 'found.md'}:\n| N |\n|---|\n| 6 |\n"
+    assert said(capsys, "view", tmp_path / "table") == shown
+    text = said(capsys, "view", tmp_path / "rank")
+    assert "ranking 1/1: relative_mse 0.5\n" in text
+    assert text.endswith(shown.replace("table", "rank"))
+    assert "no results" not in text
+
+
 def test_arrays_without_a_figure_are_listed(tmp_path, capsys):
     save_npz(tmp_path / "x.npz", {"weights": np.zeros((3, 2)), "step": 7})
     text = said(capsys, "view", tmp_path / "x.npz", "--out", tmp_path / "x.png")

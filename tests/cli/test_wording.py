@@ -89,6 +89,7 @@ class Options:
             {"keep_out": ((0.0, 0.0, 0.1),)},
             "no room beside --keep-out 0.0 0.0 0.1, a --keep-out diameter of 0.05 m",
         ),
+        ("spiders is bad: for a round zone use KeepOutDisc", {}, "spiders is bad: for a round zone use --keep-out"),
         ("a.fits: refine is not positive at 1 pixel", {}, "a.fits: refine is not positive at 1 pixel"),
         ("there is no file /tmp/1/sky: give files", {"seed": 1}, "there is no file /tmp/1/sky: give files"),
         ("no fill_factor.npz in a/n_pixels/b", {}, "no fill_factor.npz in a/n_pixels/b"),

@@ -103,6 +103,15 @@ def test_the_target_is_flat_below_the_inverse_of_its_size():
     assert make().object_psd(0.2).knee == 1 / 64
 
 
+@pytest.mark.parametrize(
+    ("size", "said"), [(30.0, "30 arcsec, which is more than the field, 2.68 "), (3e-6, "less than a pixel, 0.0279 ")]
+)
+def test_a_target_that_the_frames_cannot_show_is_warned_of(size, said):
+    with pytest.warns(UserWarning, match=f"source.size is .*{said}"):
+        known = make(source=Source(magnitude=5.0, size=size), wavelength=550e-9, width=20e-9)
+    assert known.knee == min(0.5, known.pixel_scale / (size * ARCSEC))
+
+
 def test_pixels_are_fine_enough_for_the_shortest_wavelength():
     known = make(filter="bessell-V", wavelength=None, width=None)
     assert known.pixel_scale == pytest.approx(Band.from_filter("bessell-V").shortest / (2 * 2.0))
@@ -234,8 +243,8 @@ def test_the_number_of_wavelengths_that_does_tells_errors_to_four_percent(width)
         (Telescope, {"diameter": 1.0, "vane_width": 0.1, "vane_angles": (0.0, 5.0)}, "vanes 5 degrees apart"),
         (Source, {}, "and not both"),
         (Source, {"magnitude": 1.0, "photon_rate": 1.0}, "and not both"),
-        (Source, {"magnitude": math.nan}, r"magnitude is nan: .* from -30 to 40 .*sees.$"),
-        (Source, {"magnitude": -3e5}, r"magnitude is -300000.0: .* the nearest possible is -30$"),
+        (Source, {"magnitude": math.nan}, r"magnitude is nan: .* from -27 to 40 .*sees.$"),
+        (Source, {"magnitude": -3e5}, r"magnitude is -300000.0: .* the nearest possible is -27$"),
         (Source, {"magnitude": 3e5}, r"magnitude is 300000.0: .* the nearest possible is 40$"),
         (Source, {"photon_rate": 1e300}, r"source.photon_rate is 1e\+300: .* at most 1e\+22"),
         (Source, {"magnitude": 1.0, "system": "vega"}, "source.system is 'vega': known systems are AB and Vega"),

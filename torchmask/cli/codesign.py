@@ -38,7 +38,7 @@ from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.verdict import Verdict
 from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
-from torchmask.spectra import NoisePSD, PowerLawPSD
+from torchmask.spectra import NYQUIST, NoisePSD, PowerLawPSD
 from torchmask.viz.comparison import comparison_figure
 
 LABELS = {"mask": "mask", "full": "full pupil"}  # in figures; in this order, so that each has one colour everywhere
@@ -178,7 +178,7 @@ def design_mask(options: Options, callback: Callback) -> SearchResult:
 def scene_knee(options: Options) -> float:
     """Return --design.knee, or else one over the larger side of the scene [cycles/pixel]."""
     knee = options.design.knee
-    return 1 / (options.scene.size * options.imaging.n_pixels) if knee is None else knee
+    return min(NYQUIST, 1 / (options.scene.size * options.imaging.n_pixels)) if knee is None else knee
 
 
 def observe(options: Options, scene: torch.Tensor, aperture: Aperture, callback: Callback) -> Observation:

@@ -14,7 +14,9 @@ from torchmask.design.search import SearchResult
 from torchmask.grid import Grid
 from torchmask.io import as_array
 from torchmask.observation import Observation
-from torchmask.optics.psf import PSF
+from torchmask.optics.band import Band
+from torchmask.optics.psf import fold
+from torchmask.simulation.exposed_psf import ExposedPSF
 from torchmask.tracking import RunLogger
 from torchmask.viz import figures as viz
 from torchmask.viz import style as drawing
@@ -62,12 +64,13 @@ def draw_zones(figure: Figure, constraints: Sequence[Constraint], scale: float) 
             figure.axes[0].add_patch(Polygon(np.array(corners), **style))
 
 
-def log_observation(name: str, observation: Observation, logger: RunLogger) -> None:
-    """Draw PSFs with and without turbulence, their MTFs, and frames."""
+def log_observation(name: str, observation: Observation, logger: RunLogger, band: Band | None = None) -> None:
+    """Draw PSFs in light of a band with and without turbulence, their MTFs, and frames."""
     assert observation.psfs is not None
     grid = observation.grid
     psfs = torch.fft.ifftshift(observation.psfs, dim=(-2, -1))
-    still = PSF(observation.aperture, grid, oversampling=4)().to(psfs)
+    optics = ExposedPSF(observation.true_aperture or observation.aperture, grid, band, observation.pixel)
+    still = fold(optics([None]), grid.shape).to(psfs)
     otfs = {"no turbulence": torch.fft.fft2(still), "exposures": torch.fft.fft2(psfs)}
     logger.figure(f"{name}/psf", viz.psf_figure({"no turbulence": still, "first exposure": psfs[0]}, grid))
     logger.figure(f"{name}/mtf", viz.mtf_figure(otfs, grid))

@@ -24,11 +24,12 @@ from torchmask.cli.options import (
 )
 from torchmask.cli.report import log_observation
 from torchmask.cli.run import new_run
+from torchmask.cli.stacks import STACK
 from torchmask.grid import ARCSEC, Grid
 from torchmask.instrument.instrument import Instrument
-from torchmask.numbers import require_r0
+from torchmask.numbers import require, require_r0, require_within
 from torchmask.optics.aperture import SparseAperture
-from torchmask.optics.band import Band
+from torchmask.optics.band import Band, warn_of_few_wavelengths
 from torchmask.optics.detector import Detector
 from torchmask.optics.geometry import MaskGeometry
 from torchmask.optics.passband import Passband
@@ -59,6 +60,9 @@ class TurbulenceOptions:
 
     def make(self, r0: float | None, wavelength: float, outer_scale: float) -> Turbulence:
         """Return the turbulence with Fried parameter `r0` [m], of which the option tells what None and inf mean."""
+        if self.wind is not None:
+            speed = math.hypot(*self.wind)
+            require_within("--turbulence.wind", speed, 0.0, 200.0, " m/s", "calm air to the fastest jet streams")
         if r0 == math.inf:
             return None
         require_r0("--r0", r0)
@@ -105,15 +109,16 @@ class ConditionOptions(FilterOptions):
                 "--conditions.temperature is that of light in a band: give --conditions.filter or "
                 "--conditions.band-width, or leave it out"
             )
-        even = None
-        if self.band_width:
-            passband = Passband.top_hat(wavelength, self.band_width)
-            even = Band.from_filter(passband, self.n_wavelengths, self.temperature)
+        band = self.filter_band(wavelength)
+        if self.band_width or self.filter:
+            passband = Passband.find(self.filter) if self.filter else Passband.top_hat(wavelength, self.band_width)
+            band = Band.from_filter(passband, self.n_wavelengths, self.temperature)
+            warn_of_few_wavelengths(passband, self.n_wavelengths, self.temperature)
         return Conditions(
             sky=sky if self.sky is None else self.sky,
             transparency_scatter=self.transparency_scatter,
             exposure_time=exposure_time,
-            band=even or self.filter_band(wavelength),
+            band=band,
         )
 
 
@@ -152,7 +157,7 @@ class Options(InstrumentOptions, MaskOptions, RunOptions):
     """
 
     scene: SceneOptions = field(default_factory=SceneOptions)
-    """The target."""
+    """The target; --instrument tells its size, source.size over the field of the camera, if that is possible."""
     wavelength: float | None = None
     """Wavelength of the observation [m]; None: the mean of the filter, or else that of the mask's .json file."""
     n_pixels: int = 128
@@ -187,6 +192,7 @@ class Options(InstrumentOptions, MaskOptions, RunOptions):
     def of_instrument(cls, known: Instrument) -> Options:
         """Return the options that an instrument sets; its light depends on the mask."""
         return cls(
+            scene=scene_of(known),
             wavelength=known.mean_wavelength,
             n_pixels=known.camera.n_pixels,
             pixel_scale_arcsec=known.pixel_scale / ARCSEC,
@@ -203,6 +209,12 @@ class Options(InstrumentOptions, MaskOptions, RunOptions):
             readout_noise=known.camera.readout_noise,
             pixel_fill=known.camera.pixel_fill,
         )
+
+
+def scene_of(known: Instrument) -> SceneOptions:
+    """Return a scene of the size of the instrument's target, if that is told, a pixel or more, and fits the field."""
+    share = 0.0 if known.source.size is None else known.source.size * ARCSEC / known.field_of_view
+    return SceneOptions(size=share) if 1 / known.camera.n_pixels <= share <= 1 else SceneOptions()
 
 
 def observing_wavelength(options: Options) -> float:
@@ -258,6 +270,7 @@ def run(options: Options) -> None:
         grid = Grid(options.n_pixels, finest.pixel_scale, wavelength)
     else:
         grid = Grid(options.n_pixels, pixel_scale, wavelength)
+    require("--jitter", options.jitter, ", in pixels, which is half the field", zero=True, most=min(grid.shape) / 2)
     detector = Detector(options.readout_noise, pixel=jittered(square_pixel(options.pixel_fill), options.jitter))
     scene = make_scene(grid.shape, n_photons, options.scene)
     used = None if known is None else used_instrument(known, float(told.area), options)
@@ -271,8 +284,8 @@ def run(options: Options) -> None:
             allow_overlap=options.allow_overlap,
             callback=output.callback,
         )
-        observation.save(output.directory / "stack.npz")
-        log_observation("observation", observation, output.logger)
+        observation.save(output.directory / STACK)
+        log_observation("observation", observation, output.logger, conditions.band)
         if isinstance(turbulence, LayeredPhase):
             output.summary.append(turbulence.layers.describe(wavelength))
         assert observation.transmission is not None

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from torchmask.cli.agreement import complete, planned_scale, require_time
+from torchmask.cli.config import CONFIG
 from torchmask.cli.options import (
     InstrumentOptions,
     MaskOptions,
@@ -29,6 +30,8 @@ from torchmask.numbers import require_wavelength
 from torchmask.observation import Observation, check_frames
 from torchmask.optics.pixel import jittered, square_pixel
 from torchmask.restoration.noise import check_errors
+
+STACK = "stack.npz"  # its name in the folder of a run
 
 
 @dataclass(frozen=True)
@@ -100,6 +103,8 @@ def read_stack(files: Sequence[Path], options: StackOptions) -> Observation:
     if options.wavelength is not None:
         require_wavelength("--wavelength", options.wavelength)
     pixel = None if options.pixel_fill is None else square_pixel(options.pixel_fill)
+    for path in files:
+        _require_stack(path)
     known = options.known_instrument()
     observation = _read(files, options, known)
     if options.pixel_fill is not None:
@@ -120,6 +125,25 @@ def read_stack(files: Sequence[Path], options: StackOptions) -> Observation:
     except ValueError as error:
         raise ValueError(f"{files[0]}: {error}; or give --no-errors to weight all pixels equally") from error
     return observation
+
+
+def _require_stack(path: Path) -> None:
+    """Raise ValueError unless this is a file that may hold frames; the message says where a folder has them."""
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder: {_frames_in(path)}")
+    if not path.is_file():
+        raise ValueError(f"there is no file {path} (needed: a stack of exposures, .npz or .fits)")
+    if path.suffix.lower() in (".json", ".dxf"):
+        raise ValueError(f"{path} is not a stack of frames: give an .npz or FITS file (a mask belongs to --mask)")
+
+
+def _frames_in(folder: Path) -> str:
+    """Return what of a folder to give; FITS files of a run are its results."""
+    if (folder / STACK).is_file():
+        return f"give the stack in it, {folder / STACK}"
+    if any(folder.glob("*.fits")) and not (folder / CONFIG).is_file():
+        return f"give the FITS files in it, such as {folder / '*.fits'}"
+    return "it holds no stack of frames, so give an .npz file of `torchmask simulate`, or FITS files"
 
 
 def _given(options: StackOptions) -> set[str]:

@@ -23,6 +23,7 @@ from torchmask.observation import Observation
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.sky import pixel_matrix
 from torchmask.restoration.result import RestorationResult
+from torchmask.spectra import NYQUIST
 from torchmask.tracking import read_metrics
 from torchmask.viz import figures as viz
 from torchmask.viz.comparison import comparison_figure
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _RESULTS = ("restored.npz", "result.npz", "stack.npz", "mask.json")  # of a run, of which the first that exists is shown
-_NYQUIST = 0.5  # cycles/pixel, the cut-off of a codesign run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,11 +179,24 @@ def _codesign_view(stored: dict[str, Any]) -> View:
     names = ("mask", "full")
     pictures = {name: (stored[f"{name}_frames"][0], stored[f"{name}_object"]) for name in names}
     text = f"relative MSE of the mask {stored['relative_mse']:.5g}"
-    return View(text, {"": comparison_figure(stored["scene"], pictures, _NYQUIST)})
+    return View(text, {"": comparison_figure(stored["scene"], pictures, NYQUIST)})
 
 
 def _view_run(folder: Path) -> View:
-    """Describe how a run ended and the last values of each stage, and show its result or else its last checkpoint."""
+    """Describe a run by its log and its tables, and show its result or else its last checkpoint."""
+    tables = [path for path in sorted(folder.glob("*.md")) if path.with_suffix(".json").is_file()]
+    texts = [f"{path}:\n{path.read_text(encoding='utf-8').strip()}" for path in tables]
+    if tables and not (folder / "metrics.jsonl").is_file():  # of `torchmask table`, which has no log
+        return View("\n\n".join(texts), {})
+    log, there = _log(folder), _results(folder)
+    if not there:
+        return View("\n\n".join([log, *texts]) if texts else f"{log}\nit has no results yet", {})
+    result = view_path(there[0])
+    return View("\n\n".join([log, *texts, f"{there[0]}:\n{result.text}"]), result.figures)
+
+
+def _log(folder: Path) -> str:
+    """Return how a run ended, the last values of each stage, and the stacks that it restored, if several."""
     rows = read_metrics(folder)  # raises ValueError if this is not a run folder
     status = read_json(folder / "status.json")
     last: dict[str, dict[str, Any]] = {}
@@ -198,16 +211,22 @@ def _view_run(folder: Path) -> View:
         budget = f"/{row['n_steps']}" if "n_steps" in row else ""
         values = ", ".join(f"{name} {value:.5g}" for name, value in row["scalars"].items() if value is not None)
         lines.append(f"  {stage} {row['step']}{budget}: {values}")
-    there = [folder / name for name in _RESULTS if (folder / name).is_file()]
-    stacks = sorted(folder.glob("*/restored.npz"))  # of a run that restored several
-    if len(stacks) > 1:
+    if len(stacks := _restored(folder)) > 1:
         lines.append(f"{len(stacks)} stacks: {', '.join(str(path) for path in stacks)}")
-    there += stacks
-    there += sorted((folder / "checkpoints").glob("*.npz"), key=lambda path: path.stat().st_mtime, reverse=True)
-    if not there:
-        return View("\n".join([*lines, "it has no results yet"]), {})
-    result = view_path(there[0])
-    return View("\n".join([*lines, "", f"{there[0]}:", result.text]), result.figures)
+    return "\n".join(lines)
+
+
+def _restored(folder: Path) -> list[Path]:
+    """Return the results of a run that restored several stacks."""
+    return sorted(folder.glob("*/restored.npz"))
+
+
+def _results(folder: Path) -> list[Path]:
+    """Return the files of a run that can be shown: its results, then its checkpoints from the last one."""
+    results = [folder / name for name in _RESULTS if (folder / name).is_file()]
+    checkpoints = (folder / "checkpoints").glob("*.npz")
+    last_first = sorted(checkpoints, key=lambda path: path.stat().st_mtime, reverse=True)
+    return [*results, *_restored(folder), *last_first]
 
 
 def _names(path: Path, view: View) -> dict[str, Path]:

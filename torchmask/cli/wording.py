@@ -18,11 +18,16 @@ _ADVICE = re.compile(
     r"(?<=give )(?P<names>[a-z]\w*(?:(?:, or|, and|,| or| and) [a-z]\w*)*)\b"
     r"|(?<![-\w./'\"`])(?P<word>[a-z]\w*_\w+)\b(?![./(=])"
 )
-_RULE = re.compile(  # a constraint as it prints itself, and as advice calls it
+_RULE = re.compile(  # a constraint as it prints itself, as advice calls a length of it, and by its name alone
     r"(?P<kind>KeepOutSegment|KeepOutDisc|MinimumGap|RimMargin)"
-    r"(?:\((?P<numbers>(?:[^()]|\([^()]*\))*)\)| (?P<length>gap|margin|width|diameter)\b)"
+    r"(?:\((?P<numbers>(?:[^()]|\([^()]*\))*)\)| (?P<length>gap|margin|width|diameter)\b|\b)"
 )
-_FLAGS = {"KeepOutSegment": "--spiders", "MinimumGap": "--min-gap", "RimMargin": "--rim-margin"}
+_FLAGS = {
+    "KeepOutDisc": "--keep-out",
+    "KeepOutSegment": "--spiders",
+    "MinimumGap": "--min-gap",
+    "RimMargin": "--rim-margin",
+}
 _ANGLE = re.compile(r"[\d.e+-]+ rad \((?P<arcsec>[\d.e+-]+ arcsec)\)")  # options are in arcsec
 _NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*(?:e[-+]?\d+)?|nan|inf)\b")
 
@@ -114,6 +119,8 @@ def _advise(text: str, known: list[Option]) -> str:
 def _rule(found: re.Match[str], known: list[Option]) -> str:
     """Return a constraint as the options that make it, with its numbers in their order."""
     kind, numbers, length = found["kind"], _NUMBER.findall(found["numbers"] or ""), found["length"]
+    if not (numbers or length):
+        return _FLAGS[kind]
     if kind == "KeepOutDisc":  # the central obstruction, or one of the discs
         given = [option for option in known if option.name in ("central_obstruction", "keep_out") and option.is_given]
         if numbers:

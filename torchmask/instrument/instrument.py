@@ -17,7 +17,7 @@ from torchmask.io import extra, from_json, read_json, to_json, write_json
 from torchmask.numbers import THROUGH_AIR, require, require_wavelength, require_within, whole_number
 from torchmask.optics.band import MOST_WAVELENGTHS, Band, warn_of_few_wavelengths
 from torchmask.optics.passband import VEGA_IN_AB, Passband
-from torchmask.spectra import NoisePSD, PowerLawPSD
+from torchmask.spectra import NYQUIST, NoisePSD, PowerLawPSD
 
 _FORMAT = "torchmask instrument, version 1"
 
@@ -27,7 +27,8 @@ class Instrument:
     """Complete description of an observation, which determines photons, frames and noise for any mask on the telescope.
 
     Raises ValueError if a number is out of range, the band is given twice or not at all, or the observing time is
-    shorter than one frame; the message says what is possible. Warns if `n_wavelengths` is too small for the band.
+    shorter than one frame; the message says what is possible. Warns if `n_wavelengths` is too small for the band, or
+    the target for a pixel or too large for the field.
 
     Examples
     --------
@@ -87,6 +88,7 @@ class Instrument:
         object.__setattr__(self, "n_wavelengths", number)
         self._check_time()
         self._check_band()
+        self.source.warn_of_size(self.pixel_scale / ARCSEC, self.field_of_view / ARCSEC)
 
     def _check_time(self) -> None:
         if self.observing_time is not None and self.frames < 1:
@@ -162,6 +164,11 @@ class Instrument:
             return self.camera.pixel_scale * ARCSEC
         return Grid.nyquist(self.telescope.diameter, self.band.shortest, 2).pixel_scale
 
+    @property
+    def field_of_view(self) -> float:
+        """Angle on the sky of one side of the field [rad]."""
+        return self.camera.n_pixels * self.pixel_scale
+
     def grid(self, n_pixels: int | None = None) -> Grid:
         """Return the grid of the camera, or one of equal pixels with `n_pixels` a side, at the wavelength of r0."""
         return Grid(self.camera.n_pixels if n_pixels is None else n_pixels, self.pixel_scale, self.mean_wavelength)
@@ -209,9 +216,9 @@ class Instrument:
 
     @property
     def knee(self) -> float:
-        """The frequency below which the power spectrum of the target is flat [cycles/pixel]."""
+        """The frequency below which the power spectrum of the target is flat [cycles/pixel]: all if it is a point."""
         size = self.source.size
-        return PowerLawPSD.knee if size is None else self.pixel_scale / (size * ARCSEC)
+        return PowerLawPSD.knee if size is None else min(NYQUIST, self.pixel_scale / (size * ARCSEC))
 
     def object_psd(self, area: float) -> PowerLawPSD:
         """Return the power spectrum of the target."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -101,7 +102,7 @@ class Source:
         if self.system not in get_args(System):
             raise ValueError(f"source.system is {self.system!r}: known systems are {' and '.join(get_args(System))}")
         require_within(
-            *("source.magnitude", self.magnitude, -30.0, 40.0, ""),
+            *("source.magnitude", self.magnitude, -27.0, 40.0, ""),
             "brighter than the Sun to fainter than any telescope sees",
         )
         require(
@@ -110,6 +111,17 @@ class Source:
         require("source.temperature", self.temperature, ", in K")
         require("source.size", self.size, ", in arcsec")
         require("source.exponent", self.exponent, "", zero=True)
+
+    def warn_of_size(self, pixel: float, field: float) -> None:
+        """Warn of a target narrower than a pixel or wider than the field [arcsec], most often in another unit."""
+        if self.size is None or pixel <= self.size <= field:
+            return
+        shown = f"less than a pixel, {pixel:.3g}" if self.size < pixel else f"more than the field, {field:.3g}"
+        warnings.warn(
+            f"source.size is {self.size:g} arcsec, which is {shown} arcsec: give the diameter of the target in arcsec "
+            "(1e-6 rad are 0.206), or another camera.n_pixels or camera.pixel_scale",
+            stacklevel=1,  # one place in all, as `warn_of_few_wavelengths`
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
