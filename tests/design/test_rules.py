@@ -30,6 +30,11 @@ def test_a_zone_that_misses_the_mask_is_refused(rule, misses):
         DesignSpace(**rule)
 
 
+def test_a_bar_in_millimetres_from_the_centre_is_told():
+    with pytest.raises(ValueError, match=r"bar 0 0 600 0 30: it is wider than the mask, 1\.2 m; give it in m"):
+        MaskRules(spiders=((0.0, 0.0, 600.0, 0.0, 30.0),)).require_on_pupil(1.2)
+
+
 @pytest.mark.parametrize(
     ("given", "said"),
     [({"mask_diameter": 8200.0}, "8.2 m are 8.2"), ({"wavelength": 550e-6}, "from 1e-07 to 5e-05")],

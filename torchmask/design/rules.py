@@ -55,7 +55,8 @@ class MaskRules:
             raise ValueError(f"spiders has a bar whose {error}") from error
 
     def require_on_pupil(self, mask_diameter: float) -> None:
-        """Raise ValueError if a disc or bar lies wholly outside a mask of this diameter [m], where it forbids nothing.
+        """Raise ValueError if a disc or bar lies wholly outside a mask of this diameter [m], where it forbids nothing,
+        or a bar is wider than the mask.
 
         Such a rule is most often in millimetres.
         """
@@ -63,6 +64,8 @@ class MaskRules:
             _require_near(f"keep_out has a disc {x:g} {y:g} {diameter:g}", math.hypot(x, y), diameter, mask_diameter)
         for x, y, to_x, to_y, width in self.spiders:
             bar = f"spiders has a bar {x:g} {y:g} {to_x:g} {to_y:g} {width:g}"
+            if width >= mask_diameter:
+                raise ValueError(f"{bar}: it is wider than the mask, {mask_diameter:g} m; give it in m (300 mm are 0.3)")
             _require_near(bar, _distance_from_centre((x, y), (to_x, to_y)), width, mask_diameter)
 
 
