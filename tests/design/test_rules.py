@@ -31,7 +31,7 @@ def test_a_zone_that_misses_the_mask_is_refused(rule, misses):
 
 
 def test_a_bar_in_millimetres_from_the_centre_is_told():
-    with pytest.raises(ValueError, match=r"bar 0 0 600 0 30: it is wider than the mask, 1\.2 m; give it in m"):
+    with pytest.raises(ValueError, match=r"bar 0 0 600 0 30: wider than a mask of 1\.2 m; give it in m"):
         MaskRules(spiders=((0.0, 0.0, 600.0, 0.0, 30.0),)).require_on_pupil(1.2)
 
 

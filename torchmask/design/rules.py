@@ -65,7 +65,7 @@ class MaskRules:
         for x, y, to_x, to_y, width in self.spiders:
             bar = f"spiders has a bar {x:g} {y:g} {to_x:g} {to_y:g} {width:g}"
             if width >= mask_diameter:
-                raise ValueError(f"{bar}: it is wider than the mask, {mask_diameter:g} m; give it in m (300 mm are 0.3)")
+                raise ValueError(f"{bar}: wider than a mask of {mask_diameter:g} m; give it in m (30 mm are 0.03)")
             _require_near(bar, _distance_from_centre((x, y), (to_x, to_y)), width, mask_diameter)
 
 
