@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from numbers import Real
 
+WIDEST = 1000.0  # [m], diameter of a telescope
 THROUGH_AIR = 1e-7, 5e-5  # [m] of an observation, from the ultraviolet to beyond the last window of the infrared
 
 
@@ -72,7 +73,7 @@ def require_diameter(name: str, metres: float | None) -> None:
 thought of; in m, so 8.2 m are 8.2); the nearest possible is 1000 m
     """
     require_within(
-        *(name, metres, 1e-3, 1000.0, " m"),
+        *(name, metres, 1e-3, WIDEST, " m"),
         "a mask on a bench to the largest telescope thought of; in m, so 8.2 m are 8.2",
     )
 

@@ -1,4 +1,4 @@
-"""Refusal of values that say more than numbers: those with a unit, and those with some hidden behind a mask."""
+"""Refusal of values of another type, and of those that say more than numbers: with a unit, or some behind a mask."""
 
 from __future__ import annotations
 
@@ -37,3 +37,17 @@ def require_plain(name: str, values: Any) -> None:
             f"{name} hides {hidden} of {values.size} values behind a mask: give {name}.filled(0), with "
             f"valid=~{name}.mask for frames"
         )
+
+
+def require_type(name: str, value: Any, kind: type, example: str = "") -> None:
+    """Raise TypeError unless a value is of a type; the message can give an example.
+
+    Examples
+    --------
+    >>> require_type("n_frames", "20", int)
+    Traceback (most recent call last):
+    TypeError: n_frames is of type str: it must be of type int
+    """
+    if not isinstance(value, kind):
+        such = f", such as {example}" if example else ""
+        raise TypeError(f"{name} is of type {type(value).__name__}: it must be of type {kind.__name__}{such}")

@@ -84,7 +84,7 @@ def test_options_are_the_turbulence_that_they_name():
         (["--scene.path", "none.png"], "none.png"),
         (["--pixel-fill", "1.5"], r"--pixel-fill is 1\.5"),
         (["--jitter", "-1"], r"--jitter is -1\.0"),
-        (["--jitter", "9"], r"--jitter is 9\.0: .* at most 8, in pixels, which is half the field"),
+        (["--jitter", "9"], r"--jitter is 9\.0: .* at most 8 pixels, half the field"),
         (["--turbulence.wind", "800", "0"], r"--turbulence\.wind is 800\.0: .* the nearest possible is 200 m/s"),
         (["--true-mask.magnification", "0"], "--true-mask.magnification is"),
     ],

@@ -25,20 +25,21 @@ def case(most=0.0):
     mask, first, second, sign = torch.tensor(PAIRS).T
     pixels = CommonPixels.of(lenses, patches.plane, mask, 4 * mask + first, 4 * mask + second, sign)
     lines = torch.randn(len(pixels.pair), 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    return patches.plane, lenses, pixels, lines * torch.tensor([1.0, 0.1, 0.01]) + most
+    return patches, lenses, pixels, lines * torch.tensor([1.0, 0.1, 0.01]) + most
 
 
-def plane_of(plane, lenses, mask, lens, sign):
+def plane_of(patches, lenses, mask, lens, sign):
     """T of one lens on a plane with the rows and columns of frequencies, turned by half a turn if `sign` is -1.
 
-    It vanishes from one hole on; the splines that it is made of do not quite.
+    It vanishes from one hole on, the splines that it is made of three steps of their lattice further out.
     """
+    plane, beyond = patches.plane, 3 / patches.colours[0].splines.parts
     whole = torch.zeros(plane.n_pixels, dtype=torch.float64)
     whole[lenses.index[mask, lens].flatten()] = lenses.values[0, mask, lens].flatten()
     (rows, columns), (column, row) = GEOMETRY.grid, lenses.baseline[mask, lens]
-    y = (torch.arange(plane.size[0]) - plane.origin[0] - row) * (GEOMETRY.period / rows)
-    x = (torch.arange(plane.size[1]) - plane.origin[1] - column) * (GEOMETRY.period / columns)
-    whole = whole.view(plane.size) * (torch.hypot(y[:, None], x) <= GEOMETRY.reach)
+    y = (torch.arange(plane.size[0]) - plane.origin[0] - row) / (GEOMETRY.reach / GEOMETRY.period * rows + beyond)
+    x = (torch.arange(plane.size[1]) - plane.origin[1] - column) / (GEOMETRY.reach / GEOMETRY.period * columns + beyond)
+    whole = whole.view(plane.size) * (torch.hypot(y[:, None], x) <= 1)
     if sign < 0:
         y, x = (2 * middle - torch.arange(n) for middle, n in zip(plane.origin, plane.size, strict=True))
         whole = whole[y.clamp(0, plane.size[0] - 1)][:, x.clamp(0, plane.size[1] - 1)]
@@ -46,11 +47,12 @@ def plane_of(plane, lenses, mask, lens, sign):
 
 
 def test_what_lenses_share_is_the_product_of_their_planes():
-    plane, lenses, pixels, lines = case()
+    patches, lenses, pixels, lines = case()
+    plane = patches.plane
     found = SharedLight.apply(lenses.values.flatten(1), lines, pixels, 2 * plane.n_pixels).view(2, *plane.size)
     expected = torch.zeros_like(found)
     for number, (mask, first, second, sign) in enumerate(PAIRS):
-        product = plane_of(plane, lenses, mask, first, 1) * plane_of(plane, lenses, mask, second, sign)
+        product = plane_of(patches, lenses, mask, first, 1) * plane_of(patches, lenses, mask, second, sign)
         assert product.max() > 1e-3
         corner = pixels.corner[number].long()
         for line in (pixels.pair == number).nonzero()[:, 0]:
@@ -62,7 +64,8 @@ def test_what_lenses_share_is_the_product_of_their_planes():
 
 @pytest.mark.parametrize("most", [0.0, 10.0])
 def test_gradients_where_the_coherence_is_bounded_too(most):
-    plane, lenses, pixels, lines = case(most)
+    patches, lenses, pixels, lines = case(most)
+    plane = patches.plane
     values = lenses.values.flatten(1).requires_grad_()
     weight = torch.randn(2 * plane.n_pixels, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 

@@ -184,7 +184,7 @@ def test_masks_that_cannot_be_are_neither_written_nor_read(tmp_path, suffix):
     mask = SparseAperture([[-0.4, 0.0], [0.4, 0.0]], 0.1, 1.0)
     for wrong, said in (
         (mask.replace(centers=1000 * mask.centers), "holes reach 399.6 m beyond the rim of a mask_diameter of 1 m"),
-        (SparseAperture(1200 * mask.centers, 120.0, 1200.0), "mask_diameter is 1200"),
+        (SparseAperture(1200 * mask.centers, 120.0, 1200.0), "mask_diameter is 1200 m: give lengths in m"),
     ):
         with pytest.raises(ValueError, match=said):
             SAVE[suffix](tmp_path / f"mask{suffix}", wrong)
@@ -198,8 +198,13 @@ def test_masks_that_cannot_be_are_neither_written_nor_read(tmp_path, suffix):
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ({"subaperture_diamter": 0.1}, "it has 'subaperture_diamter': the keys of such a mask are format"),
+        (
+            {"subaperture_diamter": 0.1},
+            "it has 'subaperture_diamter', which is 0.1: the keys of such a mask are format",
+        ),
+        ({"Shape": "hexagon"}, "it has 'Shape'"),
         ({"orientation": 0.1}, "it has 'orientation'"),  # discs have none
+        ({"wavelengths": 550e-9}, "it has 'wavelengths'"),
         ({"subaperture_diameter": True}, "its subaperture_diameter is True: it must be a number, in m"),
         ({"mask_diameter": "1.0"}, "its mask_diameter is '1.0'"),
     ],
@@ -210,6 +215,21 @@ def test_typing_errors_in_a_mask_file_are_told(tmp_path, given, said):
     path.write_text(json.dumps(json.loads(path.read_text()) | given))
     with pytest.raises(ValueError, match=said):
         load_mask(path)
+
+
+@pytest.mark.parametrize("extra", [{"comment": "as cut"}, {"orientation": 0.0, "central_obstruction": 0.0}])
+def test_remarks_and_what_version_0_1_wrote_are_read_over(tmp_path, extra):
+    path = tmp_path / "mask.json"
+    save_json(path, SparseAperture([[-0.4, 0.0], [0.4, 0.0]], 0.1, 1.0))
+    expected = load_mask(path)
+    path.write_text(json.dumps(json.loads(path.read_text()) | extra))
+    assert same_bits(load_mask(path), expected)
+
+
+def test_masks_for_a_bench_are_written(tmp_path):
+    small = SparseAperture([[-2e-4, 0.0], [2e-4, 0.0]], 5e-5, 5e-4)
+    save_json(tmp_path / "mask.json", small)
+    assert same_bits(load_mask(tmp_path / "mask.json"), small)
 
 
 def test_a_wavelength_in_nanometres_is_told(tmp_path):
@@ -243,7 +263,7 @@ def test_json_holds_the_wavelength_and_does_without(tmp_path):
     record = json.loads((tmp_path / "with.json").read_text())
     for wrong in ("4.8 um", -1.0, 0, True, [4.8e-6]):
         (tmp_path / "wrong.json").write_text(json.dumps(record | {"wavelength": wrong}))
-        with pytest.raises(ValueError, match=r"wrong\.json: its wavelength is .*: it must be a positive number"):
+        with pytest.raises(ValueError, match=r"wrong\.json: its wavelength is .*: it must be a (number|wavelength)"):
             mask_wavelength(tmp_path / "wrong.json")
     with pytest.raises(ValueError, match=r"wavelength is -1\.0: it must be finite and positive, in m"):
         save_json(tmp_path / "new.json", mask, -1.0)

@@ -396,7 +396,8 @@ class Form(torch.nn.Module):
     [
         (lambda _: 1.0, TypeError, "criterion is function: .* a method `relative`"),
         (Form(lambda values: 1.0), TypeError, "criterion returns float: a tensor is needed"),
-        (Form(torch.sum), ValueError, r"returns shape \(\) for a population of 2 masks, centers \(2, 3, 2\)"),
+        (Form(torch.sum), ValueError, r"relative returns shape \(\) for a population of 2 masks"),
+        (Form(lambda values: values[None]), ValueError, r"criterion returns shape \(1,\) for one mask"),
         (Form(torch.detach), TypeError, "not differentiable in the centres"),
     ],
 )

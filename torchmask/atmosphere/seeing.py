@@ -54,10 +54,15 @@ class Seeing:
         if not (math.isfinite(self.exposure) and self.exposure >= 0):
             raise ValueError(f"exposure is {self.exposure}: it must be finite and not negative, in s")
         require_plain("wind", self.wind)
-        given = np.asarray(self.wind, dtype=float)
-        if given.shape not in ((), (2,)) or not np.isfinite(given).all() or (given.ndim == 0 and given < 0):
+        wind = self.wind.detach().cpu() if isinstance(self.wind, Tensor) else self.wind
+        try:
+            given = np.asarray(wind)
+            numbers = given.astype(float) if given.dtype.kind in "iuf" else np.empty(0)
+        except (TypeError, ValueError):
+            numbers = np.empty(0)
+        if numbers.shape not in ((), (2,)) or not np.isfinite(numbers).all() or (numbers.ndim == 0 and numbers < 0):
             raise ValueError(f"wind is {self.wind}: it must be a speed of at least 0 or a pair (vx, vy), in m/s")
-        object.__setattr__(self, "wind", float(given) if given.ndim == 0 else tuple(given.tolist()))
+        object.__setattr__(self, "wind", float(numbers) if numbers.ndim == 0 else tuple(numbers.tolist()))
         if self.exposure > 0 and self.speed == 0:
             raise ValueError(f"exposure is {self.exposure} s without wind: say how fast the turbulence moves, in m/s")
 

@@ -109,10 +109,11 @@ class ConditionOptions(FilterOptions):
                 "--conditions.temperature is that of light in a band: give --conditions.filter or "
                 "--conditions.band-width, or leave it out"
             )
-        band = self.filter_band(wavelength)
-        if self.band_width or self.filter:
-            passband = Passband.find(self.filter) if self.filter else Passband.top_hat(wavelength, self.band_width)
+        band, passband = self.filter_band(wavelength), None if self.filter is None else Passband.find(self.filter)
+        if self.band_width:
+            passband = Passband.top_hat(wavelength, self.band_width)
             band = Band.from_filter(passband, self.n_wavelengths, self.temperature)
+        if passband is not None:
             warn_of_few_wavelengths(passband, self.n_wavelengths, self.temperature)
         return Conditions(
             sky=sky if self.sky is None else self.sky,
@@ -270,7 +271,7 @@ def run(options: Options) -> None:
         grid = Grid(options.n_pixels, finest.pixel_scale, wavelength)
     else:
         grid = Grid(options.n_pixels, pixel_scale, wavelength)
-    require("--jitter", options.jitter, ", in pixels, which is half the field", zero=True, most=min(grid.shape) / 2)
+    require("--jitter", options.jitter, " pixels, half the field", zero=True, most=min(grid.shape) / 2)
     detector = Detector(options.readout_noise, pixel=jittered(square_pixel(options.pixel_fill), options.jitter))
     scene = make_scene(grid.shape, n_photons, options.scene)
     used = None if known is None else used_instrument(known, float(told.area), options)

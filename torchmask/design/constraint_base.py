@@ -63,6 +63,8 @@ class Inequality(Constraint):
     def checked_margins(self, aperture: SparseAperture) -> Tensor:
         """Return the margins (..., M) [m]; raises ValueError unless they are numbers, in a row for each mask."""
         margins, leading = self.margins(aperture), aperture.centers.shape[:-2]
+        if not isinstance(margins, Tensor):
+            raise TypeError(f"margins of {self} are of type {type(margins).__name__}: a tensor is needed")
         if margins.shape[:-1] != leading or margins.ndim == 0 or not margins.is_floating_point():
             raise ValueError(
                 f"margins of {self} have shape {tuple(margins.shape)} and dtype {margins.dtype} for centers of shape "

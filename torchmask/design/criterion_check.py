@@ -32,23 +32,27 @@ def require_criterion(criterion: Criterion, aperture: SparseAperture, differenti
         )
     # a mask and what it is turned by half a turn: as feasible, and told apart if one value stands for both
     centers = torch.stack([aperture.centers.detach(), -aperture.centers.detach()]).requires_grad_()
-    masks, found = aperture.replace(centers=centers), []
-    for name, function in (("criterion", criterion), ("criterion.relative", criterion.relative)):
-        values = function(masks)
-        if not isinstance(values, Tensor):
-            raise TypeError(f"{name} returns {type(values).__name__}: a tensor is needed, one value for each mask")
-        if values.shape != (2,):
-            raise ValueError(
-                f"{name} returns shape {tuple(values.shape)} for a population of 2 masks, centers "
-                f"{tuple(centers.shape)}: it must return one value for each, (2,)"
-            )
-        found.append(values)
-    if differentiable and not found[1].requires_grad:
+    masks = aperture.replace(centers=centers)
+    _require_values("criterion", criterion(aperture), ())
+    relative = _require_values("criterion.relative", criterion.relative(masks), (2,))
+    if differentiable and not relative.requires_grad:
         raise TypeError(
             "criterion.relative is not differentiable in the centres of the holes: use operations of PyTorch only, and "
             "do not detach, or search with method='cma' and refine=False"
         )
-    return found[1][0].detach()
+    return relative[0].detach()
+
+
+def _require_values(name: str, values: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """Return the values of one mask, or of a population of 2, or raise an error unless they are a tensor of `shape`."""
+    if not isinstance(values, Tensor):
+        raise TypeError(f"{name} returns {type(values).__name__}: a tensor is needed, one value for each mask")
+    if values.shape != shape:
+        masks = f"a population of {shape[0]} masks" if shape else "one mask"
+        raise ValueError(
+            f"{name} returns shape {tuple(values.shape)} for {masks}: it must return one value for each, {shape}"
+        )
+    return values
 
 
 def require_finite(relative_mse: Tensor) -> None:

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from torchmask.io import atomic_write, extra
-from torchmask.numbers import require_diameter
+from torchmask.numbers import WIDEST
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.overlaps import require_apart
 from torchmask.optics.shape_base import Array, Circle, Contour, Corners, Shape
@@ -182,7 +182,8 @@ def require_one_mask(aperture: SparseAperture) -> Tensor:
         raise ValueError(
             f"centers has shape {tuple(aperture.centers.shape)}: a file holds one mask, (n_subapertures, 2)"
         )
-    require_diameter("mask_diameter", aperture.mask_diameter)
+    if aperture.mask_diameter > WIDEST:
+        raise ValueError(f"mask_diameter is {aperture.mask_diameter:g} m: give lengths in m, not in mm")
     beyond = aperture.reach - aperture.mask_diameter / 2
     if not beyond <= _BEYOND * aperture.mask_diameter:
         raise ValueError(

@@ -77,6 +77,8 @@ class LensPairs:
         logarithm = shared.clamp(min=_NOTHING).log2().unflatten(1, (3, 3))
         middle, step = middle[one], step[one]
         pixels = CommonPixels.of(lenses, self.plane, *pairs[:4])
+        if len(pixels.pair) == 0:
+            return centers.new_zeros(len(centers), self.plane.n_pixels)
         start, unit = (pixels.corner * self.pixel - middle) / step, self.pixel / step
         lines = _lines(logarithm, start, unit, pixels)
         found = SharedLight.apply(lenses.values.flatten(1), lines, pixels, n_pixels)

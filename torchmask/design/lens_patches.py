@@ -23,6 +23,7 @@ from torchmask.design.spline_patches import SplinePatches
 from torchmask.optics.band import Band
 
 _NOTHING = 1e-12  # of T
+_BEYOND = 3.0  # steps of the splines' lattice: cut off there, they make no step as pixels come into a lens
 
 
 class Lenses(NamedTuple):
@@ -136,7 +137,7 @@ class LensPatches:
         patches = [self._patch(colour, baseline, turns) for colour in self.colours]
         if len(patches) == 1:
             lens, kept, index, corner, offset = patches[0]
-            ends = _disc_ends(offset.detach(), self.colours[0].plan)
+            ends = _disc_ends(offset.detach(), self.colours[0])
             return Lenses(lens[None], kept[None], index, baseline, turns, corner, ends, sign, middle)
         values, kept, corner, size = self._merged(patches)
         index = self.plane.index(corner, *values.shape[-2:])
@@ -187,11 +188,12 @@ class LensPatches:
         return merged(values), merged(kept), corner, size
 
 
-def _disc_ends(offset: Tensor, plan: PatchPlan) -> Tensor:
+def _disc_ends(offset: Tensor, colour: Colour) -> Tensor:
     """Return the ends (B, L, rows, 2) of the rows of patches whose first pixel lies at `offset` (B, L, 2) [pixels] from
-    the middle of a disc as wide as the plan's patches."""
+    the middle of a disc as wide as the patches, and as much wider as splines go on beyond its edge."""
+    plan, beyond = colour.plan, _BEYOND / colour.splines.parts
     x, y = offset[..., :1], offset[..., 1:] + torch.arange(len(plan.row), device=offset.device)
-    half = plan.reach[0] * (1 - (y / plan.reach[1]) ** 2).clamp(min=0).sqrt()
+    half = (plan.reach[0] + beyond) * (1 - (y / (plan.reach[1] + beyond)) ** 2).clamp(min=0).sqrt()
     ends = torch.stack([(-half - x).ceil(), (half - x).floor() + 1], -1)
     return ends.nan_to_num(0.0).clamp(0, len(plan.column)).long()
 

@@ -10,6 +10,7 @@ import json
 import math
 import warnings
 from collections.abc import Callable
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from torchmask.optics.records import aperture_record, read_mask
 
 _FORMAT = "torchmask mask, version 1"
 _UNITS = {"length": "m", "angle": "rad"}
+_OF_SOME_SHAPES = ("orientation", "obstruction", "central_obstruction")
 _DTYPES = {"float64": torch.float64, "float32": torch.float32}
 
 
@@ -167,7 +169,7 @@ def mask_wavelength(path: str | Path) -> float | None:
     Raises
     ------
     ValueError
-        If `load_mask` cannot read the file, or its wavelength is not a positive number.
+        If `load_mask` cannot read the file, or its wavelength is not that of light in metres.
 
     Examples
     --------
@@ -182,9 +184,9 @@ def mask_wavelength(path: str | Path) -> float | None:
     if path.suffix.lower() != ".json":
         return None
     value = _json_record(path).get("wavelength")
-    if value is not None and not (type(value) in (int, float) and math.isfinite(value) and value > 0):
-        raise ValueError(f"{path}: its wavelength is {value!r}: it must be a positive number, in m")
-    require_wavelength("wavelength", value)
+    if value is not None and type(value) not in (int, float):
+        raise ValueError(f"{path}: its wavelength is {value!r}: it must be a number, in m")
+    require_wavelength(f"{path}: its wavelength", value)
     return value
 
 
@@ -200,9 +202,11 @@ def _read_json(path: Path) -> SparseAperture:
     centers = torch.tensor(record["centers"], dtype=torch.float64).to(_dtype(record["dtype"]))
     mask = read_mask(record | {"centers": centers})
     known = ["format", "units", *needed, *mask.shape.parameters, "wavelength"]
-    unknown = [key for key in record if key not in known]
-    if unknown:  # typing errors, or what this shape does not have: the mask would be another than is meant
-        raise ValueError(f"it has {', '.join(map(repr, unknown))}: the keys of such a mask are {', '.join(known)}")
+    for key, value in record.items():
+        meant = get_close_matches(key.lower(), [*known, *_OF_SOME_SHAPES], n=1, cutoff=0.8)
+        if key not in known and meant and value:  # files of version 0.1 have zeros for what a shape lacks
+            has = f"the keys of such a mask are {', '.join(known)}"
+            raise ValueError(f"it has {key!r}, which is {value!r}: {has}, and others, such as 'comment'")
     return mask
 
 

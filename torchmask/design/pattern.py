@@ -80,12 +80,15 @@ class Pattern:
         """
         if not (math.isfinite(fill_factor) and fill_factor > 0):
             raise ValueError(f"fill_factor is {fill_factor}: it must be finite and positive")
-        most = self.largest_fill_factor()
+        inner = mask_diameter - 2 * rim_margin
+        if not inner > 0:
+            raise ValueError(f"rim_margin is {rim_margin} m: it leaves nothing of a mask of {mask_diameter:g} m")
+        most = self.largest_fill_factor() * (inner / mask_diameter) ** 2
         if fill_factor > most:
             raise ValueError(f"its holes would overlap: it carries a fill factor of at most {most:.4g}")
         hole = mask_diameter * math.sqrt(fill_factor / self._area_over_disc / len(self.centers))
         middle, radius = catalog.smallest_enclosing_circle(self.centers)
-        room = (mask_diameter - self.shape.outer_diameter(hole)) / 2 - rim_margin
+        room = (inner - self.shape.outer_diameter(hole)) / 2
         centers = torch.from_numpy((self.centers - middle) * (room / radius))
         return SparseAperture(centers, hole, mask_diameter, self.shape)
 

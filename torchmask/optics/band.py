@@ -6,7 +6,6 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from numbers import Real
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -43,7 +42,7 @@ class Band:
         Raises ValueError if there is no wavelength, the numbers differ, or a value is not finite and positive, and
         TypeError for a single number.
         """
-        if isinstance(wavelengths, Real):
+        if np.ndim(wavelengths) == 0:  # type: ignore[arg-type]
             raise TypeError(f"wavelengths is {wavelengths}: a sequence is needed, such as [{wavelengths}]")
         shares = [1.0] * len(wavelengths) if weights is None else [float(weight) for weight in weights]
         if not len(wavelengths) or len(shares) != len(wavelengths):

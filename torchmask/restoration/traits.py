@@ -9,6 +9,7 @@ from enum import Enum
 from torchmask.grid import Grid
 from torchmask.numbers import whole_number
 from torchmask.optics.aperture import Aperture, SparseAperture
+from torchmask.plain import require_type
 from torchmask.restoration.objective import Free
 from torchmask.restoration.projected_lbfgs import Minimizer
 from torchmask.restoration.schedule import Schedule
@@ -137,9 +138,9 @@ def check_given(
     Raises TypeError for an aperture, a grid, a schedule, a minimiser or a switch of another type, and ValueError for a
     read-out noise or a tolerance out of range.
     """
-    for name, value, kind in (("aperture", aperture, Aperture), ("grid", grid, Grid), ("schedule", schedule, Schedule)):
-        if not isinstance(value, kind) and (value is not None or name != "schedule"):
-            raise TypeError(f"{name} is of type {type(value).__name__}: it must be of type {kind.__name__}")
+    require_type("aperture", aperture, Aperture)
+    require_type("grid", grid, Grid)
+    require_type("schedule", schedule or Schedule(), Schedule)
     if isinstance(minimizer, type) or not (minimizer is None or callable(minimizer)):
         given = minimizer.__name__ if isinstance(minimizer, type) else repr(minimizer)
         raise TypeError(

@@ -23,6 +23,7 @@ from torchmask.observation import Observation
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.detector import Detector, image_formation
 from torchmask.optics.overlaps import require_apart
+from torchmask.plain import require_type
 from torchmask.record import Callback, Record
 from torchmask.simulation.conditions import Conditions
 from torchmask.simulation.exposed_psf import ExposedPSF
@@ -221,15 +222,9 @@ def _stack_phases(phases: Sequence[Tensor | None], like: Tensor) -> Tensor:
 
 def require_instruments(aperture: Any, grid: Any, detector: Any) -> None:
     """Raise TypeError unless these are an aperture, a grid and a detector."""
-    for name, given, kind, example in (
-        ("aperture", aperture, Aperture, "SparseAperture.from_catalog('golay6', 1.0, 0.15)"),
-        ("grid", grid, Grid, "Grid.nyquist(1.0, 550e-9, 128)"),
-        ("detector", detector, Detector, "Detector(readout_noise=1.5)"),
-    ):
-        if not isinstance(given, kind):
-            raise TypeError(
-                f"{name} is of type {type(given).__name__}: it must be of type {kind.__name__}, such as {example}"
-            )
+    require_type("aperture", aperture, Aperture, "SparseAperture.from_catalog('golay6', 1.0, 0.15)")
+    require_type("grid", grid, Grid, "Grid.nyquist(1.0, 550e-9, 128)")
+    require_type("detector", detector, Detector, "Detector(readout_noise=1.5)")
 
 
 def _check_types(scene: Any, generator: Any) -> None:
