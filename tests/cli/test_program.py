@@ -177,6 +177,18 @@ def test_a_warning_is_one_line(capsys):
     assert warnings.showwarning is shown
 
 
+@pytest.mark.filterwarnings("default::UserWarning")
+def test_a_warning_is_told_once_whatever_filters_are_set_in_between(capsys):
+    def run(_):
+        for _ in range(3):
+            warnings.warn("the noise is high", stacklevel=1)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+
+    assert status(run) == 0
+    assert capsys.readouterr().err == "program: warning: the noise is high\n"
+
+
 def test_a_package_that_is_missing_is_named_with_its_extra_and_others_are_mistakes_of_the_program(capsys):
     assert status(fails(ModuleNotFoundError("no", name="ezdxf.units"))) == 1
     assert "needs ezdxf" in capsys.readouterr().err

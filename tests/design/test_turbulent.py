@@ -399,6 +399,18 @@ def test_gradients_are_the_same_however_many_masks_are_in_work(monkeypatch):
     torch.testing.assert_close(*found, rtol=0, atol=1e-12 * float(found[0].abs().max()))
 
 
+def test_one_hole_is_as_good_anywhere():
+    criterion, mask = criterion_of(r0=0.1), SparseAperture([[0.1, 0.0]], 0.3, 1.0)
+    centers = torch.tensor([[[0.1, 0.0]], [[-0.2, 0.1]]], dtype=torch.float64, requires_grad=True)
+    errors = criterion(mask.replace(centers=centers))
+    assert errors[0] == errors[1] == criterion(mask)
+    (gradient,) = torch.autograd.grad(errors.sum(), centers)
+    assert torch.equal(gradient, torch.zeros_like(centers))
+    found = search_mask(criterion, 1, 1.0, 0.09, budget=40)
+    assert found.relative_mse == pytest.approx(float(criterion.relative(mask)), rel=1e-12)
+    assert refine_mask(criterion, mask, budget=10).relative_mse == float(criterion.relative(mask))
+
+
 def test_tables_made_in_inference_serve_a_training_too():
     criterion = criterion_of(Grid.nyquist(1.0, 550e-9, 24), r0=0.25)
     mask = SparseAperture(torch.nn.Parameter(mask_of(3).centers), 0.2, 1.0)

@@ -82,7 +82,8 @@ def carry_out(run: Callable[[T], int | None], options: T) -> int | None:
 def exit_status(program: str, work: Callable[[], int | None], debug: bool) -> int:
     """Do the work; mistakes and warnings become one line each, unless `debug` asks for the traceback."""
     with warnings.catch_warnings():
-        warnings.showwarning = lambda message, *_, **__: _say(program, f"warning: {message}")
+        told: set[str] = set()
+        warnings.showwarning = lambda message, *_, **__: _warn(program, str(message), told)
         try:
             with _interrupted_by_termination():
                 return work() or 0
@@ -195,6 +196,13 @@ def _groups(options: type) -> set[Any]:
         if dataclasses.is_dataclass(hint):
             found |= _groups(typing.cast(type, hint))
     return found
+
+
+def _warn(program: str, message: str, told: set[str]) -> None:
+    """Print a warning unless it has been `told`: Python forgets which it has shown whenever filters change."""
+    if message not in told:
+        told.add(message)
+        _say(program, f"warning: {message}")
 
 
 def _say(program: str, message: str) -> None:

@@ -21,6 +21,7 @@ from torchmask.design.frequency_plane import half_plane
 from torchmask.design.mask_transfer import MaskTransfer
 from torchmask.design.overlap import Geometry
 from torchmask.grid import Grid
+from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.band import Band
 from torchmask.optics.pixel import PixelResponse
 from torchmask.optics.pupil import Aperture
@@ -198,8 +199,8 @@ class TurbulentMSE(AsymptoticMSE):
         self._check(aperture)
         centers = aperture.centers
         if aperture.is_full:
-            table = self._table(aperture, self._pupil_power)
-            return table.to(centers).expand(*centers.shape[:-2], *table.shape)
+            nowhere = 0 * centers.sum((-2, -1))  # the same wherever the pupil lies: with a gradient, of 0
+            return self._table(aperture, self._pupil_power).to(centers) + nowhere[..., None, None]
         flat = centers.reshape(math.prod(centers.shape[:-2]), *centers.shape[-2:])
         power = self._table(aperture, self._mask_transfer)(flat) / aperture.n_subapertures**2
         return power.reshape(*centers.shape[:-2], *power.shape[-2:])
@@ -255,7 +256,10 @@ class TurbulentMSE(AsymptoticMSE):
         kept = torch.zeros_like(transfer).flatten()
         known = transfer.flatten() > 1e-4
         frequencies = nodes.flatten(0, 1)[known] / self.grid.period
-        found = function(aperture.still(), self.grid, frequencies, self.seeing, band)
+        one = aperture.still()
+        if isinstance(one, SparseAperture):  # of a population any does
+            one = one.replace(centers=one.centers.new_zeros(1, 2))
+        found = function(one, self.grid, frequencies, self.seeing, band)
         kept[known] = found * (still(nodes, smooth) / transfer**2).flatten()[known]
         kept = kept.unflatten(0, transfer.shape)
         if round_:
