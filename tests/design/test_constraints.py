@@ -301,7 +301,7 @@ def test_a_mask_that_is_no_mask_any_more_is_not_in_order():
     mask.centers[1] = torch.nan
     with pytest.raises(ValueError, match="centers hold values that are not finite"):
         check_mask(mask)
-    with pytest.raises(TypeError, match="a SparseAperture is needed, not Tensor"):
+    with pytest.raises(TypeError, match="aperture is of type Tensor: it must be of type SparseAperture"):
         check_mask(mask.centers)
 
 

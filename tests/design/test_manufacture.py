@@ -111,7 +111,7 @@ def test_only_one_sparse_aperture_makes_a_file(tmp_path, suffix):
     path = tmp_path / f"mask{suffix}"
     with pytest.raises(ValueError, match="a file holds one mask"):
         SAVE[suffix](path, SparseAperture(torch.zeros(2, 3, 2), 0.1, 1.0))
-    with pytest.raises(TypeError, match="SparseAperture is needed, not FullAperture"):
+    with pytest.raises(TypeError, match="aperture is of type FullAperture: it must be of type SparseAperture"):
         SAVE[suffix](path, FullAperture(1.0))
     assert not list(tmp_path.iterdir())
 

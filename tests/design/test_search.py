@@ -307,7 +307,7 @@ def test_a_criterion_that_fails_at_some_masks_is_searched_at_the_others(method):
 
 
 def test_only_one_sparse_aperture_is_refined(golay6):
-    with pytest.raises(TypeError, match="SparseAperture is needed, not FullAperture"):
+    with pytest.raises(TypeError, match="aperture is of type FullAperture: it must be of type SparseAperture"):
         refine_mask(COARSE, FullAperture(1.0))  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="one mask"):
         refine_mask(COARSE, SparseAperture(golay6.centers.expand(2, -1, -1), golay6.subaperture_diameter, 1.0))

@@ -19,6 +19,7 @@ from torchmask.numbers import whole_number
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.overlaps import check_overlaps, pair_clearances
 from torchmask.optics.shape_base import safe_length
+from torchmask.plain import require_type
 
 
 @dataclass(frozen=True)
@@ -260,8 +261,7 @@ def check_mask(aperture: SparseAperture, tolerance: float = 1e-9, constraints: S
     --------
     >>> check_mask(SparseAperture([[-0.4, 0.0], [0.4, 0.0]], subaperture_diameter=0.2, mask_diameter=1.0))
     """
-    if not isinstance(aperture, SparseAperture):
-        raise TypeError(f"a SparseAperture is needed, not {type(aperture).__name__}")
+    require_type("aperture", aperture, SparseAperture)
     require_constraints(constraints)
     if not aperture.centers.isfinite().all():
         raise ValueError("centers hold values that are not finite: a training that diverged may have put them there")

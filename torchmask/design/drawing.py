@@ -22,6 +22,7 @@ from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.overlaps import require_apart
 from torchmask.optics.shape_base import Array, Circle, Contour, Corners, Shape
 from torchmask.optics.shapes import outlined_shape
+from torchmask.plain import require_type
 
 LIFE_SIZE = 1000.0  # [mm on the plate for a metre of the pupil]
 _SCALE = "torchmask mm per m"
@@ -176,8 +177,7 @@ def require_one_mask(aperture: SparseAperture) -> Tensor:
 
     Raises TypeError or ValueError for anything else, a diameter that no mask has, and holes far outside it.
     """
-    if not isinstance(aperture, SparseAperture):
-        raise TypeError(f"a SparseAperture is needed, not {type(aperture).__name__}")
+    require_type("aperture", aperture, SparseAperture)
     if aperture.centers.ndim != 2:
         raise ValueError(
             f"centers has shape {tuple(aperture.centers.shape)}: a file holds one mask, (n_subapertures, 2)"

@@ -17,6 +17,7 @@ from torchmask.design.descent import BatchedBFGS
 from torchmask.design.merit import Criterion, Holes, Merit, device_of, for_processor
 from torchmask.numbers import whole_number
 from torchmask.optics.aperture import SparseAperture
+from torchmask.plain import require_type
 from torchmask.record import Callback, Record
 
 PENALTY = 3e3  # weight of the squared shortfalls, in mask diameters, relative to log MSE
@@ -199,8 +200,7 @@ def refine_mask(
     >>> better.relative_mse < float(criterion.relative(golay))
     True
     """
-    if not isinstance(aperture, SparseAperture):
-        raise TypeError(f"a SparseAperture is needed, not {type(aperture).__name__}")
+    require_type("aperture", aperture, SparseAperture)
     if aperture.centers.ndim != 2:
         raise ValueError(f"centers has shape {tuple(aperture.centers.shape)}: refine_mask takes one mask, (N, 2)")
     require_constraints(constraints)
