@@ -4,6 +4,7 @@ import re
 import numpy as np
 import pytest
 import torch
+from scipy.special import jn_zeros
 
 from torchmask.grid import Grid
 
@@ -99,6 +100,9 @@ def test_the_table_says_what_is_nyquist_and_what_aliases():
     # period 2.5 m: rows of 2.5 / 64 m, columns of 2.5 / 48 m, and 0.576 of the coarser across a hole
     assert "0.03906 x 0.05208 m" in critical["one pupil sample"]
     assert "0.576 | below 2: oversample by 4" in critical["samples across a hole"]
+    dark = 2 * float(jn_zeros(1, 1)[0]) / math.pi * 2.5 / hole  # across the first dark ring of the Airy pattern
+    assert f"{dark:.4g}" == "203.3"
+    assert "| 203.3 |" in critical["pixels across the image of a hole"]
     # A quarter wider than Nyquist allows: frequency 1 - 0.625 is where the folded spectrum begins.
     aliased = rows_of(Grid.nyquist(diameter / 1.25, 1e-6, 64).describe(diameter))
     assert "0.625 cycles/pixel | above 1/2: frequencies beyond 0.375" in aliased["cut-off frequency"]

@@ -77,6 +77,22 @@ def test_more_layers_come_closer_to_the_profile():
     assert errors[-1] < 1e-3
 
 
+@pytest.mark.parametrize("n_layers", [2, 5, 8])
+def test_every_group_has_the_same_share_of_strength_and_of_what_sets_theta0(n_layers):
+    """Half of a share is one, half the other; a group may have a cell of the profile too many at either end."""
+
+    def shares(layers):
+        strength, height = np.array(layers.strengths), np.array(layers.heights)
+        high = strength * height ** (5 / 3)
+        return (strength / strength.sum() + high / high.sum()) / 2
+
+    cell = shares(named_layers("hv57", 10_000)).max()
+    assert cell < 0.01
+    grouped = named_layers("hv57", n_layers)
+    assert len(grouped.heights) == n_layers
+    np.testing.assert_allclose(shares(grouped), 1 / n_layers, rtol=0, atol=1.01 * cell)
+
+
 def test_one_layer_is_the_textbook():
     """theta0 = 0.314 r0 / h, tau0 = 0.314 r0 / v, f_G = 0.427 v / r0; a wind across counts with its length."""
     layers = Layers.from_fractions(0.1, WAVELENGTH, [4000.0], [3.0], [(6.0, -8.0)])
@@ -173,6 +189,32 @@ def test_sites_have_the_r0_of_their_sources(name, r0):
     assert layers.r0(WAVELENGTH) == pytest.approx(r0, rel=1e-12)
     assert np.diff(layers.heights).min() > 0
     assert len(named_layers(name, 3).heights) == 3
+
+
+SITES = {  # by height [m]: share of the turbulence and speed of the wind [m/s], as the sources print them
+    "las_campanas": {
+        **{250: (0.42, 10), 500: (0.03, 10), 1000: (0.06, 20), 2000: (0.16, 20)},
+        **{4000: (0.11, 25), 8000: (0.10, 30), 16000: (0.12, 25)},
+    },
+    "mauna_kea": {
+        **{500: (0.2283, 10), 1000: (0.0883, 10), 2000: (0.0666, 10)},
+        **{4000: (0.1458, 10), 8000: (0.3350, 10), 16000: (0.1350, 10)},
+    },
+}
+
+
+@pytest.mark.parametrize(("name", "r0", "wind"), [("las_campanas", 0.16, 18.67), ("mauna_kea", 0.2, 10.0)])
+def test_sites_have_the_shares_and_winds_of_their_sources(name, r0, wind):
+    layers, site = named_layers(name), SITES[name]
+    assert layers.heights == tuple(site)
+    total = sum(share for share, _ in site.values())
+    shares = np.array(layers.layer_r0(WAVELENGTH)) ** (-5 / 3) * r0 ** (5 / 3)
+    np.testing.assert_allclose(shares, [share / total for share, _ in site.values()], rtol=1e-12)
+    assert layers.winds == tuple((float(speed), 0.0) for _, speed in site.values())
+    # theta0 and tau0 are 0.314 r0 over the means of heights and winds, to the power 5/3
+    high = sum(share * height ** (5 / 3) for height, (share, _) in site.items()) / total
+    assert layers.theta0(WAVELENGTH) == pytest.approx(0.31427 * r0 / high**0.6, rel=2e-5)
+    assert layers.tau0(WAVELENGTH) == pytest.approx(0.31427 * r0 / wind, rel=3e-4)  # winds are given to four digits
 
 
 def test_unknown_profiles_are_refused_with_a_list():

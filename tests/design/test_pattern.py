@@ -39,6 +39,17 @@ def test_a_pattern_keeps_off_the_rim():
     assert mask.fill_factor == pytest.approx(0.1, rel=1e-12)
 
 
+def test_a_rim_margin_scales_the_largest_area_with_the_disc_that_it_leaves():
+    """Of a mask of 1.2 m a margin of 0.15 m leaves 0.9 m: (3/4)^2 of the fill factor."""
+    pattern = Pattern.from_catalog("golay6")
+    most = pattern.largest_fill_factor() * 0.75**2
+    mask = pattern.afresh(1.2, most * (1 - 1e-9), rim_margin=0.15)
+    assert float(NoOverlap().margins(mask).min()) == pytest.approx(0, abs=1e-8)
+    assert float(InsideDisc().margins(mask).min()) == pytest.approx(0.15, rel=1e-9)
+    with pytest.raises(ValueError, match=f"a fill factor of at most {most:.4g}"):
+        pattern.afresh(1.2, most * (1 + 1e-6), rim_margin=0.15)
+
+
 def test_a_mask_as_built_is_scaled_with_its_holes():
     built = SparseAperture.from_catalog("jwst_niriss_ami_7")
     scaled = Pattern.from_catalog("jwst_niriss_ami_7").scaled(1.0)

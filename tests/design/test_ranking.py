@@ -4,6 +4,7 @@ import csv
 import io
 
 import pytest
+import torch
 
 from torchmask.design.constraints import KeepOutDisc
 from torchmask.design.criterion import AsymptoticMSE
@@ -58,6 +59,23 @@ def test_masks_are_compared_with_the_searched_one_of_as_many_holes(ranking):
     assert excess["keck_lws_pattern6a_6", Layout.AFRESH] > 1
     assert excess["jwst_niriss_ami_7", Layout.AFRESH] is None
     assert excess["keck_lws_pattern6a_6", Layout.AS_BUILT] is None  # it has another area
+
+
+@pytest.mark.parametrize("names", [("good", "worse"), ("worse", "good")])
+def test_excess_is_over_the_best_searched_mask_and_errors_are_told_over_the_floor(names):
+    searched = {"good": OWN, "worse": OWN.replace(0.7 * OWN.centers)}
+    found = rank(searched={name: searched[name] for name in names})
+    errors = {name: float(criterion(float(mask.area)).relative(mask)) for name, mask in searched.items()}
+    assert errors["worse"] > 1.05 * errors["good"]
+    psd = PowerLawPSD(1.5, 1e8)(GRID)
+    beyond = torch.hypot(*GRID.frequencies(torch.float64)) >= 1 / GRID.period  # frequencies that a mask of 1 m lacks
+    floor = float(psd[beyond].sum() / psd.sum())
+    assert floor > 0.01
+    for row in found.rows:
+        assert row.above_floor == pytest.approx(row.relative_mse - floor, rel=1e-9)
+        if row.n_subapertures == 6 and row.layout is not Layout.AS_BUILT:
+            more = 100 * (row.relative_mse - errors["good"]) / errors["good"]
+            assert row.excess_percent == pytest.approx(more, rel=1e-9, abs=1e-9)
 
 
 def test_what_overlaps_is_named_with_the_reason(ranking):

@@ -6,7 +6,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.optimize import minimize_scalar
+from scipy.optimize import brentq, minimize_scalar
 from scipy.spatial import Delaunay
 from scipy.special import j1, jn_zeros
 
@@ -151,6 +151,20 @@ def test_psf_width_of_two_holes():
     assert report.fwhm_min == pytest.approx(2.0 / (2 * baseline), rel=(hole / baseline) ** 2)
     assert report.fwhm_max == pytest.approx(2.0 * 1.0289940 / hole, rel=1e-6)
     assert report.fwhm_min < report.fwhm < report.fwhm_max
+
+
+def test_psf_width_is_that_of_a_disc_with_the_area_above_half_maximum():
+    """In polar coordinates the area is the mean square of the radius; of two holes it ends at a root along each ray."""
+    baseline, hole = 0.5, 0.3
+    report = analyse_redundancy(mask_of([[-0.25, 0], [0.25, 0]], hole, 2.0))
+
+    def radius(angle):
+        fringe = math.pi * baseline * math.cos(angle)
+        return brentq(lambda f: airy(hole * f) * math.cos(fringe * f) ** 2 - 0.5, 1e-6, 1.03 / hole)
+
+    radii = np.array([radius(angle) for angle in np.arange(180) * math.pi / 180])
+    assert report.fwhm == pytest.approx(2.0 * 2 * math.sqrt(np.mean(radii**2)), rel=1e-9)
+    assert np.mean(radii) < 0.95 * math.sqrt(np.mean(radii**2))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchmask.design.constraint_base import project
-from torchmask.design.constraints import FixedHoles, KeepOutDisc, MinimumGap, NFoldSymmetry, check_mask
+from torchmask.design.constraints import FixedHoles, KeepOutDisc, MinimumGap, NFoldSymmetry, RimMargin, check_mask
 from torchmask.design.refine import refine_mask
 from torchmask.design.room import require_room
 from torchmask.optics.aperture import SparseAperture
@@ -102,6 +102,17 @@ def test_the_bound_is_where_the_best_packing_is(n, gap, obstruction, largest):
     told = []
     with pytest.raises(ValueError, match="a fill_factor of at most") as refusal:
         require_room(n, 1.0, 1.01 * largest, rules, callback=told.append)
+    assert not told
+    stated = float(str(refusal.value).split("a fill_factor of at most ")[1].split()[0])
+    assert 0.999 * largest < stated <= largest
+
+
+def test_a_rim_margin_is_lost_on_either_side():
+    """Seven equal discs fit three to a diameter, of what the margins leave: found just below, refused just above."""
+    largest, rules, told = 7 * (0.8 / 3) ** 2, [RimMargin(0.1)], []
+    check_mask(require_room(7, 1.0, 0.98 * largest, rules)[1], 1e-9, rules)
+    with pytest.raises(ValueError, match=r"cannot fit into a disc of 0\.8 m, whose area holds 5 at most") as refusal:
+        require_room(7, 1.0, 1.01 * largest, rules, callback=told.append)
     assert not told
     stated = float(str(refusal.value).split("a fill_factor of at most ")[1].split()[0])
     assert 0.999 * largest < stated <= largest

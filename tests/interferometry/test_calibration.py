@@ -8,8 +8,8 @@ import torch
 
 from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.grid import Grid
-from torchmask.interferometry.calibration import calibrate_mask
-from torchmask.interferometry.star_fit import require_all_holes, start_frame
+from torchmask.interferometry.calibration import _variance, calibrate_mask
+from torchmask.interferometry.star_fit import StarFit, require_all_holes, start_frame
 from torchmask.interferometry.star_model import Shared, StarModel
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.detector import Detector
@@ -108,6 +108,37 @@ def test_a_star_in_turbulence_anywhere_in_the_field():
     assert bool((difference < 4 * found.geometry_errors).all())
     assert bool((difference < torch.tensor([math.radians(0.1), 2e-3, 2e-3, 2e-3])).all())
     assert bool((found.offset - torch.tensor([-4.0, 3.0])).abs().max() < 4 * found.offset_errors.max())
+
+
+def test_the_place_of_a_star_that_moves_has_the_error_of_a_mean():
+    """The same frame three times, moved by whole pixels: the scatter of the frames over the root of their number."""
+    moves = torch.tensor([[0.0, 1.0], [3.0, 0.0], [-2.0, 2.0]], dtype=torch.float64)  # (x, y)
+    (frame,) = bench(electrons=1e7)
+    frames = torch.stack([frame.roll((int(y), int(x)), (0, 1)) for x, y in moves.tolist()])
+    still, found = (calibrate_mask(some, TOLD, GRID, n_modes=4) for some in (frame[None], frames))
+    torch.testing.assert_close(found.offset, still.offset + moves.mean(0), rtol=0, atol=0.01)
+    # photons leave a place uncertain by 1e-3 pixels or so
+    torch.testing.assert_close(found.offset_errors, moves.std(0) / math.sqrt(3), rtol=0.01, atol=0)
+    assert float(still.offset_errors.max()) < 0.01
+
+
+def test_what_is_left_beyond_the_noise_counts_the_parameters_that_were_fitted():
+    """Residuals of n pixels about a fit of p parameters sum to n - p variances."""
+    n, p, variance = 200, 22, 50.0
+    images = 9.0 + torch.rand(2, n, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    residual = torch.randn(2, n, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    counted = torch.ones(2, n, dtype=torch.float64)
+    counted[1, :50] = 0.0
+    residual *= ((counted.sum(1) - p) * variance / (counted * residual**2).sum(1)).sqrt()[:, None]
+    shared = Shared(torch.eye(2, dtype=torch.float64), torch.zeros(5, dtype=torch.float64))
+    fit = StarFit(torch.zeros(2, p, dtype=torch.float64), shared, images)
+    found = _variance(images + residual, counted, fit, readout_noise=2.0)
+    mean = (counted * found).sum(1) / counted.sum(1)
+    torch.testing.assert_close(mean, torch.full_like(mean, variance), rtol=1e-12, atol=0)
+    torch.testing.assert_close(found - mean[:, None], images - (counted * images).sum(1, True) / counted.sum(1, True))
+    # less than the noise alone, 9.5 photons and 2 electrons of read-out, is chance
+    quiet = _variance(images + 0.1 * residual, counted, fit, readout_noise=2.0)
+    torch.testing.assert_close(quiet, images + 4.0, rtol=1e-12, atol=0)
 
 
 def test_pixels_that_are_told_are_taken_out():

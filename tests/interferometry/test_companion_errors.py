@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from torchmask.grid import ARCSEC, MAS, Grid
+from torchmask.interferometry import companion_errors
 from torchmask.interferometry.companion import CompanionModel, Exposures, Parameters
 from torchmask.interferometry.companion_errors import (
     differences_over_errors,
@@ -118,3 +119,22 @@ def test_injected_companions_are_found_again(star):
     assert border < 0.05
     for row, error in zip(rows, errors, strict=True):
         assert row["separation"] == pytest.approx(250 + float(error[1]) / MAS, abs=0.1)
+
+
+def test_fits_of_injected_companions_start_where_a_search_would_find_them(star, monkeypatch):
+    """At the point of its raster nearest to the truth, not at the truth itself."""
+    model, exposures, fit = star
+    starts = []
+
+    def found(model, injected, start, parameters):
+        starts.append(start)
+        return fit_of(start, torch.eye(3), start[None])
+
+    monkeypatch.setattr(companion_errors, "fit_companion", found)
+    like = tensor(0.1, 0.0, 0.25 * ARCSEC)
+    injection_errors(model, exposures, fit, like, 5, 0.1)
+    turns = 2 * math.pi * (torch.arange(5, dtype=torch.float64) + 0.5) / 5
+    truth = 2.5 * torch.stack([turns.sin(), turns.cos()], 1)  # in steps of the raster
+    places = torch.stack(starts)[:, 1:] / (0.1 * ARCSEC)
+    torch.testing.assert_close(places, truth.round(), rtol=0, atol=1e-9)
+    assert [float(start[0]) for start in starts] == 5 * [0.1]

@@ -96,10 +96,27 @@ def test_summary_of_a_fit_is_that_of_its_equations(small):
     torch.testing.assert_close(found.chi_square, near.square().mean(1) / 100)
 
 
-def test_search_is_the_first_step_of_a_fit(small):
-    """Its contrast is that of a fit that may only change linearly, its error that with the position known."""
+def test_chi_square_is_a_mean_over_the_pixels_that_count(small):
+    exposures, truth = draw(small, TRUTH, error=10.0, noise=10.0)
+    valid = torch.ones_like(exposures.valid)
+    valid[0, 8:14] = valid[1, :, 10:14] = False
+    spoilt = Exposures(torch.where(valid, exposures.frames, 1e9), exposures.errors, valid, exposures.to_pixels)
+    found = fit_companion(small, spoilt, TRUTH, truth, steps=0)
+    for t, chi_square in enumerate(found.chi_square.tolist()):
+        counted = valid[t] & small.near
+        assert int(counted.sum()) < 0.9 * int(small.near.sum())
+        residual = (exposures.frames[t] - found.images[t])[counted] / 10.0
+        assert chi_square == pytest.approx(float(residual.square().mean()), rel=1e-12)
+
+
+@pytest.mark.parametrize("steps", [40, 2])
+def test_search_is_the_first_step_of_a_fit(small, steps):
+    """Its contrast is that of a fit that may only change linearly, its error that with the position known.
+
+    After two steps the fit of the star is not at its end: what it still has to move is no light of a companion.
+    """
     exposures, _ = draw(small, TRUTH, error=100.0, noise=100.0)
-    star = fit_companion(small, exposures)
+    star = fit_companion(small, exposures, steps=steps)
     place = torch.tensor([[2.0, -2.0], [-3.0, 1.0]], dtype=torch.float64)
     contrast, error = search_companions(small, exposures, star, place)
     for offset, here, sure in zip(place, contrast, error, strict=True):

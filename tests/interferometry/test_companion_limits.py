@@ -1,5 +1,7 @@
 """Where companions are looked for, and how faint they may be, in closed form."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -39,3 +41,16 @@ def test_between_annuli_limits_are_linear_and_beyond_them_constant():
     offsets = torch.tensor([[[0.06, 0.08], [0.0, 0.25]], [[0.0, 0.0], [-3.0, 4.0]]], dtype=torch.float64) * ARCSEC
     expected = torch.tensor([[0.02, 0.0125], [0.02, 0.01]], dtype=torch.float64)
     torch.testing.assert_close(limits(offsets), expected, rtol=1e-12, atol=0)
+
+
+def test_the_error_of_a_limit_is_that_of_an_rms_of_independent_squares():
+    """As drawn: the scatter over many rings of the rms of as many normal numbers as squares of 0.1 arcsec fit in."""
+    offsets = search_offsets(0.05)
+    limits = detection_limits(offsets, torch.full((len(offsets),), 1e-3, dtype=torch.float64))
+    generator = torch.Generator().manual_seed(0)
+    for middle, limit, error in zip(limits.separation, limits.contrast, limits.errors, strict=True):
+        n = round(2 * math.pi * middle / 0.1)
+        drawn = torch.randn(4000, n, generator=generator, dtype=torch.float64).square().mean(1).sqrt()
+        # the standard deviation of 4000 numbers is known to 1.1 %; that of an rms of n is 1 / (2 n)^(1/2) but for a
+        # relative 1 / (8 n), and n is rounded by a half at most, which changes it by 1 / (4 n)
+        assert error / limit == pytest.approx(float(drawn.std()), rel=4 / math.sqrt(2 * 4000) + 3 / (8 * n))

@@ -3,13 +3,15 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
-from torchmask.grid import Grid
-from torchmask.interferometry.companion_map import fit_pair, map_companions, raster
+from torchmask.grid import ARCSEC, Grid
+from torchmask.interferometry.companion_map import CompanionMap, fit_pair, map_companions, raster
 from torchmask.interferometry.fringes import frame_observables
-from torchmask.interferometry.measurements import join
+from torchmask.interferometry.measurements import Measurements, join
+from torchmask.interferometry.pair_model import PairResiduals
 from torchmask.observation import Observation
 from torchmask.optics.aperture import SparseAperture
 
@@ -63,6 +65,20 @@ def test_errors_that_were_told_too_small_grow_with_what_is_left(measure_pair):
     assert (variance * math.sqrt(2 / SEEDS) + 1 - 1.1).abs().max() < 4 * 1.1 * math.sqrt((2 + 6 / 18) / SEEDS)
 
 
+def test_errors_never_fall_below_those_of_the_measurements(measure_pair):
+    """Without noise nothing is left, which would be no reason to trust the measurements any more than they say."""
+    seen = measure_pair(TRUTH)
+    fit, found = fit_pair(seen, TRUTH), map_companions(seen, TRUTH[None, 1:])
+    problem = PairResiduals(seen)
+    scaled = torch.autograd.functional.jacobian(lambda x: problem.residuals(x * problem.unit), TRUTH / problem.unit)
+    expected = torch.linalg.inv(scaled.T @ scaled) * problem.unit[:, None] * problem.unit
+    torch.testing.assert_close(fit.covariance, expected, rtol=1e-6, atol=0)
+    # at a known place only the contrast is unknown
+    assert float(found.errors) == pytest.approx(float(scaled[:, 0].square().sum().rsqrt()), rel=1e-6)
+    assert float(found.significance) == pytest.approx(math.sqrt(found.star_chi_square), rel=1e-6)
+    assert found.degrees_of_freedom == fit.degrees_of_freedom == 25 - 3
+
+
 def test_what_errors_half_as_large_again_do_not_explain_is_no_companion(measure_pair):
     fits = [fit_pair(measure_pair(TRUTH, seed, told=told), TRUTH) for told in (1.0, 1 / 1.5, 0.3) for seed in range(8)]
     assert [fit.explained for fit in fits] == 16 * [True] + 8 * [False]
@@ -96,6 +112,33 @@ def test_a_companion_at_the_limit_is_found_at_the_significance_of_the_limit(meas
     slack = 5 * float(limits.errors[0] / limits.contrast[0])
     assert abs(float(significance.mean()) - 5) < slack + 4 / math.sqrt(SEEDS)
     assert float(significance.mean()) > 4
+
+
+def test_the_error_of_a_limit_holds_its_scatter_and_that_of_the_errors_themselves():
+    """Errors scaled by a chi-square of n degrees of freedom are known to 1 / (2 n)^(1/2) of themselves."""
+    places = torch.tensor([[0.0, 0.4], [-0.8, 0.0], [0.0, -1.2], [1.6, 0.0]], dtype=torch.float64)
+    errors = torch.tensor([1e-3, 1e-3, 2e-3, 4e-3], dtype=torch.float64)
+    found = CompanionMap(places * ARCSEC, errors, errors, errors, 30.0, 40.0, 32).limits(ARCSEC, 3.0)
+    own = 1 / math.sqrt(2 * 32)
+    assert found.separation == pytest.approx([0.6, 1.4], rel=1e-12)
+    assert found.contrast == pytest.approx([3e-3, 3 * math.sqrt(10) * 1e-3], rel=1e-12)
+    # in the second annulus 2 and 4 scatter by 1 about 3
+    assert found.errors == pytest.approx([own * 3e-3, 3e-3 * math.hypot(1, own * math.sqrt(10))], rel=1e-12)
+
+
+@pytest.mark.parametrize(("shortest", "most"), [(2.0, 1.25), (0.05, 25.0)])
+def test_a_raster_ends_at_half_the_widest_fringe_and_at_25_of_the_finest(shortest, most):
+    """Baselines up to 5 m; separations in periods of their fringe, eight points to each."""
+    baselines = torch.tensor([[shortest, 0.0], [0.0, -5.0], [1.2, 1.6]], dtype=torch.float64)
+    one, none = torch.ones(3, dtype=torch.float64), torch.zeros(0, dtype=torch.float64)
+    seen = Measurements(
+        baselines, 2e-6 * one, one, 0.01 * one, None, torch.zeros(0, 2, 2, dtype=torch.float64), none, none, none, None
+    )
+    radius = torch.linalg.vector_norm(raster(seen), dim=1) / (2e-6 / 5)
+    line = np.arange(-220, 221) / 8
+    expected = np.hypot(*np.meshgrid(line, line))
+    assert len(radius) == ((expected > 0.5) & (expected < most)).sum()
+    assert 0.5 < radius.min() < radius.max() < most
 
 
 def test_closure_phases_alone_and_several_observations(measure_pair):

@@ -129,6 +129,20 @@ def test_observables_of_faint_frames_are_free_of_bias(expose_points, electrons, 
         assert abs(float(mean.mean())) < 3 * float(error.square().mean().sqrt()) / math.sqrt(len(pulls)) < 0.75
 
 
+def test_photons_whose_errors_are_told_have_a_third_moment_too(expose_points):
+    """As above: triple products of 30 electrons and the errors that they are expected to have."""
+    mask = SparseAperture(CENTERS, 0.1, 1.0)
+    grid = Grid.nyquist(mask.extent, WAVELENGTH, 32, 1.1)
+    clean = expose_points(mask, grid, electrons=30, n_frames=50, oversampling=8).repeat(4, 1, 1)
+    pulls = []
+    for seed in range(4):
+        noisy = torch.poisson(clean, torch.Generator().manual_seed(seed))
+        found = frame_observables(Observation(noisy, mask, grid, 0.0, errors=(clean + 1e-9).sqrt()))
+        pulls.append(mean_pull(found.triple_amplitudes - 1, found.triple_covariance))
+    mean, error = (torch.stack(values) for values in zip(*pulls, strict=True))
+    assert abs(float(mean.mean())) < 3 * float(error.square().mean().sqrt()) / math.sqrt(len(pulls)) < 1.5
+
+
 def correlation_of(covariance):
     deviation = covariance.diagonal().sqrt()
     return covariance / deviation[:, None] / deviation

@@ -137,6 +137,9 @@ def test_what_is_not_finite_is_flagged(tmp_path, mask, grid, expose_points):
     save_oifits(tmp_path / "a.fits", broken, observation, bandwidth=1e-8)
     flags = fits.getdata(tmp_path / "a.fits", "OI_VIS2")["FLAG"]
     assert flags.ravel().tolist() == [True] + 5 * [False]
+    correlations = fits.getdata(tmp_path / "a.fits", "OI_CORR")
+    assert np.isfinite(correlations["CORR"]).all()
+    assert 1 not in correlations["IINDX"]  # the number of that value
 
 
 def test_two_holes_have_a_baseline_and_no_triangle(tmp_path, grid, expose_points):

@@ -150,6 +150,30 @@ def test_a_file_of_a_spectrograph_on_telescopes(revision, tmp_path, recwarn):
     assert int((torch.linalg.eigvalsh(expected) > 1e-9).sum()) == 3
 
 
+def test_values_without_a_positive_error_are_left_out(tmp_path, observables):
+    seen, observation = observables
+    save_oifits(tmp_path / "a.fits", seen, observation, bandwidth=1e-8)
+    with fits.open(tmp_path / "a.fits") as hdus:
+        hdus["OI_VIS2"].data["VIS2ERR"][:2] = [[0.0], [-0.01]]
+        hdus["OI_T3"].data["T3PHIERR"][1] = 0.0
+        hdus.writeto(tmp_path / "b.fits")
+    read = load_oifits(tmp_path / "b.fits")
+    torch.testing.assert_close(read.vis2, seen.vis2[2:], rtol=1e-12, atol=0)
+    torch.testing.assert_close(read.closure_phases, seen.closure_phases[[0, 2, 3]], rtol=1e-12, atol=1e-15)
+
+
+def test_closure_phases_of_two_tables_are_independent_even_at_one_time(tmp_path, observables):
+    """As of two instruments in one night: only triangles of one table share the noise of a baseline."""
+    seen, observation = observables
+    save_oifits(tmp_path / "a.fits", seen, observation, bandwidth=1e-8)
+    with fits.open(tmp_path / "a.fits") as hdus:
+        kept = [hdu.copy() for hdu in hdus if hdu.name != "OI_CORR"]
+        fits.HDUList([*kept, hdus["OI_T3"].copy()]).writeto(tmp_path / "b.fits")
+    correlation = load_oifits(tmp_path / "b.fits").closure_correlation
+    one = torch.tensor([[3, 1, -1, 1], [1, 3, 1, -1], [-1, 1, 3, 1], [1, -1, 1, 3]], dtype=torch.float64) / 3
+    torch.testing.assert_close(correlation, torch.block_diag(one, one))
+
+
 def test_what_is_no_oifits_is_refused(tmp_path, observables):
     with pytest.raises(ValueError, match=r"there is no file .*none\.fits"):
         load_oifits(tmp_path / "none.fits")

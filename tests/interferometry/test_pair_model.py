@@ -7,7 +7,7 @@ import torch
 from torch.autograd import gradcheck
 from torch.autograd.functional import jacobian
 
-from torchmask.interferometry.pair_model import PairResiduals, pair_visibilities
+from torchmask.interferometry.pair_model import PairResiduals, pair_visibilities, square
 
 
 def test_the_closed_form_of_another_hand(binary):
@@ -39,3 +39,14 @@ def test_residuals_of_noise_are_independent_and_of_variance_one(measure_pair):
     # variances scatter by sqrt(2/n), covariances by 1/sqrt(n); 25 and 300 of them stay below 4.5 of it
     assert away.diagonal().max() < 4.5 * math.sqrt(2 / n)
     assert (away - away.diagonal().diag()).max() < 4.5 / math.sqrt(n)
+
+
+def test_a_contrast_is_never_fitted_below_the_faintest(measure_pair):
+    """Data of a star less 0.7 of itself elsewhere would lead there; from -1 on the light of both is negative."""
+    truth = torch.tensor([-0.7, 4.4e-7, -2.4e-7], dtype=torch.float64)
+    problem = PairResiduals(measure_pair(truth))
+    assert square(problem.residuals(truth)) < 1e-9
+    start = torch.cat([torch.tensor([-0.3], dtype=torch.float64), truth[1:]])
+    found, residual = problem.descend(start, 40)
+    assert -0.5 <= float(found[0]) < -0.49
+    assert 1 < square(residual) < square(problem.residuals(start))

@@ -6,6 +6,8 @@ import pytest
 import torch
 
 from torchmask.grid import Grid
+from torchmask.interferometry.star_fit import Information
+from torchmask.interferometry.star_frames import StarFrames
 from torchmask.interferometry.star_model import PLACE, Shared, StarModel
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.geometry import MaskGeometry
@@ -108,3 +110,21 @@ def test_offsets_tell_by_how_much_a_common_tilt_moves_the_image(shape):
     still = model.image(torch.zeros_like(values), lies, kernels).view(25, 25)
     moved = model.image(values, lies, kernels).view(25, 25)
     torch.testing.assert_close(moved[:-2, 1:], still[2:, :-1])
+
+
+@pytest.mark.parametrize("shape", [(32, 36), (33, 35)])
+def test_places_of_stars_count_from_the_middle_pixel_of_odd_sides_too(shape):
+    frames = torch.zeros(2, *shape, dtype=torch.float64)
+    frames[0, shape[0] // 2 + 3, shape[1] // 2 - 2] = frames[1, shape[0] // 2 - 1, shape[1] // 2 + 4] = 1.0
+    star = StarFrames.around(frames, torch.ones_like(frames, dtype=torch.bool), 3)
+    assert star.middles.tolist() == [[-2.0, 3.0], [4.0, -1.0]]  # (x, y)
+    assert star.pixels[:, 3, 3].tolist() == [1.0, 1.0]
+
+
+def test_the_scatter_of_frames_is_that_of_their_mean():
+    """Each tells one number with a variance of 1 / 2: the mean of them all has their sample variance over n."""
+    numbers = torch.tensor([1.0, -2.0, 0.5, 3.0, -2.5], dtype=torch.float64)
+    ones, nothing = torch.ones(5, 1, 1, dtype=torch.float64), torch.zeros(1, 1, dtype=torch.float64)
+    information = Information(2 * ones, 2 * (numbers - numbers.mean())[:, None], ones, nothing)
+    assert float(information.noise_covariance) == pytest.approx(1 / 10, rel=1e-12)
+    assert float(information.covariance) == pytest.approx(float(numbers.var()) / 5, rel=1e-12)

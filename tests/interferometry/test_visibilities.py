@@ -16,6 +16,7 @@ from torchmask.observation import Observation
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.detector import Detector
 from torchmask.optics.pixel import SquarePixel
+from torchmask.optics.round import disc_otf
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.simulation.exposures import simulate_observation
 
@@ -97,6 +98,26 @@ def test_errors_of_a_restored_object_are_those_of_frames_with_its_noise(pixel, e
     torch.testing.assert_close(louder.closure_errors, 2 * found.closure_errors)
     worse = replace(restored(scene, mask, n_frames=2, noise=3.0), chi_square=torch.tensor([3.0, 5.0]))
     torch.testing.assert_close(restored_observables(worse, observation).closure_errors, 2 * found.closure_errors)
+
+
+def test_squares_have_the_covariance_of_circular_noise_and_of_light_that_all_share(mask, grid):
+    """Of |V + n|^2 it is 2 |V|^2 E|n|^2 + (E|n|^2)^2, and light that is wrong by a fraction e lowers all by 2 e."""
+    scene = torch.zeros(grid.shape, dtype=torch.float64)
+    scene[24, 24], scene[25, 23] = 300.0, 60.0
+    observation = Observation(torch.ones(1, *grid.shape), mask, grid, 0.0)
+    found = restored_observables(restored(scene, mask, n_frames=2, noise=2.0), observation)
+    power, noise = found.vis2, 2 * found.visibility_errors**2  # of real and imaginary part
+    assert float((noise / power).min()) > 0.1  # the square of the noise counts
+    nu_y, nu_x = grid.frequencies(torch.float64)
+    transfer = disc_otf((torch.hypot(nu_x, nu_y) / grid.cutoff(0.1)).clamp(max=1))  # of all holes, about zero frequency
+    of_light = 2.0**2 * math.prod(grid.shape) / (360.0**2 * 2 * float(transfer.square().sum()))
+    apart = torch.triu_indices(6, 6, 1).unbind()
+    shared = found.vis2_covariance[apart] / (power[:, None] * power)[apart]
+    torch.testing.assert_close(shared, shared[0].expand(15), rtol=1e-9, atol=0)
+    # a hole, sampled 8 times, and its patch of 40 frequencies are known to some percent
+    assert float(shared[0]) == pytest.approx(4 * of_light, rel=0.08)
+    own = found.vis2_covariance.diagonal() - shared[0] * power**2
+    torch.testing.assert_close(own, 2 * power * noise + noise**2, rtol=1e-9, atol=0)
 
 
 def test_restoring_a_binary_brings_its_closure_phases_nearer_the_truth(binary):

@@ -1,13 +1,15 @@
 """Bands as a few wavelengths, by Gauss quadrature; filters by the cards of a header."""
 
 import math
+import warnings
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchmask.optics.band import FILTERS, Band, Filter, filter_of_header
+from torchmask.optics.band import FILTERS, Band, Filter, filter_of_header, warn_of_few_wavelengths
+from torchmask.optics.passband import Passband
 
 
 @pytest.mark.parametrize("width", [-10e-9, 0.0, 1.2e-6, math.nan])
@@ -109,3 +111,17 @@ def test_the_relative_width_is_that_of_the_top_hat_of_equal_scatter():
     assert Band.top_hat(2e-6, 0.5e-6, 3).relative_width == pytest.approx(0.25, rel=1e-12)
     assert Band.of([0.9e-6, 1.1e-6]).relative_width == pytest.approx(math.sqrt(3) * 0.2, rel=1e-12)
     assert Band.of([1e-6]).relative_width == 0
+
+
+@pytest.mark.parametrize(
+    ("percent", "enough"), [(4.9, 1), (5.0, 1), (5.1, 2), (19.9, 2), (20.0, 2), (20.1, 3), (35.1, 4)]
+)
+def test_one_wavelength_stands_for_five_percent_and_each_other_for_fifteen_more(percent, enough):
+    """Of the width over the mean wavelength; as many as that are not warned of."""
+    passband = Passband.top_hat(550e-9, percent / 100 * 550e-9)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_few_wavelengths(passband, enough)
+    if enough > 1:
+        with pytest.warns(UserWarning, match=f"n_wavelengths is {enough - 1} .* {enough} wavelengths do"):
+            warn_of_few_wavelengths(passband, enough - 1)

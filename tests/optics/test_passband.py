@@ -8,6 +8,7 @@ from astropy import constants, units
 from astropy.modeling.physical_models import BlackBody
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.integrate import trapezoid
 from speclite import filters
 
 from torchmask.optics.band import Band
@@ -38,6 +39,18 @@ def test_2mass_bands_pass_the_photons_of_vega(band, flux, width, wavelength):
     assert Passband.find(name).ab_photons * 10 ** (-0.4 * VEGA_IN_AB[name]) == pytest.approx(photons, rel=0.03)
 
 
+@pytest.mark.parametrize(
+    ("band", "flux"), [("U", 1.790), ("B", 4.063), ("V", 3.636), ("R", 3.064), ("I", 2.416), ("J", 1.589), ("H", 1.021)]
+)
+def test_magnitudes_of_vega_are_those_of_its_flux(band, flux):
+    """Bessell, Castelli & Plez, Astron. Astrophys. 333, 231 (1998), table A2: 1e-20 erg / (s cm^2 Hz) at magnitude 0.
+
+    Their zero points and those of Blanton & Roweis differ by 0.03 mag, as do the bands of 2MASS and theirs.
+    """
+    name = f"bessell-{band}" if band in "UBVRI" else f"twomass-{band}"
+    assert VEGA_IN_AB[name] == pytest.approx(-2.5 * math.log10(1e-20 * flux) - 48.6, abs=0.04)
+
+
 def test_an_even_band_passes_the_photons_of_the_closed_form():
     photons = 3631e-26 / constants.h.value * math.log(600 / 500)
     assert Passband.top_hat(550e-9, 100e-9).ab_photons == pytest.approx(photons, rel=1e-9)
@@ -59,6 +72,19 @@ def test_light_of_a_black_body_is_plancks(temperature, wavelength, width):
     x, light = Passband.top_hat(wavelength, width * wavelength).light(temperature)
     radiance = BlackBody(temperature * units.K, scale=1 * units.Unit("W / (m2 m sr)"))(x * units.m).value * x
     np.testing.assert_allclose(light, radiance / radiance.max(), rtol=2e-6)  # constants of other years
+
+
+def test_an_uneven_curve_has_the_mean_and_the_photons_of_its_integrals():
+    """Straight from 0.2 to 1 within 20 nm, and to 0.1 within 80 nm; integrals by trapezoids of a thousandth of a nm."""
+    passband = Passband((500e-9, 520e-9, 600e-9), (0.2, 1.0, 0.1))
+    x = np.linspace(500e-9, 600e-9, 100_001)
+    passed = np.interp(x, passband.wavelengths, passband.transmission)
+    # the error of trapezoids is that of the curvature over their width, 1e-5 of the band, squared
+    mean = trapezoid(passed * x, x) / trapezoid(passed, x)
+    assert passband.mean_wavelength == pytest.approx(mean, rel=1e-9)
+    assert passband.mean_wavelength == pytest.approx(1e-9 * (12 * 512.2222 + 44 * 549.0909) / 56, rel=1e-6)
+    photons = 3631e-26 / constants.h.value * trapezoid(passed / x, x)
+    assert passband.ab_photons == pytest.approx(photons, rel=1e-9)
 
 
 @pytest.mark.parametrize("name", ["bessell-V", "decam2014-g"])

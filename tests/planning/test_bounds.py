@@ -9,7 +9,7 @@ from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.otf import OTF
 from torchmask.optics.zernike import ZernikePhase
-from torchmask.planning.bounds import myopic_bound
+from torchmask.planning.bounds import _columns, _half_plane, myopic_bound
 from torchmask.restoration.aberrations import turbulent_basis
 from torchmask.spectra import NoisePSD, PowerLawPSD
 
@@ -130,3 +130,13 @@ def test_finer_samples_change_the_excess_little():
 def test_what_cannot_be_is_refused(changes, said):
     with pytest.raises(ValueError, match=said):
         bound(**changes)
+
+
+@pytest.mark.parametrize("shape", [(6, 8), (6, 7), (5, 8)])
+def test_half_spectra_have_the_products_of_whole_ones(shape):
+    """Of real fields, whatever their sides: columns that stand for two count twice."""
+    fields = torch.randn(3, *shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    spectra, grid = torch.fft.fft2(fields), Grid(shape, 1e-7, 5e-7)
+    columns = _columns(spectra, _half_plane(grid))
+    whole = torch.einsum("ahw,bhw->ab", spectra, spectra.conj())
+    torch.testing.assert_close(columns @ columns.T, whole.real, rtol=1e-12, atol=1e-12)

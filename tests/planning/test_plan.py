@@ -376,6 +376,7 @@ def test_frames_that_repeat_themselves_are_told(quick):
         assert found.best_instrument.frames_that_differ(MASK.subaperture_diameter) == pytest.approx(differ, rel=1e-12)
         line = f"only about {differ:.0f} of the 20 frames show turbulence of their own"
         assert (line in str(found)) == said
+        assert ("The wind takes 9.13 ms to cross 0.09129 m" in str(found)) == said
 
 
 def test_an_image_of_nothing_is_called_that(quick, tmp_path, capsys):

@@ -58,6 +58,15 @@ def test_light_narrower_than_the_first_band_counts_as_that():
         assert ratio(1e5, 4.0, 0.0) == ratio(1e5, 4.0, 0.2)
 
 
+def test_exposures_shorter_than_the_first_count_as_that():
+    first = SmearingMap(PHOTONS, (0.5, 1.0, 4.0), SPREADS, LONG, WIDE)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        short, tried = (first.outlook(INSTANTS, n_photons=1e5, exposure=t, spread=0.2) for t in (0.0, 0.5))
+    assert short == tried
+    assert short.outside == ()
+
+
 @pytest.mark.parametrize(
     ("point", "edge", "name", "said"),
     [

@@ -61,6 +61,16 @@ def test_turbulence_strength_is_unbiased(aperture):
     assert few.turbulence_strength(draw(3, few.n_parameters)) is None
 
 
+@pytest.mark.parametrize(
+    ("aperture", "n_modes"), [(SparseAperture([[0.0, 0.3], [0.3, -0.2]], 0.2, 1.0), 3), (PUPIL, 5)]
+)
+def test_turbulence_strength_takes_two_modes_at_least(aperture, n_modes):
+    """Tip and tilt of a mask, defocus and one astigmatism of a single aperture; one of them alone does not tell."""
+    enough, few = (turbulent_basis(aperture, n, 0, 0.15, 20.0) for n in (n_modes, n_modes - 1))
+    assert enough.turbulence_strength(draw(3, enough.n_parameters)) is not None
+    assert few.turbulence_strength(draw(3, few.n_parameters)) is None
+
+
 def test_what_is_common_to_all_frames_says_nothing_of_the_turbulence(five_holes):
     alone, beside = (turbulent_basis(five_holes, 3, common, R0, OUTER_SCALE) for common in (0, 6))
     z = draw(5, beside.n_parameters)

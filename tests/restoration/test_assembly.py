@@ -6,12 +6,16 @@ from dataclasses import replace
 import pytest
 import torch
 
+from torchmask.optics.geometry import MaskGeometry
+from torchmask.restoration import assembly
 from torchmask.restoration.assembly import add_deviations, assemble_result
+from torchmask.restoration.background import Background
 from torchmask.restoration.candidates import Candidates
 from torchmask.restoration.checkpoint import Progress, Status
 from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.objective import Free
 from torchmask.restoration.posterior import evenness
+from torchmask.restoration.traits import Refinement
 
 UNIT, NOISE = 500.0, 0.03  # electrons, and the noise of `explained` in units of the mean
 
@@ -106,3 +110,45 @@ def test_deviations_of_an_even_object_are_smaller_unless_light_was_faint(ended):
     )
     assert evenness(progress.state.image) < 0.8
     torch.testing.assert_close(bright, faint * evenness(progress.state.image))
+
+
+def test_a_result_includes_the_sky_that_was_told_and_the_one_that_was_found(explained):
+    """In electrons: the told one as given, and of the found one, which the frames hold in units of a mean pixel."""
+    objective, state = explained
+    found = torch.tensor([0.5, 0.2, 0.0, 1.0], dtype=torch.float64)
+    told = torch.tensor([0.0, 100.0, 50.0, 25.0], dtype=torch.float64)[:, None, None] * torch.linspace(0, 2, 32)
+    frames = objective.model(state.image, state.z) + found[:, None, None]
+    valid, precision = torch.ones_like(frames, dtype=torch.bool), torch.ones(1, 1, 1, dtype=torch.float64)
+    stack = FrameStack(frames, valid, UNIT, 1.0, told, Background.PER_FRAME)
+    model = objective.model.beside(Background.PER_FRAME)
+    objective = type(objective)(model, frames, precision, objective.prior)
+    result = assemble_result(objective, stack, Progress(Candidates(state, 1), [1.0]), r0=None)
+    torch.testing.assert_close(result.background, UNIT * found + told.mean((1, 2)), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(result.model, UNIT * frames + told, rtol=1e-9, atol=1e-9)
+    assert float(result.residuals.abs().max()) < 1e-9
+
+
+def test_the_deviation_of_a_magnification_is_that_of_a_shrinkage_times_it(ended, monkeypatch):
+    """A shrinkage is minus the logarithm of a magnification; the rotation is an angle already."""
+    objective, stack, progress = ended
+    monkeypatch.setattr(assembly, "place_deviations", lambda *_: torch.tensor([0.01, 0.02], dtype=torch.float64))
+    state = replace(progress.state, geometry=MaskGeometry(0.1, 1.5, 1.5))
+    progress = Progress(Candidates(state, 1), [1.0], refinement=Refinement.ON)
+    result = assemble_result(objective, stack, progress, r0=None)
+    assert result.geometry_std is not None
+    assert result.geometry_std.tolist() == pytest.approx([0.01, 0.03])
+
+
+def test_the_deviation_of_a_coefficient_is_its_rms_over_samples_and_frames(ended, monkeypatch):
+    """Of coefficients, not of parameters, which the basis mixes; that of the object is in electrons."""
+    objective, stack, progress = ended
+    state, basis = replace(progress, integrated=True).state, objective.model.aberrations
+    z = torch.randn(5, *state.z.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    monkeypatch.setattr(assembly, "standard_deviations", lambda *_: (2 * state.image, z))
+    result = assemble_result(objective, stack, progress, r0=None, n_modes=2)
+    found = add_deviations(result, objective, stack, replace(progress, integrated=True), 5)
+    scatter = torch.zeros(5, 3, dtype=torch.float64)
+    for sample, frame in ((sample, frame) for sample in range(5) for frame in range(4)):
+        scatter += (basis.mixing @ z[sample, frame]).view(5, 3) ** 2 / 20
+    torch.testing.assert_close(found.coefficients_std, scatter.sqrt()[:, :2], rtol=1e-9, atol=0)
+    torch.testing.assert_close(found.object_std, 2 * result.object, rtol=1e-12, atol=0)

@@ -124,6 +124,20 @@ def test_transmissions_are_those_of_what_rises_above_the_background(random_expos
     assert float(chi_square.max()) < 1e-20
 
 
+def test_a_common_sky_is_never_less_than_none(random_exposures, three_holes):
+    """Frames from which too much was subtracted are fitted as if no sky were free."""
+    model, image, z, _, precision = random_exposures(ExposureModel(three_holes, GRID, 4))
+    frames = model(image, z) - 3.0
+    ones = torch.ones(3, dtype=torch.float64)
+    state = State(image, z, Calibration(ones, ones, 1.0))
+    told, free = (
+        fit_of_frames(MyopicObjective(model.beside(background), frames, precision, TotalVariation()), state)
+        for background in (Background.NONE, COMMON)
+    )
+    for one, other in zip(free, told, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-12, atol=0)
+
+
 def test_the_darkest_part_is_that_of_the_mean_frame():
     frames = torch.full((3, 40, 32), 9.0, dtype=torch.float64)
     frames[:, :5, 4:8] = torch.tensor([2.0, 6.0, 4.0]).double()[:, None, None]

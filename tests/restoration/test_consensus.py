@@ -97,6 +97,20 @@ def test_aberrations_are_fitted_to_the_mean_object(explained):
     torch.testing.assert_close(found.image / found.image.sum(), state.image / state.image.sum())
 
 
+def test_the_mean_is_light_and_has_the_mean_weight_of_the_prior(explained):
+    """A sharp object between the pixels rings when it is shifted, by less than nothing."""
+    objective, state = explained
+    point = torch.zeros_like(state.image)
+    point[12, 14] = 100.0
+    between = shift(point, (0.5, 0.5)).clamp(min=0)
+    assert float(shift(between, (-0.5, -0.5)).min()) < -1
+    sharp = [replace(state, image=image) for image in (point, between)]
+    weighed = [one.calibrated(aberration_weight=weight) for one, weight in zip(sharp, (0.5, 2.0), strict=True)]
+    mean = registered_mean(objective, weighed)
+    assert float(mean.image.min()) == 0
+    assert mean.calibration.aberration_weight == pytest.approx(1.25, rel=1e-12)
+
+
 # --- whole restorations
 
 STAGES = ("restoration", "fit to the mean")

@@ -8,8 +8,10 @@ import torch
 
 from torchmask.grid import Grid
 from torchmask.metrics import shift
+from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.band import Band
-from torchmask.restoration.aberrations import AberrationBasis
+from torchmask.restoration import escapes
+from torchmask.restoration.aberrations import AberrationBasis, turbulent_basis
 from torchmask.restoration.background import Background
 from torchmask.restoration.escapes import centre_on_pixels, restart_outlier_frames, settle, tilt
 from torchmask.restoration.forward import ExposureModel
@@ -118,6 +120,44 @@ def test_restarts_are_those_of_the_seed(explained):
     assert not torch.equal(restarted(1), restarted(2))
 
 
+def test_frames_are_lost_by_the_noise_of_the_best_quarter(explained, monkeypatch):
+    """Which half of the frames being lost does not change; the limit is 1.25 times its highest residual variance."""
+    objective, state = explained
+    noise = torch.tensor([1.0, 3.0, 1.0, 3.0], dtype=torch.float64)
+    monkeypatch.setattr(escapes, "calibrate", lambda objective, state: state.calibrated(noise_inflation=noise))
+    started = []
+
+    def descend(objective, state, *rest):
+        started.append(len(state.z))
+        raise StopIteration
+
+    monkeypatch.setattr(escapes, "descend", descend)
+    with pytest.raises(StopIteration):
+        restart_outlier_frames(objective, state, FIRST_INFLATION, SCHEDULE, idle, seed=1)
+    assert started == [2 * SCHEDULE.restarts]
+
+
+def test_restarts_scatter_around_what_is_expected_by_as_much_as_the_others_do(explained, monkeypatch):
+    """Whatever is expected: moved with all aberrations, it moves the starts, and nothing else changes."""
+    objective, state = explained
+    every, started = replace(SCHEDULE, outlying=0.0, restarts=1, restart_rounds=1), []
+
+    def descend(objective, state, *rest):
+        started.append(state.z)
+        return state
+
+    monkeypatch.setattr(escapes, "descend", descend)
+    apart = torch.linspace(-3, 3, state.z.numel(), dtype=torch.float64).view_as(state.z)
+    elsewhere = objective.with_changes(centre=apart), replace(state, z=state.z + apart)
+    for there, now in ((objective, state), elsewhere):
+        restart_outlier_frames(there, now, FIRST_INFLATION, every, idle, seed=1)
+    assert started[0].shape == state.z.shape
+    torch.testing.assert_close(started[1] - apart, started[0], rtol=0, atol=1e-12)
+    rms = float(state.z.square().mean(1).sqrt().median())
+    # as many normal numbers have this rms, within four standard errors
+    assert float(started[0].square().mean().sqrt()) == pytest.approx(rms, rel=4 / math.sqrt(2 * state.z.numel()))
+
+
 def test_what_all_frames_share_stays_when_one_starts_anew(five_holes, five_hole_basis, explain):
     shared = AberrationBasis(five_hole_basis.mixing, 3, n_common=6)
     objective, state = explain(ExposureModel(five_holes, GRID, shared))
@@ -153,6 +193,16 @@ def test_tilt_moves_every_image(offset, band, five_holes, five_hole_basis):
     z = torch.randn(2, five_hole_basis.n_parameters, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     moved = model.psf(z + tilt(model, offset))
     torch.testing.assert_close(moved, shift(model.psf(z), offset), rtol=0, atol=1e-9)
+
+
+def test_tilt_moves_images_of_a_mask_that_is_off_its_centre():
+    """Its holes have a mean piston then, which modes of turbulence do not include, and no image shows."""
+    mask = SparseAperture([[0.1, 0.4], [0.4, 0.0], [0.0, -0.1]], 0.36, 1.2)
+    basis = turbulent_basis(mask, 3, 0, 0.25, 20.0)
+    model = ExposureModel(mask, GRID, basis)
+    z = torch.randn(2, basis.n_parameters, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    moved = model.psf(z + tilt(model, (1.3, -0.6)))
+    torch.testing.assert_close(moved, shift(model.psf(z), (1.3, -0.6)), rtol=0, atol=1e-9)
 
 
 def moved_away(objective, state, offset):
@@ -199,6 +249,27 @@ def test_beside_a_sky_an_object_that_is_moved_costs_no_more_than_before(backgrou
     before, after = (float(objective.evaluator(one.calibration)(one.image, one.z).value) for one in (begun, found))
     assert found is not begun
     assert after < before
+
+
+@pytest.mark.parametrize("background", [Background.NONE, Background.PER_FRAME, Background.COMMON])
+def test_an_object_is_settled_in_the_misfit_and_the_price_of_its_light(background, explained, monkeypatch):
+    told, state = explained
+    objective = MyopicObjective(told.model.beside(background), told.frames + 0.5, told.precision, told.prior)
+    asked = []
+
+    def settle_object(image, slope, power, prior, n_iterations):
+        asked.append((image, slope, power, prior, n_iterations))
+        return 0.0, 2 * image
+
+    monkeypatch.setattr(escapes, "settle_object", settle_object)
+    found = settle(objective, state, 7)
+    ((image, slope, power, prior, n_iterations),) = asked
+    misfit, curved = objective.object_quadratic(state.image, state.z, state.calibration)
+    torch.testing.assert_close(slope, misfit + (0.0 if background is Background.NONE else 1.0), rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(power, curved)
+    assert (image is state.image, prior is objective.prior, n_iterations) == (True, True, 7)
+    assert torch.equal(found.image, 2 * state.image)
+    assert found.z is state.z
 
 
 def test_an_object_on_its_pixels_is_the_very_same_state(explained):

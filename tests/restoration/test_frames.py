@@ -2,12 +2,14 @@
 
 import math
 import warnings
+from dataclasses import replace
 
 import pytest
 import torch
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture
+from torchmask.restoration.background import Background
 from torchmask.restoration.frames import FrameStack, border_brightness
 from torchmask.restoration.myopic import MyopicDeconvolution
 
@@ -125,3 +127,53 @@ def test_errors_without_photons_weigh_every_pixel_by_itself():
     assert bool((stack.noise_of_frames.level == 1).all())
     single = stack.to(torch.float32, torch.device("cpu"))
     assert single.precision.dtype == torch.float32
+
+
+def test_contrast_is_the_chi_square_of_the_weighted_mean_frame_against_an_even_one():
+    """Each pixel of the mean has the inverse variance of all its valid frames; pixels without any do not count."""
+    generator = torch.Generator().manual_seed(2)
+    frames, errors = exposures(), 1 + 5 * torch.rand(4, *GRID.shape, dtype=torch.float64, generator=generator)
+    valid = torch.rand(4, *GRID.shape, generator=generator) > 0.2
+    valid[:, 3, :5] = False
+    stack = FrameStack(frames / 7, valid, 7.0, 1.0, errors=errors)
+    means, weights = [], []
+    for row, column in ((row, column) for row in range(32) for column in range(32)):
+        seen = valid[:, row, column]
+        if bool(seen.any()):
+            weight = errors[seen, row, column] ** -2
+            weights.append(float(weight.sum()))
+            means.append(float((weight * frames[seen, row, column]).sum()) / weights[-1])
+    mean, weight = (torch.tensor(values, dtype=torch.float64) for values in (means, weights))
+    level = float((weight * mean).sum() / weight.sum())
+    assert stack.contrast == pytest.approx(float((weight * (mean - level) ** 2).mean()), rel=1e-9)
+
+
+def test_contrast_of_noise_alone_is_one():
+    """Within four standard errors, of a chi-square of nearly as many degrees of freedom as pixels."""
+    noise = READOUT * torch.randn(6, *GRID.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    stack = FrameStack(noise + 4.0, torch.ones(6, *GRID.shape, dtype=torch.bool), 1.0, READOUT**2)
+    assert stack.contrast == pytest.approx(1, abs=4 * math.sqrt(2 / 1024))
+
+
+def test_noise_of_frames_includes_that_of_a_known_sky():
+    """It makes a frame noisier where it is brighter, whether it was subtracted or not."""
+    sky = torch.tensor([0.0, 20.0, 60.0, 10.0], dtype=torch.float64)[:, None, None]
+    frames, known = exposures() + sky, sky * torch.linspace(0.5, 1.5, 32, dtype=torch.float64)
+    valid, variance = torch.ones_like(frames, dtype=torch.bool), float(frames.mean()) + READOUT**2
+    bare = FrameStack(frames / 30, valid, 30.0, variance, slope=1.0)
+    told = FrameStack((frames - known) / 5, valid, 5.0, variance, known, slope=1.0)
+    assert float(bare.noise_of_frames.level.max()) > 1.5 * float(bare.noise_of_frames.level.min())
+    for one, other in zip(told.noise_of_frames, bare.noise_of_frames, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-9, atol=0)
+
+
+def test_a_free_sky_that_changes_is_no_change():
+    """Of frames whose light is the same but for its brightness, above the sky in their darkest part."""
+    light = torch.zeros(GRID.shape, dtype=torch.float64)
+    light[10:20, 12:22] = 5.0
+    frames = light * torch.tensor([0.5, 1.0, 1.5]).double()[:, None, None]
+    sky = torch.tensor([3.0, 0.2, 1.0], dtype=torch.float64)[:, None, None]
+    stack = FrameStack(frames + sky, torch.ones_like(frames, dtype=torch.bool), 1.0, 0.01, free=Background.PER_FRAME)
+    unit = float(frames.mean())  # of the light, which is what brightness is relative to
+    assert replace(stack, frames=stack.frames / unit, unit=unit).change.each < 1e-20
+    assert replace(stack, frames=stack.frames / unit, unit=unit, free=Background.NONE).change.each > 1

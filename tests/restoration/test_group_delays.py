@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from torchmask.restoration import group_delays
 from torchmask.restoration.aberrations import turbulent_basis
 from torchmask.restoration.descent import descend
 from torchmask.restoration.fringes import change_fringes
@@ -170,3 +171,13 @@ def test_what_is_expected_of_the_aberrations_holds_them(wide, off):
     held = off(objective, state, [0, 0.5, 0, 0, 0]).calibrated(aberration_weight=1e9)
     begun, _ = start_from_delays(known, held, 30.0, ProjectedLBFGS())
     torch.testing.assert_close(begun.z, state.z, rtol=0, atol=1e-3)  # 1e9 against a misfit of some 1e5
+
+
+@pytest.mark.parametrize(
+    ("errors", "tells"),
+    [([0.1, 0.1, 0.26, 0.26, 0.26], False), ([0.24, 0.24, 0.24, 9.0, 9.0], True), ([0.26] * 5, False)],
+)
+def test_delays_are_told_if_those_of_most_holes_are_to_a_quarter_of_a_wave(errors, tells, explained, monkeypatch):
+    """Of which two standard errors are half a wave."""
+    monkeypatch.setattr(group_delays, "delay_errors", lambda *_: torch.tensor([errors, errors]))
+    assert tells_delays(*explained) is tells

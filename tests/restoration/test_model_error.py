@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from torchmask.atmosphere.von_karman import modal_covariance
 from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.restoration.aberrations import turbulent_basis
@@ -31,6 +32,21 @@ def test_holes_are_independent_and_what_is_left_out_has_no_low_modes(five_holes)
     coefficients = rest.coefficients(torch.eye(rest.n_parameters, dtype=torch.float64))
     assert float(coefficients[..., :6].abs().max()) == 0
     assert int((coefficients.square().sum(2) > 0).sum(1).max()) == 1
+
+
+@pytest.mark.parametrize("n_modes", [1, 3, 6])
+def test_what_is_left_out_is_conditional_on_the_modes_that_are_included(n_modes, five_holes):
+    """Modes of turbulence are correlated, so the others are known in part: their covariance is the inverse of their
+    block of the inverse covariance of all."""
+    rest = LeftOut.of(five_holes, n_modes, 0.25, 20.0).rest
+    hole = five_holes.replace(centers=torch.zeros(1, 2, dtype=torch.float64))
+    covariance = modal_covariance(hole, rest.n_modes, 0.25, 20.0)
+    expected = torch.linalg.inv(torch.linalg.inv(covariance)[n_modes:, n_modes:])
+    mixing = rest.mixing.unflatten(0, (5, rest.n_modes))[2]
+    found = (mixing @ mixing.T)[n_modes:, n_modes:]
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-9 * float(expected.max()))
+    if n_modes > 1:  # piston alone is hardly correlated
+        assert float((expected - covariance[n_modes:, n_modes:]).abs().max()) > 0.01 * float(expected.max())
 
 
 def with_left_out(objective, state, left_out, strength=1.0, seed=7):

@@ -158,3 +158,37 @@ def test_errors_that_are_the_same_in_all_frames_hold_no_photons():
     assert photon_slope(frames, detector.sqrt().expand_as(frames), valid) == 0
     assert photon_slope(frames[:1], variance[:1].sqrt(), valid[:1]) == 0  # one frame does not tell
     assert photon_slope(-frames.abs(), variance.sqrt(), valid) == 0
+
+
+def test_errors_that_fall_where_counts_rise_hold_no_photons():
+    frames, variance, _ = photons_on_a_map(1.0)
+    falling = variance.max() + 1 - variance
+    valid = torch.ones_like(frames, dtype=torch.bool)
+    assert photon_slope(frames, falling.sqrt(), valid) == 0
+
+
+def test_errors_are_taken_as_given_where_frames_show_more_noise():
+    """Not those of photon and read-out noise, which leave out a sky that was subtracted, or a dark current."""
+    frames = 49 + 7 * torch.randn(8, *GRID.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    errors, valid = torch.full_like(frames, 5.5), torch.ones_like(frames, dtype=torch.bool)
+    assert expected_variance(frames, GRID, PUPIL, None, valid, errors) == pytest.approx(5.5**2, rel=1e-12)
+    dark = frames - 20.0  # of photons 29, while 49 are measured within a tenth
+    assert expected_variance(dark, GRID, PUPIL, 0.0, valid) == pytest.approx(49, rel=0.1)
+    assert expected_variance(dark, GRID, PUPIL, 0.0, valid) == expected_variance(dark, GRID, PUPIL, None, valid)
+
+
+def test_noise_is_no_evener_than_even():
+    """Even light leaves a mean square of 1, from which taking the noise off alone would leave less by chance."""
+    frames = torch.full((1, 4, 4), 50.0, dtype=torch.float64)
+    valid, precision = torch.ones(1, 4, 4, dtype=torch.bool), torch.full((1, 1, 1), 1 / 50, dtype=torch.float64)
+    found = FrameNoise.of(frames, valid, precision, 1.0)
+    assert float(found.level) == 1
+    assert float(found.unevenness) == 1
+
+
+def test_errors_below_their_photon_noise_have_that_of_a_mean_pixel_alone():
+    """As where counts are noisier than the light that the errors were made from: nothing is left of the detector."""
+    frames = torch.tensor([[[100.0, 20.0, 30.0, -10.0]]], dtype=torch.float64)
+    errors = torch.tensor([[[60.0, 20.0, 34.0, 9.0]]], dtype=torch.float64).sqrt()
+    found = even_photons(frames, errors, 1.0).square()
+    torch.testing.assert_close(found, 35.0 + torch.tensor([[[0.0, 0.0, 4.0, 9.0]]]).double(), rtol=1e-12, atol=1e-12)

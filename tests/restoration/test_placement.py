@@ -13,9 +13,10 @@ from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.band import Band
 from torchmask.optics.geometry import MaskGeometry
 from torchmask.restoration.adjoint import data_fidelity
+from torchmask.restoration.background import Background
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.myopic import MyopicDeconvolution
-from torchmask.restoration.objective import Free
+from torchmask.restoration.objective import Free, MyopicObjective
 from torchmask.restoration.placed import PlacedSamples, centers_of, moved_centers
 from torchmask.restoration.placement import (
     distance,
@@ -153,6 +154,32 @@ def test_what_frames_tell_of_a_misplaced_mask(step, explain):
     here = misplacement(objective, state)
     assert here.gain < 9.2  # half of a chi-square with two degrees of freedom, which one noise in 10000 exceeds
     assert bool((here.step.abs() < 4 * deviations).all())
+
+
+@pytest.mark.parametrize("background", [Background.PER_FRAME, Background.COMMON])
+def test_a_sky_does_not_look_like_a_misplaced_mask(background, explain):
+    """Whatever its level, where it is free; one that is not shifts the step by many deviations."""
+    told, state = explain()
+    model, steps = told.model.beside(background), []
+    for sky in (1.0, 4.0):
+        objective = MyopicObjective(model, told.frames + sky, told.precision, told.prior)
+        steps.append(misplacement(objective, state))
+    torch.testing.assert_close(steps[0].step, steps[1].step, rtol=1e-9, atol=1e-12)
+    assert steps[0].gain == pytest.approx(steps[1].gain, rel=1e-9)
+    not_free = MyopicObjective(told.model, told.frames + 4.0, told.precision, told.prior)
+    assert misplacement(not_free, state).gain > 10 * steps[1].gain
+
+
+def test_the_gain_of_a_step_is_what_the_misfit_falls_by(explain):
+    """To first order of the frames in the step, as far as that changes them."""
+    objective, state = explain()
+    found = misplacement(objective, state)
+    frames, precision, _ = objective.scaled_data(state.calibration)
+    left = frames - objective.model(state.image, state.z)
+    slopes = slopes_of_frames(objective.model, state.image, state.z)
+    moved_by = left - torch.einsum("s,stij->tij", found.step, slopes)
+    falls = 0.5 * float((precision * (left**2 - moved_by**2)).sum())
+    assert found.gain == pytest.approx(falls, rel=1e-6)
 
 
 def test_deviations_allow_for_what_aberrations_imitate(explain):

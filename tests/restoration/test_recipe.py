@@ -12,6 +12,7 @@ from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.band import Band
 from torchmask.optics.zernike import zernike_basis
 from torchmask.restoration.aberrations import turbulent_basis
+from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.recipe import FULL_MODES, MASK_MODES, ModelRecipe
 
 GRID = Grid.nyquist(1.0, 550e-9, 32)
@@ -144,3 +145,14 @@ def test_a_faint_search_has_at_most_six_modes(options, blind, first, then):
 def test_a_full_pupil_has_all_its_modes_however_faint():
     made = recipe(FullAperture(1.0), frame_modes=10, last_modes=15)
     assert made.for_frames(blind=True, faint=True) is made
+
+
+def test_turbulence_that_is_not_told_is_as_wide_as_a_hole():
+    """A full pupil spans seven times its r0, and the outer scale is twenty times the mask."""
+    for aperture, r0 in ((mask(), 0.3), (FullAperture(1.4), 0.2)):
+        grid = Grid.nyquist(1.4, 550e-9, 32)
+        made = MyopicDeconvolution(aperture, grid, 3).recipe
+        assert made.r0 == pytest.approx(r0, rel=1e-12)
+        assert made.outer_scale == pytest.approx(20 * aperture.mask_diameter, rel=1e-12)
+        told = MyopicDeconvolution(aperture, grid, 3, r0=0.17, outer_scale=33.0).recipe
+        assert (told.r0, told.outer_scale) == (0.17, 33.0)

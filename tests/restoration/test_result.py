@@ -40,6 +40,17 @@ def test_frames_have_the_numbers_that_they_are_given(restored):
         seen.with_frame_numbers(range(7))
 
 
+def test_a_summary_tells_the_change_of_pistons_against_their_mean_and_what_is_known_of_the_mask(restored):
+    """A change of all holes alike, of tilts or of other modes is no change of pistons."""
+    motion = torch.zeros(8, 5, 3, dtype=torch.float64)
+    motion[..., 0] = 7.0 + torch.tensor([0.5, -0.5, 0.0, 0.0, 0.0])  # 0.1 on average, when squared
+    motion[..., 1:] = 3.0
+    told = dataclasses.replace(restored, motion=motion, rotation=0.01, magnification=1.02)
+    told = dataclasses.replace(told, geometry_std=torch.tensor([0.002, 0.003])).summary()
+    assert "pistons change by 0.32 rad rms while a frame lasts" in told
+    assert "turned by 0.573 +- 0.115 deg from x to y and magnified by 1.02000 +- 0.00300" in told
+
+
 def result_of_version_0_1(n_frames=2):
     """The arrays that 0.1.0 wrote, as numpy writes them: gains and a weight of total variation."""
     frames = np.random.default_rng(0).random((n_frames, 8, 8))

@@ -14,7 +14,7 @@ from torchmask.restoration.checkpoint import Progress
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.objective import Free
-from torchmask.restoration.projected_lbfgs import ProjectedLBFGS
+from torchmask.restoration.projected_lbfgs import Minimum, ProjectedLBFGS
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.starts import (
     Known,
@@ -207,3 +207,17 @@ def test_new_frames_are_fitted_to_the_object(rms, explained):
     assert after < 0.3 * before
     if rms is not None:
         assert after < 1.001 * least
+
+
+@pytest.mark.parametrize("n_new", [1, 2, 3])
+def test_new_frames_cost_their_share_of_evaluations(n_new, explained):
+    """Each evaluation of theirs is that of so many of the four frames, whatever it takes."""
+    objective, state = explained
+
+    def idle(cost, start, lower, *, max_iterations, callback):
+        callback(start, cost(start)[0], 12)
+        return Minimum(start, cost(start)[0], 1, 12, False, "idle")
+
+    fitted, spent = fit_new_frames(objective, state, 4 - n_new, None, Schedule(), idle, seed=0)
+    torch.testing.assert_close(fitted.z, state.z, rtol=1e-12, atol=0)
+    assert spent == 12 * n_new // 4

@@ -152,3 +152,27 @@ def test_it_is_kept_as_json():
     for wrong in ("", "3", "{}", json.dumps(values | {"finding": "OTHER"}), json.dumps(values | {"more": 1})):
         with pytest.raises(ValueError, match="there is no verdict in"):
             Verdict.from_json(wrong)
+
+
+def test_frames_of_which_few_pixels_are_valid_do_not_tell_noise_from_an_object():
+    """The contrast is that of the mean frame, which has as many pixels as the frame with the most of them."""
+    pixels, few = torch.tensor([PIXELS, PIXELS // 4, PIXELS]), 5 * math.sqrt(2 / PIXELS)
+    assert verdict_on(1.0, 1.0, 1.0, contrast=1 + 0.99 * few, pixels=pixels).finding is Finding.ONLY_NOISE
+    assert verdict_on(1.0, 1.0, 1.0, contrast=1 + 1.01 * few, pixels=pixels).explained
+
+
+def test_single_frames_may_leave_twice_the_least_that_a_stack_may():
+    """Where that is more than the model error, times the square of their transmission."""
+    tolerance, transmission = Tolerance(2.0, 2.0, least=0.5), torch.tensor([0.8, 1.2])
+    noise = NormalDist().inv_cdf(1 - 0.01 / 2) * math.sqrt(2 / 960)
+    limits = 0.96 * (1 + 2 * 0.5 * transmission.double() ** 2 + noise)  # per pixel
+    for sign, frames in ((-1, ()), (1, (0, 1))):
+        each = (limits + sign * 1e-6).tolist()
+        assert verdict_on(*each, tolerance=tolerance, transmission=transmission).frames == frames
+
+
+def test_parameters_take_the_noise_of_the_brightest_pixels():
+    """Of the frame in which noise times its unevenness is largest."""
+    noise = FrameNoise(torch.tensor([0.8, 1.2]), torch.tensor([1.0, 2.0]))
+    chance = math.hypot(0.8, 1.2 * math.sqrt(2)) * math.sqrt(2 / 960) / 2
+    assert verdict_on(1.0, 1.0, noise=noise).least == pytest.approx(1 - 100 * 2.4 / 1920 - 5 * chance, rel=1e-6)

@@ -50,6 +50,22 @@ def test_the_sky_adds_its_light_and_its_noise():
     assert float(seen.frames.var()) == pytest.approx(variance, rel=4 * math.sqrt((2 + 1 / sky) / n))
 
 
+def test_the_light_that_is_told_to_be_kept_is_not_that_of_the_sky():
+    """Of a sky with four times the light of the scene nothing is left but its noise."""
+    light, sky, records = 1e7, 4e7 / 32**2, []
+    seen = simulate_observation(
+        *(box(light), MASK, GRID, TurbulencePhase(0.2, 20.0), Detector(), 3),
+        torch.Generator().manual_seed(0),
+        conditions=Conditions(sky=sky),
+        callback=records.append,
+    )
+    kept = float(torch.stack([psf.sum() for psf in seen.psfs]).mean())  # of a star in the middle
+    noise = math.sqrt(5 * light / 3) / light
+    (record,) = records
+    # light that leaves the field from a box of a quarter of its width is more than that of a star by some percent
+    assert 0.9 * kept - 5 * noise < record.scalars["kept_light"] < 1 + 5 * noise
+
+
 def test_the_light_follows_the_transmission_and_the_sky_does_not():
     sky, light = 50.0, 1e8
     clear, cloudy = simulate(box(light), 40, sky=sky), simulate(box(light), 40, sky=sky, transparency_scatter=0.3)
