@@ -83,7 +83,41 @@ def test_a_stack_moves_to_another_precision():
 def test_border_brightness():
     frames = torch.zeros(2, 4, 6)
     frames[:, 1:3, 1:5] = torch.tensor([2.0, -8.0])[:, None, None]
-    assert border_brightness(frames + 10) == pytest.approx(10 / (10 - 3 / 3), rel=1e-6)
+    valid = torch.ones_like(frames, dtype=torch.bool)
+    assert border_brightness(frames + 10, valid) == pytest.approx(10 / (10 - 3 / 3), rel=1e-6)
+
+
+def test_pixels_that_are_not_valid_make_no_border_bright():
+    frames, valid = torch.ones(2, 6, 6), torch.ones(2, 6, 6, dtype=torch.bool)
+    frames[:, 0] = 50.0
+    valid[:, 0] = False
+    assert border_brightness(frames, valid) == 1
+    valid[:, :, [0, -1]] = valid[:, -1] = False
+    assert border_brightness(frames, valid) == 0  # none is known
+
+
+def test_photons_are_counted_over_valid_pixels():
+    """Where the dark half of the field is left out, a mean pixel has twice the light."""
+    frames, valid = exposures(), torch.ones(GRID.shape, dtype=torch.bool)
+    valid[:, :10] = False
+    stack = FrameStack.of(frames, valid, GRID, PUPIL, READOUT)
+    assert stack.variance == pytest.approx(float(frames[:, valid].mean()) + READOUT**2, rel=1e-12)
+    assert float(stack.noise_of_frames.level.mean()) == pytest.approx(1, rel=1e-12)
+
+
+def test_a_cosmic_ray_gets_no_weight_and_is_told():
+    """Its frame is as without it elsewhere, and so is the noise that is measured."""
+    frames = exposures()
+    hit = frames.clone()
+    hit[2, 14, 25] += 1e4
+    with pytest.warns(UserWarning, match=r"9 pixels of frames \[2\].*9.99e\+03 electrons at .* \(2, 14, 25\)"):
+        stack = FrameStack.of(hit, None, GRID, PUPIL, None)
+    left_out = (~stack.valid).nonzero()
+    assert {tuple(place) for place in left_out.tolist()} == {(2, y, x) for y in (13, 14, 15) for x in (24, 25, 26)}
+    assert bool((stack.precision[~stack.valid] == 0).all())
+    torch.testing.assert_close((stack.frames * stack.unit)[stack.valid], frames[stack.valid], rtol=1e-9, atol=1e-9)
+    # four standard errors of a median of some 110 frequencies of 4 frames; the hit has 24000 electrons^2 there
+    assert stack.variance == pytest.approx(FrameStack.of(frames, None, GRID, PUPIL, None).variance, rel=0.25)
 
 
 def test_a_bright_border_is_noticed():

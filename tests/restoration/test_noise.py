@@ -118,7 +118,7 @@ def test_photons_in_errors_are_found_and_evened_out(slope, dtype):
     found = photon_slope(frames, errors, valid)
     # a difference of two variances of at most 200, over one of counts, most of which are above 1
     assert found == pytest.approx(slope, abs=200 * rounding)
-    even = even_photons(frames, errors, found)
+    even = even_photons(frames, errors, valid, found)
     expected = (slope * frames.mean() + detector).sqrt().expand_as(frames)
     torch.testing.assert_close(even, expected, rtol=200 * rounding, atol=0)
 
@@ -146,7 +146,7 @@ def test_cosmic_rays_and_dead_pixels_do_not_change_the_slope_and_keep_their_erro
     errors[:, 7], valid[:, 7] = math.nan, False
     slope = photon_slope(frames, errors, valid)
     assert slope == pytest.approx(1.0, abs=1e-9)
-    even = even_photons(frames, errors, slope)
+    even = even_photons(frames, errors, valid, slope)
     torch.testing.assert_close(even[:, 3], errors[:, 3], rtol=1e-9, atol=0)
     torch.testing.assert_close(even[2, 10:14, 5:30], errors[2, 10:14, 5:30], rtol=1e-7, atol=0)
     assert float(even[3, 10:14, 5:30].max()) < 15
@@ -190,5 +190,20 @@ def test_errors_below_their_photon_noise_have_that_of_a_mean_pixel_alone():
     """As where counts are noisier than the light that the errors were made from: nothing is left of the detector."""
     frames = torch.tensor([[[100.0, 20.0, 30.0, -10.0]]], dtype=torch.float64)
     errors = torch.tensor([[[60.0, 20.0, 34.0, 9.0]]], dtype=torch.float64).sqrt()
-    found = even_photons(frames, errors, 1.0).square()
+    found = even_photons(frames, errors, torch.ones_like(frames, dtype=torch.bool), 1.0).square()
     torch.testing.assert_close(found, 35.0 + torch.tensor([[[0.0, 0.0, 4.0, 9.0]]]).double(), rtol=1e-12, atol=1e-12)
+
+
+def test_the_noise_is_that_of_valid_pixels_whatever_stands_in_the_others():
+    """A frame whose dark half is left out: the mean of all pixels would count half of the photons only."""
+    generator = torch.Generator().manual_seed(2)
+    light = torch.cat([torch.zeros(4, 16, 32), torch.full((4, 16, 32), 80.0)], 1).double()
+    frames, valid = torch.poisson(light, generator=generator), light > 0
+    errors = torch.full_like(frames, 9.0)
+    assert expected_variance(frames, GRID, PUPIL, 3.0, valid) == pytest.approx(float(frames[valid].mean()) + 9)
+    even = even_photons(frames, errors, valid, 1.0)[valid].square()
+    torch.testing.assert_close(even, frames[valid].mean() + (81 - frames[valid]).clamp(min=0))
+    precision = valid / (frames[valid].mean() + 9)
+    level = FrameNoise.of(frames, valid, precision, 1.0).level
+    expected = (frames.sum((1, 2)) / valid.sum((1, 2)) + 9) / (frames[valid].mean() + 9)
+    torch.testing.assert_close(level, expected, rtol=1e-12, atol=0)

@@ -33,16 +33,12 @@ def noise_variance(frames: Tensor, grid: Grid, aperture: Aperture, valid: Tensor
     if valid is not None and not bool(valid.all()):
         generator = torch.Generator().manual_seed(0)
         white = torch.randn(frames.shape, dtype=frames.dtype, device="cpu", generator=generator).to(frames.device)
-        frames = _least_power(frames, valid, beyond)
-        median_over_mean = _median_power(_least_power(white * valid, valid, beyond), beyond)
+        frames = fill_with_least_power(frames, valid, beyond)
+        median_over_mean = _median_power(fill_with_least_power(white * valid, valid, beyond), beyond)
     return _median_power(frames, beyond) / median_over_mean
 
 
-def _median_power(frames: Tensor, beyond: Tensor) -> float:
-    return float((torch.fft.fft2(frames, norm="ortho").abs() ** 2)[..., beyond].mean(0).median())
-
-
-def _least_power(frames: Tensor, valid: Tensor, beyond: Tensor) -> Tensor:
+def fill_with_least_power(frames: Tensor, valid: Tensor, beyond: Tensor) -> Tensor:
     """Return frames whose pixels that are not valid minimise the power at the frequencies `beyond` (H, W)."""
     half = beyond[:, : beyond.shape[1] // 2 + 1]
 
@@ -50,3 +46,7 @@ def _least_power(frames: Tensor, valid: Tensor, beyond: Tensor) -> Tensor:
         return torch.where(valid, 0.0, torch.fft.irfft2(torch.fft.rfft2(x) * half, s=beyond.shape))
 
     return frames + conjugate_gradients(gradient, -gradient(frames), lambda x: x, _ITERATIONS)
+
+
+def _median_power(frames: Tensor, beyond: Tensor) -> float:
+    return float((torch.fft.fft2(frames, norm="ortho").abs() ** 2)[..., beyond].mean(0).median())

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchmask.grid import Grid
 from torchmask.observation import check_frames
 from torchmask.optics.aperture import Aperture
+from torchmask.optics.spikes import leave_out_spikes
 from torchmask.restoration.background import Background, check_known_level
 from torchmask.restoration.change import Change
 from torchmask.restoration.noise import FrameNoise, check_errors, even_photons, expected_variance, photon_slope
@@ -29,7 +30,7 @@ class FrameStack:
     frames : (T, H, W) in units of `unit`, with invalid pixels filled in and a known background subtracted
     valid : (T, H, W) bool, False where a pixel has no weight
     unit : mean pixel without background [electrons]
-    variance : mean noise variance of a pixel [electrons^2], including that of the background
+    variance : mean noise variance of a valid pixel [electrons^2], including that of the background
     known : known background [electrons], which broadcasts to the frames
     free : unknown background, not `IF_SEEN`
     errors : (T, H, W) standard deviations of the pixels [electrons], with even photon noise; None if all pixels have
@@ -60,15 +61,17 @@ class FrameStack:
         """Check `frames` (T, H, W) [electrons] and measure their noise.
 
         `grid` is that of the shortest wavelength; `readout_noise` [electrons rms] may be None. Raises ValueError as
-        `check_frames`, `check_errors` and `expected_variance` do. Warns if the object seems to extend beyond the field.
+        `check_frames`, `check_errors` and `expected_variance` do. Warns of cosmic rays and hot pixels, which get no
+        weight, and if the object seems to extend beyond the field.
         """
         frames, valid = check_frames(frames, valid, grid)
+        frames, valid = leave_out_spikes(frames, valid, grid, aperture, stacklevel=4)
         errors = None if errors is None else check_errors(errors, frames, valid)
         variance = expected_variance(frames, grid, aperture, readout_noise, valid, errors)
-        slope = min(1.0, variance / float(frames.mean()))
+        slope = min(1.0, variance / float(frames[valid].mean()))
         if errors is not None:
             slope = photon_slope(frames, errors, valid)
-            errors = even_photons(frames, errors, slope)
+            errors = even_photons(frames, errors, valid, slope)
         free = background.of(frames) if isinstance(background, Background) else Background.NONE
         known = check_known_level(0.0 if isinstance(background, Background) else background, frames)
         frames = frames - known
@@ -77,7 +80,7 @@ class FrameStack:
         unit = float(light.mean())
         if not unit > 0:
             raise ValueError("the frames hold only background, no object to restore: check background and the target")
-        if border_brightness(light) > _BRIGHT_BORDER or float(guess.mean()) > _EVEN_LIGHT * float(frames.mean()):
+        if border_brightness(light, valid) > _BRIGHT_BORDER or float(guess.mean()) > _EVEN_LIGHT * float(frames.mean()):
             warnings.warn(
                 "the frames are bright at the border: does the object extend beyond the field? If it is sky, give its "
                 "level [electrons per pixel]",
@@ -140,8 +143,11 @@ class FrameStack:
         return self.precision * self.grain
 
 
-def border_brightness(frames: Tensor) -> float:
-    """Return the mean of the mean frame's outermost pixels, divided by the mean of all its pixels."""
-    mean = frames.mean(0)
-    border = torch.cat([mean[0], mean[-1], mean[1:-1, 0], mean[1:-1, -1]])
-    return float(border.mean() / mean.mean())
+def border_brightness(frames: Tensor, valid: Tensor) -> float:
+    """Return the mean of the outermost valid pixels of frames (T, H, W), divided by the mean of all valid ones; 0 if
+    none of the outermost is valid."""
+    border = valid.clone()
+    border[:, 1:-1, 1:-1] = False
+    if not bool(border.any()):
+        return 0.0
+    return float(frames[border].mean() / frames[valid].mean())

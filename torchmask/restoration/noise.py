@@ -37,7 +37,7 @@ class FrameNoise(NamedTuple):
         `grain` times its light. Where the light is more by d, the variance is 1 + precision grain d of the assumed one.
         Of the mean square of that, the part that the noise in d makes is taken off.
         """
-        mean, squares, levels = float(frames.mean()), [], []
+        mean, squares, levels = float(frames[valid].mean()), [], []
         for frame, seen, weight in zip(frames, valid, precision.expand_as(frames), strict=True):
             by_light = grain * weight[seen].double()
             variance = 1 + by_light * (frame[seen].double() - mean)
@@ -55,7 +55,7 @@ def expected_variance(
     valid: Tensor | None = None,
     errors: Tensor | None = None,
 ) -> float:
-    """Return the mean noise variance of a pixel [electrons^2].
+    """Return the mean noise variance of a valid pixel [electrons^2].
 
     It is that of `errors` if they are given, else that of photon and read-out noise if `readout_noise` is given, else
     measured by `noise_variance`. Noise clearly above that of photons and read-out comes from a sky that was subtracted
@@ -67,7 +67,7 @@ def expected_variance(
         variance = float((errors if valid is None else errors[valid]).square().mean())
         told = option = "errors"
     elif readout_noise is not None:
-        variance = float(frames.mean()) + readout_noise**2
+        variance = float((frames if valid is None else frames[valid]).mean()) + readout_noise**2
         told, option = "photon noise and readout_noise", "readout_noise"
     elif measured is not None and measured > 0:
         return measured
@@ -127,11 +127,11 @@ def photon_slope(frames: Tensor, errors: Tensor, valid: Tensor) -> float:
     return max(0.0, float(slopes[int((weight < weight[-1] / 2).sum())]))
 
 
-def even_photons(frames: Tensor, errors: Tensor, slope: float) -> Tensor:
-    """Return `errors` (T, H, W) [electrons] whose photon noise is that of a mean pixel in all pixels.
+def even_photons(frames: Tensor, errors: Tensor, valid: Tensor, slope: float) -> Tensor:
+    """Return `errors` (T, H, W) [electrons] whose photon noise is that of a mean valid pixel in all pixels.
 
     True photon noise would weigh bright pixels least, where most of the object is to be seen. Restorations lose by it,
     see docs/tried.md. `slope` is that of `photon_slope`; the rest of the variance stays as it is.
     """
     rest = (errors.square() - slope * frames.clamp(min=0)).clamp(min=0)
-    return (slope * frames.mean() + rest).sqrt()
+    return (slope * frames[valid].mean() + rest).sqrt()

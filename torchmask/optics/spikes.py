@@ -1,0 +1,150 @@
+"""Pixels that hold what no optics can make: cosmic rays, hot and dead pixels that nobody has marked.
+
+An aperture transmits nothing beyond its cut-off frequency, so all that frames hold there is noise. A single pixel that
+is brighter or darker by A than it should be has the same power at all frequencies: beyond the cut-off it stands out by
+A times the share of the plane that lies there, whatever the object. Hits of several pixels stand out beside them, too.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import torch
+from torch import Tensor
+from torch.nn.functional import max_pool2d, pad
+
+from torchmask.grid import Grid
+from torchmask.optics.aperture import Aperture
+from torchmask.optics.bad_pixels import fill_bad_pixels
+from torchmask.optics.noise import fill_with_least_power
+
+_CHANCE = 0.001  # of finding one in frames without any
+_ROUNDS = 30  # in each, spikes that stand beside brighter ones come to light
+_BESIDE = 0.5  # of the largest spike of a frame: smaller ones may be its side lobes
+_NEAR = 2  # pixels on either side, among which only the largest spike of a round counts
+_GROWN = 1  # pixels on either side that are left out with a spike, as few hits keep to one
+_AROUND = 7  # the same among which the noise is alike
+_UNEVEN = 0.02  # error of the flat, and of what is left of borders, over the light
+_TAPER = 6  # part of the frame's side over which its border fades, so that what is cut off there makes no spike
+_MOST = 0.05  # of all pixels: if there are more, what is beyond the cut-off is light after all
+_MEDIAN = 0.4549  # of the square of a normal deviate, over its mean
+
+
+def leave_out_spikes(
+    frames: Tensor, valid: Tensor, grid: Grid, aperture: Aperture, stacklevel: int
+) -> tuple[Tensor, Tensor]:
+    """Return frames (T, H, W) with spikes filled in, and `valid` (T, H, W) without them.
+
+    If there are any, a warning says so, as if it were raised `stacklevel` calls above.
+    """
+    found = find_spikes(frames, valid, grid, aperture)
+    if not bool(found.any()):
+        return frames, valid
+    where = torch.where(found, frames, -math.inf).argmax()
+    place = tuple(int(one) for one in torch.unravel_index(where, frames.shape))
+    numbers = found.any(2).any(1).nonzero()[:, 0].tolist()
+    warnings.warn(
+        f"{int(found.sum())} pixels of frames {numbers} hold what no optics can make, or lie beside it, such as cosmic "
+        f"rays, hot and dead pixels; the brightest has {float(frames[place]):.3g} electrons at (frame, row, column) "
+        f"{place}. They get no weight, as if they were marked in `valid`",
+        stacklevel=stacklevel + 1,
+    )
+    valid = valid & ~found
+    return fill_bad_pixels(frames, valid), valid
+
+
+def find_spikes(frames: Tensor, valid: Tensor, grid: Grid, aperture: Aperture) -> Tensor:
+    """Return which valid pixels of `frames` (T, H, W) [electrons] are spikes or their neighbours, (T, H, W) bool.
+
+    Pixels that are not `valid` (T, H, W) must hold finite values. A pixel is a spike if noise would reach what it holds
+    beyond the cut-off in one of a thousand stacks, by Bernstein's inequality, which holds for few photons too
+    (Boucheron, Lugosi & Massart, Concentration Inequalities, 2013, section 2.8). The variance of the noise is measured
+    there, and is at least that of the photons. Near the border, in a twelfth of the frame's side, there are none. Nor
+    are there any if more than a twentieth of all pixels would be, as with light of a larger aperture or another
+    wavelength, or if fewer than eight frequencies lie beyond the cut-off.
+    """
+    found = torch.zeros_like(valid)
+    beyond = _frequencies(frames, grid, aperture)
+    if int(beyond.sum()) < 8:
+        return found
+    share = float(beyond.double().mean())
+    down, across = (_taper(side).to(frames) for side in frames.shape[1:])
+    window = down[:, None] * across
+    tapered, asked = frames * window, valid & (window > 0.5)
+    footprint = torch.fft.rfft2(torch.fft.ifft2(beyond.to(frames)).real ** 2)
+    half = beyond[:, : footprint.shape[1]]
+
+    def reaching(variance: Tensor) -> Tensor:
+        """Return what noise of this variance in the pixels has beyond the cut-off."""
+        return torch.fft.irfft2(torch.fft.rfft2(variance) * footprint, s=frames.shape[1:]).clamp(min=0)
+
+    photons, uneven = reaching(tapered.clamp(min=0) * window), reaching((_UNEVEN * frames) ** 2)
+    log_odds = math.log(2 * frames.numel() / _CHANCE)
+    for _ in range(_ROUNDS):
+        counts, known = asked & ~found, valid & ~found
+        spoilt, seen = ~known.all(2).all(1), tapered
+        if bool(spoilt.any()):
+            seen = tapered.clone()
+            seen[spoilt] = fill_with_least_power(tapered[spoilt], known[spoilt], beyond)
+        residual = torch.fft.irfft2(torch.fft.rfft2(seen) * half, s=frames.shape[1:])
+        residual = torch.where(counts, residual, 0.0)
+        square = residual**2
+        photon = _per_electron(frames, square / share, counts)
+        least, step = torch.addcmul(uneven, photon, photons), photon * log_odds * share / 3
+        limit = step + (step**2 + 2 * log_odds * torch.maximum(_spread(square, counts), least)).sqrt()
+        # dark pixels come last: beside bright ones that touch there are side lobes below zero
+        more = _peaks(residual, limit) if bool((residual > limit).any()) else _peaks(-residual, limit)
+        if not bool(more.any()):
+            break
+        found = found | (valid & (_largest(more.to(frames), _GROWN) > 0))
+        if int(found.sum()) > max((2 * _GROWN + 1) ** 2, _MOST * int(valid.sum())):
+            return torch.zeros_like(valid)
+    return found
+
+
+def _frequencies(frames: Tensor, grid: Grid, aperture: Aperture) -> Tensor:
+    """Return the frequencies (H, W) at which spikes are looked for.
+
+    Where pixels are fine enough they are as far beyond the cut-off as the fading of the border spreads light.
+    """
+    nu_y, nu_x = grid.frequencies(frames.dtype, frames.device)
+    cutoff, spread = grid.cutoff(aperture.extent), _TAPER / min(frames.shape[1:])
+    return torch.hypot(nu_y, nu_x) > max(cutoff, min(0.5, cutoff + spread))
+
+
+def _taper(side: int) -> Tensor:
+    """Return a window (side,) that rises from 0 at either end to 1."""
+    place = torch.arange(side, dtype=torch.float64) + 0.5
+    return torch.sin(math.pi / 2 * (torch.minimum(place, side - place) * _TAPER / side).clamp(max=1)) ** 2
+
+
+def _largest(values: Tensor, near: int) -> Tensor:
+    """Return the largest of values (T, H, W) among `near` pixels on either side."""
+    return max_pool2d(values[:, None], 2 * near + 1, 1, near)[:, 0]
+
+
+def _peaks(residual: Tensor, limit: Tensor) -> Tensor:
+    """Return where frames (T, H, W) have their largest values beyond the limit, each alone in its surroundings."""
+    is_large = residual >= _BESIDE * residual.amax((1, 2), keepdim=True)
+    return (residual == _largest(residual, _NEAR)) & is_large & (residual > limit)
+
+
+def _spread(square: Tensor, valid: Tensor) -> Tensor:
+    """Return the variance (H, W) of normal deviates around each pixel, by the median of their squares (T, H, W)."""
+    known = torch.where(valid, square, math.nan)
+    # of an even number, midway between the two in the middle
+    known = (known.nanmedian(0).values - (-known).nanmedian(0).values) / 2
+    known = torch.where(known.isnan(), known.nanmedian(), known)
+    near = [min(_AROUND, side - 1) for side in known.shape]
+    around = pad(known[None], (near[1], near[1], near[0], near[0]), mode="reflect")[0]
+    for axis in (0, 1):  # one after the other, which needs less memory than both at once
+        around = around.unfold(axis, 2 * near[axis] + 1, 1).median(-1).values
+    return torch.maximum(around, known.median()) / _MEDIAN
+
+
+def _per_electron(frames: Tensor, square: Tensor, valid: Tensor) -> Tensor:
+    """Return the variance of the noise over the light, at most 1: less if frames are not in electrons."""
+    n = valid.sum((1, 2)).clamp(min=1)
+    variance, light = ((((part * valid).sum((1, 2)) / n).median()) for part in (square, frames))
+    return torch.where(light > 0, variance / light, 0.0).clamp(0, 1)
