@@ -151,6 +151,29 @@ def test_arrays_of_another_order_of_bytes_become_tensors(tmp_path):
     assert torch.equal(as_tensor(values.astype(">f8")[::-1]), torch.from_numpy(values).flip(0))
     tensor = torch.ones(2, requires_grad=True)
     assert as_tensor(tensor) is tensor
+    assert as_tensor(values.astype(np.longdouble)).dtype == torch.float64
+
+
+def test_arrays_that_may_not_be_written_to_become_tensors_of_their_own():
+    """Without torch's warning; writing to the tensor leaves the array as it is."""
+    values = np.arange(3.0)
+    values.flags.writeable = False
+    as_tensor(values)[0] = 5.0
+    assert values[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("values", "given"),
+    [
+        (None, "None was given"),
+        ("frames.npz", "'frames.npz' was given"),
+        (np.array([1.0, None]), "an array of object was given"),
+        (["a", "b"], "an array of <U1 was given"),
+    ],
+)
+def test_what_is_no_number_is_named(values, given):
+    with pytest.raises(TypeError, match=f"{given}: numbers are needed"):
+        as_tensor(values)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.complex64, torch.int64, torch.bool])

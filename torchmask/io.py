@@ -37,17 +37,24 @@ def as_tensor(values: Any, device: torch.device | str | None = None, dtype: torc
 
     Arrays may have any strides, as flipped ones do, and any order of bytes, as those of FITS files do.
 
-    Raises TypeError for values with a unit, and ValueError for masked arrays that hide values, see `require_plain`.
+    Raises TypeError for values with a unit, or that are no numbers, such as a path or None, and ValueError for masked
+    arrays that hide values, see `require_plain`.
     """
     if isinstance(values, Tensor):
         return values.to(device=device, dtype=dtype)
     require_plain("values", values)
-    return torch.as_tensor(_native(np.asarray(values)), dtype=dtype, device=device)
+    array = np.asarray(values)
+    if array.dtype.kind not in "biufc":
+        given = repr(values) if values is None or isinstance(values, (str, Path)) else f"an array of {array.dtype}"
+        raise TypeError(f"{given} was given: numbers are needed, as an array, a tensor or a sequence")
+    return torch.as_tensor(_native(array), dtype=dtype, device=device)
 
 
 def _native(array: np.ndarray) -> np.ndarray:
-    """Return the array in the order of bytes and with the strides that tensors have."""
-    return array.astype(array.dtype.newbyteorder("="), order="C", copy=False)
+    """Return the array with the order of bytes, strides and precision that tensors have; they may be written to."""
+    wide = array.dtype.kind == "f" and array.itemsize > 8
+    kind = np.dtype(np.float64) if wide else array.dtype.newbyteorder("=")
+    return array.astype(kind, order="C", copy=not array.flags.writeable)
 
 
 @contextmanager

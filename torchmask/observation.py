@@ -226,7 +226,8 @@ def check_frames(
     Pixels that are not valid have no weight in later fits, but means and Fourier transforms need values for them, which
     `fill_bad_pixels` provides.
 
-    Raises ValueError if the frames are complex, a shape is wrong, a valid pixel is not finite, or a frame has no light.
+    Raises TypeError if frames are no numbers, and ValueError if they are complex, a shape is wrong, a valid pixel is
+    not finite, or a frame has no valid pixel or no light.
     The message names frames by `numbers`, or from 0 if none are given.
     """
     frames = as_tensor(frames)
@@ -250,12 +251,21 @@ def check_frames(
         valid = valid.expand(frames.shape)
         frames = fill_bad_pixels(frames, valid)
     named = torch.tensor(number_frames(numbers, len(frames)), device=frames.device)
+    unseen = ~valid.any(2).any(1)
+    if bool(unseen.any()):
+        raise ValueError(
+            f"frames {named[unseen].tolist()} have no valid pixel: leave them out, or see whether `valid` is True "
+            "where a pixel counts"
+        )
     bad = ~torch.isfinite(frames).flatten(1).all(1)
     if bool(bad.any()):
         raise ValueError(f"frames {named[bad].tolist()} hold values that are not finite: mark those pixels in `valid`")
     dark = frames.mean((1, 2)) <= 0
     if bool(dark.any()):
-        raise ValueError(f"frames {named[dark].tolist()} hold no light: leave them out")
+        raise ValueError(
+            f"frames {named[dark].tolist()} hold no light: their mean pixel is not positive. Leave them out, or "
+            "subtract less sky and dark"
+        )
     return frames, valid
 
 

@@ -170,14 +170,17 @@ def test_refuses_results_of_something_else(explained):
     objective, state = explained
     result = result_of(objective, state)
     begun = begin(objective)
-    for other in (
-        replace(result, coefficients=result.coefficients[:, :4]),
-        replace(result, coefficients=result.coefficients[..., :2]),
-        replace(result, extended_object=result.object),
+    for other, given in (
+        (replace(result, coefficients=result.coefficients[:, :4]), r"4 holes and 3 modes: .* 5 holes and 3 modes"),
+        (replace(result, coefficients=result.coefficients[..., :2]), r"5 holes and 2 modes: .* 5 holes and 3 modes"),
+        (
+            replace(result, extended_object=result.object, object=result.object[:30]),
+            r"frames of 30 x 32 pixels: those .* have 32 x 32",
+        ),
     ):
-        with pytest.raises(ValueError, match=r"are needed$"):
+        with pytest.raises(ValueError, match=f"start is of .*{given}"):
             start_from_result(objective, begun, other, UNIT)
-    with pytest.raises(ValueError, match=r"\(at most 3, \*\(5, 3\)\) and \(40, 40\) are needed"):
+    with pytest.raises(ValueError, match=r"start is of 4 frames .*: at most 3 frames, 5 holes and 3 modes are needed"):
         start_from_result(objective.of_frames(slice(0, 3)), begun.of_frames(slice(0, 3)), result, UNIT)
 
 

@@ -61,10 +61,16 @@ class FrameStack:
         """Check `frames` (T, H, W) [electrons] and measure their noise.
 
         `grid` is that of the shortest wavelength; `readout_noise` [electrons rms] may be None. Raises ValueError as
-        `check_frames`, `check_errors` and `expected_variance` do. Warns of cosmic rays and hot pixels, which get no
-        weight, and if the object seems to extend beyond the field.
+        `check_frames`, `check_errors` and `expected_variance` do. Warns of frames that repeat others, of cosmic
+        rays and hot pixels, which get no weight, and if the object seems to extend beyond the field.
         """
         frames, valid = check_frames(frames, valid, grid)
+        if copies := copies_among(frames):
+            warnings.warn(
+                f"frames {copies} repeat earlier ones pixel by pixel, as a file that is read twice does: they tell "
+                "nothing new, but count as much, so leave them out",
+                stacklevel=4,
+            )
         frames, valid = leave_out_spikes(frames, valid, grid, aperture, stacklevel=4)
         errors = None if errors is None else check_errors(errors, frames, valid)
         variance = expected_variance(frames, grid, aperture, readout_noise, valid, errors)
@@ -151,3 +157,22 @@ def border_brightness(frames: Tensor, valid: Tensor) -> float:
     if not bool(border.any()):
         return 0.0
     return float(frames[border].mean() / frames[valid].mean())
+
+
+def copies_among(frames: Tensor) -> list[int]:
+    """Return the numbers of the frames (T, H, W) that equal an earlier one in all pixels.
+
+    Examples
+    --------
+    >>> copies_among(torch.tensor([1.0, 2.0, 1.0, 1.0])[:, None, None])
+    [2, 3]
+    """
+    first: dict[float, list[int]] = {}
+    copies = []
+    for number, light in enumerate(frames.sum((1, 2)).tolist()):
+        alike = first.setdefault(light, [])
+        if any(torch.equal(frames[number], frames[other]) for other in alike):
+            copies.append(number)
+        else:
+            alike.append(number)
+    return copies

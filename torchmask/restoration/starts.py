@@ -162,14 +162,18 @@ def start_from_result(
     Further frames keep the aberrations of `state`. Raises ValueError if the earlier result has more frames, another
     mask or another field.
     """
-    basis, field_shape = objective.model.aberrations, tuple(state.image.shape)
-    known, expected = len(start.coefficients), (basis.n_subapertures, basis.n_modes)
-    fits = tuple(start.extended_object.shape) == field_shape and tuple(start.coefficients.shape[1:]) == expected
-    if known > len(state.z) or not fits:
+    basis = objective.model.aberrations
+    known, *given = start.coefficients.shape
+    expected = [basis.n_subapertures, basis.n_modes]
+    if given != expected or known > len(state.z):
         raise ValueError(
-            f"start has coefficients {tuple(start.coefficients.shape)} and an object on "
-            f"{tuple(start.extended_object.shape)} pixels: (at most {len(state.z)}, *{expected}) and {field_shape} "
-            "are needed"
+            f"start is of {known} frames with {given[0]} holes and {given[1]} modes: at most {len(state.z)} frames, "
+            f"{expected[0]} holes and {expected[1]} modes are needed, those of this restoration"
+        )
+    if start.extended_object.shape != state.image.shape:
+        (rows, columns), own = start.object.shape, objective.model.window.grid.shape
+        raise ValueError(
+            f"start is of frames of {rows} x {columns} pixels: those of this restoration have {own[0]} x {own[1]}"
         )
     image, z = state.image, state.z.clone()
     if Free.OBJECT in objective.free:
