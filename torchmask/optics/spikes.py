@@ -45,9 +45,9 @@ def leave_out_spikes(
     place = tuple(int(one) for one in torch.unravel_index(where, frames.shape))
     numbers = found.any(2).any(1).nonzero()[:, 0].tolist()
     warnings.warn(
-        f"{int(found.sum())} pixels of frames {numbers} hold what no optics can make, or lie beside it, such as cosmic "
-        f"rays, hot and dead pixels; the brightest has {float(frames[place]):.3g} electrons at (frame, row, column) "
-        f"{place}. They get no weight, as if they were marked in `valid`",
+        f"{int(found.sum())} pixels of frames {numbers} of this stack, counted from 0, hold what no optics can make, "
+        f"such as cosmic rays, hot and dead pixels, or lie beside it; the brightest has {float(frames[place]):.3g} "
+        f"electrons at (frame, row, column) {place}. They get no weight, as if they were marked in `valid`",
         stacklevel=stacklevel + 1,
     )
     valid = valid & ~found

@@ -67,8 +67,8 @@ class FrameStack:
         frames, valid = check_frames(frames, valid, grid)
         if copies := copies_among(frames):
             warnings.warn(
-                f"frames {copies} repeat earlier ones pixel by pixel, as a file that is read twice does: they tell "
-                "nothing new, but count as much, so leave them out",
+                f"frames {copies} of this stack, counted from 0, repeat earlier ones pixel by pixel, as a file that is "
+                "read twice does: they tell nothing new, but count as much, so leave them out",
                 stacklevel=4,
             )
         frames, valid = leave_out_spikes(frames, valid, grid, aperture, stacklevel=4)
