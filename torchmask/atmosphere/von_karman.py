@@ -16,9 +16,10 @@ import torch
 from scipy import special
 from torch import Tensor
 
+from torchmask.atmosphere.mode_transforms import directions, mode_transforms
 from torchmask.optics.phasor import phasor
 from torchmask.optics.pupil import Aperture
-from torchmask.optics.zernike import aperture_modes, noll
+from torchmask.optics.zernike import noll
 
 STRUCTURE_CONSTANT = 2 * (24 / 5 * math.gamma(6 / 5)) ** (5 / 6)  # 6.883877
 PSD_CONSTANT = STRUCTURE_CONSTANT * math.gamma(11 / 6) ** 2 * math.sin(5 * math.pi / 6) / (2 * math.pi ** (11 / 3))
@@ -166,38 +167,19 @@ class _Spectrum(NamedTuple):
 def _gram(aperture: Aperture, n_modes: int, spectrum: _Spectrum, places: Tensor, start: float, stop: float) -> Tensor:
     """Return the part of the covariance of holes at `places` (N, 2) from `start` <= pi |f| outer_diameter < `stop`."""
     order, diameter = noll(n_modes)[0], aperture.outer_diameter
-    points, weights = aperture.shape.quadrature(math.ceil(stop) + order + 16, aperture.subaperture_diameter)
-    modes = weights[:, None] * aperture_modes(aperture, points, n_modes)  # (Q, J)
+    transforms = mode_transforms(aperture, n_modes, stop)
     reach = float(torch.cdist(places, places).max()) + diameter + 2 * (spectrum.drift or 0.0)
-    total = modes.new_zeros(len(places) * n_modes, len(places) * n_modes)
+    total = places.new_zeros(len(places) * n_modes, len(places) * n_modes)
     low, high = start / (math.pi * diameter), stop / (math.pi * diameter)
     for frequency, area in _panels(low, high, spectrum.outer_scale, reach):
-        turns = math.pi * float(frequency[-1])
-        n_angles = math.ceil(turns * reach) + 2 * order + 24  # on half a turn, as the other half is the conjugate
-        n_known = order + 2 if aperture.shape.is_round else math.ceil(turns * diameter) + order + 20
-        transform = _mode_transforms(points, modes, frequency, n_known, n_angles)  # (R, A, J)
+        # On half a turn, as the other half is the conjugate.
+        n_angles = math.ceil(math.pi * float(frequency[-1]) * reach) + 2 * order + 24
         weight = 2 * math.pi / n_angles * area * spectrum(frequency)
-        transform = weight.sqrt()[:, None, None] * transform
-        shift = phasor(2 * math.pi * frequency[:, None, None] * (_directions(n_angles) @ places.T))  # (R, A, N)
+        transform = weight.sqrt()[:, None, None] * transforms(frequency, n_angles)  # (R, A, J)
+        shift = phasor(2 * math.pi * frequency[:, None, None] * (directions(n_angles) @ places.T))  # (R, A, N)
         field = (shift[..., None] * transform[..., None, :]).flatten(0, 1).flatten(1)  # (R A, N J)
         total += field.real.T @ field.real + field.imag.T @ field.imag
     return total
-
-
-def _mode_transforms(points: Tensor, modes: Tensor, frequency: Tensor, n_known: int, n_angles: int) -> Tensor:
-    """Return the Fourier transforms (R, A, J) of `modes` (Q, J) at `frequency` (R,) and `n_angles` angles.
-
-    The angles span half a turn. The transforms are trigonometric polynomials in angle, so they are evaluated at only
-    `n_known` angles and interpolated to the many that a long baseline needs. For round shapes the azimuthal order of
-    the modes is enough.
-    """
-    waves = phasor(2 * math.pi * frequency[:, None, None] * (_directions(n_known) @ points.T))  # (R, known, Q)
-    half = torch.complex(waves.real @ modes, waves.imag @ modes)  # half the work of complex modes
-    series = torch.fft.fft(torch.cat([half, half.conj()], dim=1), dim=1, norm="forward")
-    padded = series.new_zeros(len(frequency), 2 * n_angles, modes.shape[-1])
-    padded[:, :n_known] = series[:, :n_known]
-    padded[:, -n_known:] = series[:, n_known:]
-    return torch.fft.ifft(padded, dim=1, norm="forward")[:, :n_angles]
 
 
 def _panels(start: float, stop: float, outer_scale: float, reach: float) -> Iterator[tuple[Tensor, Tensor]]:
@@ -209,9 +191,3 @@ def _panels(start: float, stop: float, outer_scale: float, reach: float) -> Iter
         frequency = low + width / 2 * (1 + nodes)
         yield frequency, width / 2 * weights * frequency
         low = stop if width == stop - low else low + width
-
-
-def _directions(n_angles: int) -> Tensor:
-    """Return unit vectors (A, 2) at uniform angles on half a turn."""
-    angle = math.pi / n_angles * torch.arange(n_angles, dtype=torch.float64, device="cpu")
-    return torch.stack([angle.cos(), angle.sin()], dim=-1)
