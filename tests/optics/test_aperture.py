@@ -89,6 +89,8 @@ def test_state_dict_round_trip():
         (([[math.nan, 0.0]], 0.1, 1.0), "finite"),
         (([[0.0, 0.0]], -0.1, 1.0), "subaperture_diameter"),
         (([[0.0, 0.0]], 0.1, math.inf), "mask_diameter"),
+        ((TRIANGLE, torch.tensor([0.1, 0.2, 0.1]), 1.0), "subaperture_diameter holds 3 values: it is one number, in m"),
+        ((TRIANGLE, [0.1, 0.2, 0.1], 1.0), "as all holes have one size"),
         (([[0.0, 0.0]], 0.1, 1.0, "star"), "known shapes are .*hexagon"),
         (([[0.0, 0.0]], 0.1, 1.0, "annulus"), "needs obstruction"),
         (([[0.0, 0.0]], 0.1, 1.0, "hexagon", math.nan), "orientation"),

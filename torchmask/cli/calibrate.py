@@ -10,6 +10,7 @@ from typing import Any
 import tyro
 
 from torchmask.cli.options import RunOptions
+from torchmask.cli.program import NOT_EXPLAINED
 from torchmask.cli.run import Run, new_run
 from torchmask.cli.stacks import StackOptions, read_stack
 from torchmask.design.manufacture import save_json
@@ -27,7 +28,8 @@ class Options(StackOptions, RunOptions):
 
     The exposures are an .npz file or FITS files, of one star through the mask, in any turbulence. FITS files need
     --mask. Writes mask.json, the mask with its measured geometry, for --mask of `torchmask restore`, calibration.json
-    with all estimates and their errors, and with --instrument instrument.json, to a new folder.
+    with all estimates and their errors, and with --instrument instrument.json, to a new folder. The exit status is 3 if
+    a star and the mask do not explain the exposures.
     """
 
     stacks: tyro.conf.Positional[tuple[Path, ...]] = ()
@@ -43,8 +45,8 @@ class Options(StackOptions, RunOptions):
         return cls()
 
 
-def run(options: Options) -> None:
-    """Measure the geometry, write it and print it."""
+def run(options: Options) -> int:
+    """Measure the geometry, write it and print it; return the exit status."""
     if not options.stacks:
         raise ValueError("no exposures of a star are given: give .npz or FITS files")
     require_one_pixel(options, options.estimate_pixel)
@@ -53,6 +55,7 @@ def run(options: Options) -> None:
         output.keep_instrument(options.known_instrument())
         found = calibrate_on(seen, options.estimate_pixel, options.n_modes, output.callback)
         write_calibration(output, found, options.stacks, seen.grid.wavelength)
+    return 0 if found.verdict is None or found.verdict.explained else NOT_EXPLAINED
 
 
 def require_one_pixel(options: StackOptions, estimate: bool) -> None:
@@ -115,6 +118,7 @@ def estimates(found: MaskCalibration, files: Sequence[Path]) -> dict[str, Any]:
         "offset_errors": found.offset_errors.tolist(),
         "frame_numbers": list(found.frame_numbers),
         "explained": found.explained.tolist(),
+        "verdict": None if found.verdict is None else found.verdict.to_json(),
         "fill_factor": found.fill_factor,
         "fill_factor_error": found.fill_factor_error,
     }

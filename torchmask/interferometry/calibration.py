@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,23 +19,24 @@ from torchmask.interferometry.star_fit import (
     Information,
     StarFit,
     evaluate,
+    even_weights,
     explained_variance,
     fit_frame,
     fit_together,
     require_all_holes,
     start_frame,
 )
-from torchmask.interferometry.star_frames import StarFrames
+from torchmask.interferometry.star_frames import StarFrames, StarVerdict, judge_star, require_star
 from torchmask.interferometry.star_model import MAP, PLACE, Shared, StarModel
 from torchmask.interferometry.which_mask import require_mask
 from torchmask.observation import check_frames
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.geometry import MaskGeometry, turn_and_stretch
 from torchmask.optics.pixel import PixelResponse, SquarePixel
+from torchmask.optics.spikes import leave_out_spikes
 from torchmask.record import Callback, Record
 
 _REACH = 1.6  # radius of the pixels compared [wavelength / hole diameter]: beyond the first dark ring of a hole
-_LEAST_EXPLAINED = 0.5  # of the variance of a frame: a fit that explains less is not of a star behind this mask
 _FIRST_FILL = 0.5  # of the pixels, where the fit of their fill factor starts
 _FIRST_MODES = 3  # piston, tip and tilt are fitted first
 
@@ -56,6 +58,7 @@ class MaskCalibration:
     fill_factor, fill_factor_error : sensitive fraction of a pixel's area, which noise may take out of its range of 0
         to 1, and its error; None if it was not estimated
     frame_numbers : numbers of the frames in their files, as `Observation.frame_numbers`; empty if not known
+    verdict : whether a star and the mask explain the frames; None if that was not judged
 
     Examples
     --------
@@ -86,6 +89,7 @@ class MaskCalibration:
     fill_factor: float | None = None
     fill_factor_error: float | None = None
     frame_numbers: tuple[int, ...] = ()
+    verdict: StarVerdict | None = None
 
     @property
     def pixel(self) -> SquarePixel | None:
@@ -109,6 +113,8 @@ class MaskCalibration:
         ]
         if self.fill_factor is not None:
             rows.append(("fill factor of the pixels", f"{self.fill_factor:.4f} +- {self.fill_factor_error:.4f}"))
+        if self.verdict is not None:
+            rows.append(("a star behind the mask", str(self.verdict)))
         width = max(len(name) for name, _ in rows)
         return "\n".join(f"{name:<{width}}  {value}" for name, value in rows)
 
@@ -158,6 +164,7 @@ def calibrate_mask(
     MaskCalibration
         Standard errors are the larger of those from the noise and, for two or more frames, those from the scatter
         between frames. The latter include modes beyond `n_modes` of turbulence in holes wider than r0.
+        A warning says if a star and the mask leave more than noise and such modes, as for a double star (`verdict`).
 
     Raises
     ------
@@ -193,6 +200,7 @@ def calibrate_mask(
     if estimate_pixel and pixel is not None:
         raise ValueError(f"pixel is {pixel}, which is known, and estimate_pixel is true: leave one of them out")
     frames, valid = (values.cpu() for values in check_frames(frames, valid, grid))
+    frames, valid = leave_out_spikes(frames, valid, grid, aperture, stacklevel=2)
     reach = min(math.ceil(_REACH * grid.period / aperture.subaperture_diameter), (min(grid.shape) - 1) // 2)
     star = StarFrames.around(frames, valid, reach)
     centers = aperture.centers.detach().double().cpu()
@@ -201,19 +209,23 @@ def calibrate_mask(
     require_mask(star.light, look.geometry.apply(aperture), replace(grid, n_pixels=2 * reach + 1))
     coarse, model = (StarModel(aperture, grid, reach, number, pixel) for number in (_FIRST_MODES, n_modes))
     data, counted = star.pixels.flatten(1), star.counted.flatten(1).double()
-    even = _even_weights(data, counted)
+    even = even_weights(data, counted)
     fill = centers.new_tensor(_FIRST_FILL) if estimate_pixel else None
     shared = Shared(look.geometry.matrix, centers.new_zeros(len(centers)), fill)
     fit = _first_fit(coarse, model, data, even, shared, callback)
-    _require_star(data, counted, fit)
+    require_star(data, counted, fit, model, grid.cutoff(aperture.extent))
     fit, _ = fit_together(model, data, even, fit)
     fit, information = fit_together(model, data, counted / _variance(data, counted, fit, readout_noise), fit)
     require_all_holes(fit.shared.log_transmission.exp())
+    verdict = judge_star(star, model, fit, information, aperture, grid, readout_noise, pixel)
+    if not verdict.explained:
+        warnings.warn(str(verdict), stacklevel=2)
     return MaskCalibration(
         geometry=(geometry := MaskGeometry.from_matrix(fit.shared.matrix)),
         aperture=geometry.apply(aperture),
         mirror_seen=look.mirror_seen,
         explained=explained_variance(data, counted, fit.images),
+        verdict=verdict,
         **_estimates(model, fit, information, star.middles),
     )
 
@@ -236,12 +248,6 @@ def _first_fit(
     return evaluate(model, torch.stack(rows), shared)
 
 
-def _even_weights(data: Tensor, counted: Tensor) -> Tensor:
-    """Return equal weights (T, pixels) for all valid pixels of a frame: one over their mean light, which is clamped."""
-    level = (data * counted).sum(1, keepdim=True) / counted.sum(1, keepdim=True).clamp(min=1)
-    return counted / level.clamp(min=1e-6 * float(data.abs().max()))
-
-
 def _variance(data: Tensor, counted: Tensor, fit: StarFit, readout_noise: float) -> Tensor:
     """Return the variance (T, pixels): that of the noise plus the excess residual of the frame, equal in all pixels.
 
@@ -252,16 +258,6 @@ def _variance(data: Tensor, counted: Tensor, fit: StarFit, readout_noise: float)
     freedom = (counted.sum(1) - fit.own.shape[1]).clamp(min=1)
     left = (counted * (data - fit.images) ** 2).sum(1) / freedom - (counted * noise).sum(1) / counted.sum(1)
     return noise + left.clamp(min=0)[:, None]
-
-
-def _require_star(data: Tensor, counted: Tensor, fit: StarFit) -> None:
-    """Raise ValueError unless the fit of a star explains most of the variance of most frames."""
-    explained = float(explained_variance(data, counted, fit.images).median())
-    if explained < _LEAST_EXPLAINED:
-        raise ValueError(
-            f"a star behind this mask explains only {100 * max(explained, 0.0):.0f} % of the variance of the frames: "
-            "give frames of a point source through this mask, at the scale of the grid"
-        )
 
 
 def _estimates(model: StarModel, fit: StarFit, information: Information, middles: Tensor) -> dict[str, Any]:

@@ -16,8 +16,8 @@ from torchmask.interferometry.observables import Observables
 from torchmask.interferometry.visibilities import sky_stations, triangle_sides
 from torchmask.observation import Observation, check_frames
 from torchmask.optics.noise import noise_variance
-from torchmask.optics.spikes import leave_out_spikes
 from torchmask.optics.phasor import phasor
+from torchmask.optics.spikes import leave_out_spikes
 
 
 def frame_observables(observation: Observation) -> Observables:

@@ -86,7 +86,7 @@ def fit_frame(
     model: StarModel, frame: Tensor, weight: Tensor, own: Tensor, shared: Shared, kernels: tuple[Tensor, Tensor]
 ) -> Tensor:
     """Fit the own parameters (2 + N J,) of a frame (pixels,) by the Levenberg-Marquardt method."""
-    hold, damping = _hold(model), _DAMPING[0]
+    hold, damping = prior_weights(model), _DAMPING[0]
 
     def cost(own: Tensor) -> float:
         return float((weight * (frame - model.image(own, shared, kernels)) ** 2).sum() + (hold * own**2).sum())
@@ -136,7 +136,7 @@ def evaluate(model: StarModel, own: Tensor, shared: Shared) -> StarFit:
 
 
 def _cost(model: StarModel, frames: Tensor, weights: Tensor, fit: StarFit) -> float:
-    held = (_hold(model) * fit.own**2).sum() + fit.shared.log_transmission.mean() ** 2 / _EVEN**2
+    held = (prior_weights(model) * fit.own**2).sum() + fit.shared.log_transmission.mean() ** 2 / _EVEN**2
     return float((weights * (frames - fit.images) ** 2).sum() + held)
 
 
@@ -145,7 +145,7 @@ def _step(model: StarModel, frames: Tensor, weights: Tensor, fit: StarFit) -> tu
 
     The own parameters of a frame are eliminated from its normal equations (Schur complement).
     """
-    hold, kernels = _hold(model), model.kernels(fit.shared.matrix)
+    hold, kernels = prior_weights(model), model.kernels(fit.shared.matrix)
     matrices, scores, back, ahead, known, promised = [], [], [], [], [], 0.0
     for frame, weight, own in zip(frames, weights, fit.own, strict=True):
         image, by_own, by_shared = model.linearise(own, fit.shared, kernels)
@@ -170,7 +170,7 @@ def _step(model: StarModel, frames: Tensor, weights: Tensor, fit: StarFit) -> tu
     return step, torch.stack(ahead) - torch.stack(back) @ step, promised, information
 
 
-def _hold(model: StarModel) -> Tensor:
+def prior_weights(model: StarModel) -> Tensor:
     """Return the prior's inverse variances (2 + N J,) of a frame's own parameters."""
     low, high = _LOOSE
     modes = torch.full((model.n_modes,), high**-2, dtype=torch.float64)
@@ -192,3 +192,9 @@ def require_all_holes(light: Tensor) -> None:
             f"the best fit has {100 * float(light.max() / light.sum()):.0f} % of the light through one of "
             f"{len(light)} holes: the object is no point, or another mask was in the beam; give frames of a star"
         )
+
+
+def even_weights(data: Tensor, counted: Tensor) -> Tensor:
+    """Return equal weights (T, pixels) for all valid pixels of a frame: one over their mean light, which is clamped."""
+    level = (data * counted).sum(1, keepdim=True) / counted.sum(1, keepdim=True).clamp(min=1)
+    return counted / level.clamp(min=1e-6 * float(data.abs().max()))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -74,6 +75,8 @@ class SparseAperture(Aperture):
         else:
             shape = named_shape(shape, {"orientation": orientation})
         for name, value in (("subaperture_diameter", subaperture_diameter), ("mask_diameter", mask_diameter)):
+            if (many := value.numel() if isinstance(value, Tensor) else np.size(value)) != 1:
+                raise ValueError(f"{name} holds {many} values: it is one number, in m, as all holes have one size")
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{name} is {value}: it must be finite and positive, in m")
         if not isinstance(centers, Tensor):

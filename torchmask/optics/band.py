@@ -11,10 +11,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from torchmask.numbers import whole_number
+from torchmask.numbers import require_wavelength, whole_number
 from torchmask.optics.passband import Passband, check_curve
 
 MOST_WAVELENGTHS = 32  # largest number of wavelengths, far more than any image needs
+_NANOMETRES = 100.0  # from here on wavelengths were meant in nm; below, they may be in the free units of a grid
 # Relative width of a band for which one wavelength stands, and for which each one more does: predicted errors are then
 # within 4 % of those of nine wavelengths (masks of 6 and 9 holes, fill factors 0.02 to 0.15, D/r0 = 7).
 _ALONE, _EACH = 0.05, 0.15
@@ -39,8 +40,8 @@ class Band:
 
         Equal wavelengths become one, with all their light.
 
-        Raises ValueError if there is no wavelength, the numbers differ, or a value is not finite and positive, and
-        TypeError for a single number.
+        Raises ValueError if there is no wavelength, the numbers differ, or a value is not finite and positive, or
+        wavelengths are in nanometres, and TypeError for a single number.
         """
         if np.ndim(wavelengths) == 0:  # type: ignore[arg-type]
             raise TypeError(f"wavelengths is {wavelengths}: a sequence is needed, such as [{wavelengths}]")
@@ -52,6 +53,8 @@ class Band:
         for name, values, unit in (("wavelengths", wavelengths, ", in m"), ("weights", shares, ", in any unit")):
             if not all(math.isfinite(value) and value > 0 for value in values):
                 raise ValueError(f"{name} are {list(values)}: they must be finite and positive{unit}")
+        if (longest := float(max(wavelengths))) >= _NANOMETRES:
+            require_wavelength("the longest of wavelengths", longest)
         total, light = sum(shares), dict.fromkeys(map(float, wavelengths), 0.0)
         for wavelength, share in zip(wavelengths, shares, strict=True):
             light[float(wavelength)] += share / total
