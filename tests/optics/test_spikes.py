@@ -181,7 +181,8 @@ def test_spikes_are_filled_in_and_told():
     frames = exposures(1e6)
     hit = frames.clone()
     hit[3, 30, 12] += 1e5
-    with pytest.warns(UserWarning, match=r"9 pixels of frames \[3\] of this stack, counted from 0, hold what no optics can make.*\(3, 30, 12\)") as told:
+    said = r"9 pixels of frames \[3\] of this stack, counted from 0, hold what no optics can make.*\(3, 30, 12\)"
+    with pytest.warns(UserWarning, match=said) as told:
         filled, valid = leave_out_spikes(hit, everywhere(hit), GRID, MASK, stacklevel=1)
     assert told[0].filename == __file__
     assert places(~valid) == around(3, 30, 12)

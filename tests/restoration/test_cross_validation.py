@@ -8,9 +8,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.restoration.conftest import satellite
+from torchmask.grid import Grid
+from torchmask.metrics import relative_error
 from torchmask.restoration import cross_validation
 from torchmask.restoration.cross_validation import choose_prior
 from torchmask.restoration.descent import descend
+from torchmask.restoration.forward import ExposureModel
+from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.objective import Free
 from torchmask.restoration.priors import ObjectPrior
 from torchmask.restoration.projected_lbfgs import ProjectedLBFGS
@@ -75,9 +80,9 @@ def closed_form(frames, precision, price, weights):
     return misfits
 
 
-def last_better(misfits):
-    """Return the index of the first misfit that the next two do not fall below, or of the least of the last ones."""
-    return next(i for i, misfit in enumerate(misfits) if all(later >= misfit for later in misfits[i + 1 : i + 3]))
+def best_of(misfits):
+    """Return the index of the least misfit."""
+    return misfits.index(min(misfits))
 
 
 def chosen(frames, precision, price, weights):
@@ -105,7 +110,7 @@ def test_the_choice_is_that_of_the_closed_form(seed, n_frames, precision, price,
     price = price * precision * scale
     misfits = closed_form(frames, precision, price, weights)
     found = chosen(frames, precision, price, weights)
-    assert misfits[weights.index(found)] == pytest.approx(misfits[last_better(misfits)], rel=1e-6)
+    assert misfits[weights.index(found)] == pytest.approx(misfits[best_of(misfits)], rel=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -115,16 +120,16 @@ def test_the_choice_is_that_of_the_closed_form(seed, n_frames, precision, price,
         ([3.0, 0.75, 0.05, 0.02], 1),
         ([0.75, 0.05, 0.02], 0),
         ([3.0, 6.0, 0.75], 2),  # one that is worse does not matter
-        ([3.0, 6.0, 5.0, 0.75], 0),  # the last, which is best, is not tried once two in a row are worse
+        ([3.0, 6.0, 5.0, 9.0, 0.75], 4),  # nor do several
         ([3.0, 6.0], 0),
     ],
 )
-def test_the_choice_ends_where_two_in_a_row_are_no_better(weights, index):
+def test_the_least_misfit_of_all_is_chosen(weights, index):
     """Two sharp frames of ones with noise of 0.8, for which the best ridge has a weight of about 0.8^2."""
     noise = 0.8 * torch.randn(2, 40, 40, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     frames = 1 + noise
     misfits = closed_form(frames, 1.0, 0.0, weights)
-    assert last_better(misfits) == index
+    assert best_of(misfits) == index
     assert chosen(frames, 1.0, 0.0, weights) == weights[index]
 
 
@@ -139,7 +144,7 @@ def test_frames_count_by_their_noise():
         for state in (begun, begun.calibrated(noise_inflation=inflation))
     ]
     misfits = closed_form(frames, 1 / inflation, 0.0, weights)
-    assert found[1] == weights[last_better(misfits)] != found[0]
+    assert found[1] == weights[best_of(misfits)] != found[0]
 
 
 def test_a_price_of_light_counts_in_the_fit_alone():
@@ -150,7 +155,7 @@ def test_a_price_of_light_counts_in_the_fit_alone():
     for price in (0.0, 0.3):
         misfits = closed_form(frames, 1.0, price, weights)
         found[price] = chosen(frames, 1.0, price, weights)
-        assert found[price] == weights[last_better(misfits)]
+        assert found[price] == weights[best_of(misfits)]
     assert found[0.3] < found[0.0]
 
 
@@ -166,7 +171,7 @@ def test_the_first_prior_has_no_advantage_by_where_it_begins(monkeypatch):
     frames, weights = 2 + noise, [0.5, 0.3, 0.1]
     misfits = closed_form(frames, 1.0, 0.0, weights)
     monkeypatch.setattr(cross_validation, "settle_object", settle_in_part)
-    assert chosen(frames, 1.0, 0.0, weights) == weights[last_better(misfits)] != weights[0]
+    assert chosen(frames, 1.0, 0.0, weights) == weights[best_of(misfits)] != weights[0]
 
 
 def test_no_priors_are_no_choice():
@@ -199,6 +204,24 @@ def test_halves_are_compared_as_by_whole_descents(noise, explain):
         return total
 
     misfits = [misfit(prior) for prior in priors]
-    best = last_better(misfits)
+    best = best_of(misfits)
     assert 0 < best < len(priors) - 1
     assert choose_prior(objective, state, priors, 100) is priors[best]
+
+
+@pytest.mark.parametrize("n_frames", [2, 8])
+def test_a_faint_object_is_not_left_flat_where_aberrations_are_known(n_frames, five_holes, five_hole_basis):
+    """The heaviest priors leave little but an even level, and are not at rest: misfits rise before they fall.
+
+    Of the first few of the family the heaviest is best, which leaves errors of 0.92 to 0.98 where the lightest leaves
+    0.39 to 0.63 in two draws. The light is a thousand photons, with a read-out noise of 1.5.
+    """
+    grid = Grid.nyquist(1.0, 550e-9, 48)
+    model, generator = ExposureModel(five_holes, grid, five_hole_basis), torch.Generator().manual_seed(1)
+    truth = satellite(grid.shape, 1e3)
+    z = torch.randn(n_frames, five_hole_basis.n_parameters, dtype=torch.float64, generator=generator)
+    frames = torch.poisson(model(model.window.embed(truth), z).clamp(min=0), generator=generator)
+    frames = frames + 1.5 * torch.randn(frames.shape, dtype=torch.float64, generator=generator)
+    method = MyopicDeconvolution(five_holes, grid, n_modes=3, readout_noise=1.5)
+    result = method.restore(frames, coefficients=five_hole_basis.coefficients(z))
+    assert relative_error(result.object, truth, model.cutoff) < 0.75

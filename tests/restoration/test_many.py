@@ -12,6 +12,7 @@ from torchmask.observation import Observation
 from torchmask.optics.aperture import SparseAperture
 from torchmask.restoration.many import restore_many
 from torchmask.restoration.myopic import MyopicDeconvolution
+from torchmask.restoration.structure import smooth
 
 GRID = Grid.nyquist(1.0, 550e-9, 32)
 MASK = SparseAperture([[0.0, 0.3], [-0.3, -0.2], [0.3, -0.2]], 0.2, 1.0)
@@ -20,7 +21,7 @@ MASK = SparseAperture([[0.0, 0.3], [-0.3, -0.2], [0.3, -0.2]], 0.2, 1.0)
 def stack(seed):
     frames = torch.full((3, 32, 32), 20.0)
     frames[:, 12:20, 10 : 18 + seed] = 1000.0
-    return torch.poisson(frames, generator=torch.Generator().manual_seed(seed))
+    return torch.poisson(smooth(frames, 1.5), generator=torch.Generator().manual_seed(seed))
 
 
 def method(**options):
@@ -48,7 +49,7 @@ def test_observations_bring_their_valid_pixels_and_errors_and_each_stack_may_hav
     valid = torch.ones(32, 32, dtype=torch.bool)
     valid[14, 14] = False
     frames = torch.where(valid, stack(0), math.nan)
-    errors = 20 + 10 * torch.rand(3, 32, 32, generator=torch.Generator().manual_seed(0))  # edges count as noise
+    errors = 8 + 4 * torch.rand(3, 32, 32, generator=torch.Generator().manual_seed(0))
     seen = Observation(frames, MASK, GRID, readout_noise=None, valid=valid, errors=errors)
     found = restore_many([method(), method(r0=0.2)], [seen, stack(1)], n_workers=1, n_samples=2, seed=3)
     assert torch.equal(found[0].object, method().restore(frames, valid=valid, errors=errors, seed=3).object)

@@ -7,12 +7,14 @@ import pytest
 import torch
 from torch import Tensor
 
+from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.atmosphere.structure import coherence_distance
 from torchmask.atmosphere.von_karman import modal_covariance, von_karman_structure_function
 from torchmask.grid import Grid
 from torchmask.metrics import relative_error
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.band import Band
+from torchmask.optics.detector import Detector
 from torchmask.restoration.aberrations import AberrationBasis, moving_basis, turbulent_basis
 from torchmask.restoration.adjoint import data_fidelity
 from torchmask.restoration.forward import ExposureModel
@@ -20,6 +22,8 @@ from torchmask.restoration.linearization import Linearization
 from torchmask.restoration.motion import Setting
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.schedule import Schedule
+from torchmask.simulation.exposures import simulate_observation
+from torchmask.simulation.scene import make_scene
 
 GRID = Grid((12, 15), 2.3e-7, 550e-9)
 R0, OUTER_SCALE = 0.25, 20.0
@@ -236,3 +240,16 @@ def test_an_exposure_without_use_is_refused(methods):
         methods(1.0, aberration_prior=False)
     with pytest.raises(ValueError, match="for masks only"):
         MyopicDeconvolution(FullAperture(1.0), Grid.nyquist(1.0, 550e-9, SIDE), exposure_tau0=1.0)
+
+
+def test_faint_exposures_are_restored_with_the_motion_that_is_told():
+    """Once their object is sharp the search asks the frames for its slopes, by the model in which holes move."""
+    grid, mask = Grid.nyquist(1.0, 550e-9, 40), SparseAperture.from_catalog("golay9", 1.0, fill_factor=0.15)
+    generator = torch.Generator().manual_seed(0)
+    scene, turbulence = make_scene(grid.shape, 3e4), TurbulencePhase(0.2, 20.0)
+    seen = simulate_observation(scene, mask, grid, turbulence, Detector(1.5), 8, generator=generator)
+    method = MyopicDeconvolution(mask, grid, exposure_tau0=1.0, readout_noise=1.5, max_iterations=310)
+    result = method.restore(seen.frames)
+    assert result.motion.shape == result.coefficients.shape
+    assert bool(torch.isfinite(result.object).all())
+    assert len(result.cost) > Schedule().sharp_after

@@ -15,6 +15,7 @@ from torchmask.record import Record
 from torchmask.restoration.minimizers import TorchMinimizer
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.schedule import Schedule
+from torchmask.restoration.structure import smooth
 from torchmask.restoration.variation import TotalVariation
 
 
@@ -221,10 +222,10 @@ def test_another_default_device_sees_nothing_of_it(light, observation):
 
 
 def exposures(n_frames=3, size=32):
-    """Photons of two blocks, seen by nobody's mask."""
+    """Photons of two blocks, seen by nobody's mask but blurred as far as any optics would."""
     frames = torch.full((n_frames, size, size), 20.0, dtype=torch.float64)
     frames[:, 12:20, 10:16], frames[:, 14:17, 16:24] = 1000.0, 400.0
-    return torch.poisson(frames, generator=torch.Generator().manual_seed(0))
+    return torch.poisson(smooth(frames, 1.5), generator=torch.Generator().manual_seed(0))
 
 
 @pytest.mark.parametrize("trains", [False, True])

@@ -26,6 +26,7 @@ from torchmask.restoration.posterior import (
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.slopes import divergence, gradient
 from torchmask.restoration.state import Calibration, State
+from torchmask.restoration.structure import smooth
 from torchmask.restoration.variation import TotalVariation
 from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
@@ -211,7 +212,7 @@ def test_coefficients_scatter_as_said(five_holes):
 def test_deviations_are_kept_and_asked_for(tmp_path, five_holes):
     frames = torch.full((2, 48, 48), 20.0, dtype=torch.float64)
     frames[:, 16:30, 20:28] = 1000.0
-    frames = torch.poisson(frames, generator=torch.Generator().manual_seed(0))
+    frames = torch.poisson(smooth(frames, 1.5), generator=torch.Generator().manual_seed(0))
     method = MyopicDeconvolution(five_holes, GRID, 3, max_iterations=3)
     plain = method.restore(frames)
     assert plain.object_std is None

@@ -18,7 +18,7 @@ ERROR = ModelError(excess=0.3, fitted=40.0, phase=0.2)
 TOLERANCE = Tolerance(2.0, 2.0)
 
 
-def verdict_on(*chi_square, contrast=50.0, tolerance=TOLERANCE, at_rest=True, alone=False, error=ERROR, **fits):
+def verdict_on(*chi_square, contrast=50.0, tolerance=TOLERANCE, at_rest=True, blind=False, error=ERROR, **fits):
     n_frames = len(chi_square)
     told = {
         "chi_square": torch.tensor(chi_square, dtype=torch.float64),
@@ -27,7 +27,7 @@ def verdict_on(*chi_square, contrast=50.0, tolerance=TOLERANCE, at_rest=True, al
         "noise": FrameNoise(torch.ones(n_frames), torch.ones(n_frames)),
         "parameters": 100.0,
     }
-    return judge(FrameFits(**(told | fits)), contrast, error, tolerance, at_rest=at_rest, alone=alone)
+    return judge(FrameFits(**(told | fits)), contrast, error, tolerance, at_rest=at_rest, blind=blind)
 
 
 def test_chi_square_is_over_its_degrees_of_freedom():
@@ -54,11 +54,48 @@ def test_pixels_that_are_not_valid_do_not_count():
 
 def test_one_frame_alone_is_explained_by_many_objects():
     """So its user is told to look at others; where it is not explained, something else is amiss first."""
-    verdict = verdict_on(1.0, alone=True)
+    verdict = verdict_on(1.0, blind=True)
     assert verdict.explained
     assert "check against other frames: one alone is explained by many objects" in str(verdict)
     assert verdict_on(1.0).check == ""
-    assert "other frames" not in verdict_on(8.0, alone=True).check
+    assert "other frames" not in verdict_on(8.0, blind=True).check
+
+
+def test_light_is_scarce_below_a_signal_to_noise_of_200():
+    """That of the whole mean frame, unless object or aberrations are known, which leaves less to be told."""
+    for contrast, scarce in ((1 + 199.9**2 / PIXELS, True), (1 + 200.1**2 / PIXELS, False)):
+        assert verdict_on(1.0, 1.0, contrast=contrast, blind=True).is_scarce is scarce
+        assert not verdict_on(1.0, 1.0, contrast=contrast).is_scarce
+        few = torch.tensor([PIXELS, PIXELS // 2])  # the mean frame has as many as the frame with most of them
+        assert verdict_on(1.0, 0.5, contrast=contrast, blind=True, pixels=few).is_scarce is scarce
+
+
+def test_more_light_is_asked_for_where_it_is_scarce():
+    """Before anything else that may be wrong, and also if what was found explains the frames, as many objects would."""
+    more = "check again with more light or more frames, as these show too little of the object to tell it"
+    scarce = {"contrast": 5.0, "blind": True}
+    assert f"explained: {more}; chi-square" in str(verdict_on(1.0, 1.0, **scarce))
+    assert f"not explained: no frame is explained; {more}, and then the mask" in str(verdict_on(8.0, 8.0, **scarce))
+    lost = str(verdict_on(*[1.0] * 19, 8.0, **scarce))
+    assert f"frame 19 is not explained; {more}, and then those frames for clouds" in lost
+    stopped = str(verdict_on(8.0, 8.0, at_rest=False, **scarce))
+    assert f"{more}, and then again after more iterations, since this search was stopped early, and then the" in stopped
+    assert f"{more}, and then the mask" in str(verdict_on(8.0, **scarce))  # a single frame
+    assert verdict_on(1.0, 1.0, contrast=1.0, blind=True).check.startswith("the pointing")
+    assert "light" not in str(verdict_on(8.0, 8.0, blind=True))
+
+
+def test_noise_that_was_measured_may_have_been_raised_by_what_is_none():
+    """Nobody told a read-out noise that could be checked; any other finding stays as it is."""
+    told = verdict_on(0.1, 0.1)
+    assert told.finding is Finding.TOO_MUCH_NOISE
+    measured = told.of_measured_noise()
+    assert "check read-out noise, gain" in str(told)
+    assert "check what was measured as noise in the frames: light that is cut off at their border" in str(measured)
+    assert "cosmic rays and hot pixels raise it, so tell readout_noise= or mark such pixels in valid=" in str(measured)
+    assert (measured.finding, measured.least) == (told.finding, told.least)
+    for other in (verdict_on(1.0, 1.0), verdict_on(8.0, 8.0), verdict_on(1.0, 1.0, contrast=1.0)):
+        assert other.of_measured_noise() is other
 
 
 def test_single_frames_may_be_lost():

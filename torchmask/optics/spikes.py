@@ -115,7 +115,7 @@ def _frequencies(frames: Tensor, grid: Grid, aperture: Aperture) -> Tensor:
 
 def _taper(side: int) -> Tensor:
     """Return a window (side,) that rises from 0 at either end to 1."""
-    place = torch.arange(side, dtype=torch.float64) + 0.5
+    place = torch.arange(side, dtype=torch.float64, device="cpu") + 0.5
     return torch.sin(math.pi / 2 * (torch.minimum(place, side - place) * _TAPER / side).clamp(max=1)) ** 2
 
 

@@ -187,21 +187,21 @@ class AberrationBasis(nn.Module):
         """Return the variance of the frames' own aberrations (T, K) over that of the prior: (prior r0 / r0)^(5/3).
 
         It is measured from tip and tilt relative to their means over the sub-apertures, which are best determined and
-        depend least on the outer scale, or from defocus to Noll mode 10 for a single aperture. None without such modes.
+        depend least on the outer scale, or from defocus to Noll mode 10 for a single aperture. None for less than two.
         """
         n_sub, n_modes = self.n_subapertures, self.n_modes
         low, high = (1, 3) if n_sub > 1 else (3, 10)
-        if n_modes < low + 2:
-            return None
         mixing = self.mixing[:, : self.n_own]
         coefficients = (z[:, : self.n_own] @ mixing.to(z).T).unflatten(1, (n_sub, n_modes))
         covariance = (mixing @ mixing.T).to(z).unflatten(1, (n_sub, n_modes)).unflatten(0, (n_sub, n_modes))
         modes = coefficients[..., low:high]
-        expected = torch.einsum("njnj->j", covariance)[low:high].sum()
+        expected = torch.einsum("njnj->j", covariance)[low:high]
         if n_sub > 1:
             modes = modes - modes.mean(1, keepdim=True)
-            expected = expected - torch.einsum("njmj->j", covariance)[low:high].sum() / n_sub
-        ratio = float((modes**2).sum() / len(z) / expected)
+            expected = expected - torch.einsum("njmj->j", covariance)[low:high] / n_sub
+        if int((expected > 0).sum()) < 2:
+            return None
+        ratio = float((modes**2).sum() / len(z) / expected.sum())
         return min(max(ratio, _STRENGTH_RANGE[0]), _STRENGTH_RANGE[1])
 
 

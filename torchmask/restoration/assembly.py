@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import replace
 
 import torch
@@ -79,7 +80,16 @@ def add_deviations(
     progress: Progress,
     n_samples: int,
 ) -> RestorationResult:
-    """Return the result with standard deviations of the object, up to the cut-off, and of the coefficients."""
+    """Return the result with standard deviations of the object, up to the cut-off, and of the coefficients.
+
+    Warns if its verdict is that light is scarce: then they count noise, and not what the prior has taken off.
+    """
+    if result.verdict is not None and result.verdict.is_scarce:
+        warnings.warn(
+            "the frames show too little of the object for its standard deviations, which may be several times too "
+            "small: they count noise, not what the prior on the object has taken off; take more light or more frames",
+            stacklevel=3,
+        )
     model = objective.model
     image, z = standard_deviations(objective, progress.state, model.cutoff, stack.photon_share, n_samples)
     if not progress.integrated:  # in faint light it is the prior that makes an object even

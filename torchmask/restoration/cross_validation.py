@@ -9,7 +9,6 @@ B 36, 111, 1974). The aberrations stay those that were found from all frames.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -21,37 +20,32 @@ from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.priors import ObjectPrior
 from torchmask.restoration.state import State
 
-_PATIENCE = 2  # under a heavy prior objects that are not yet at rest may look better than they are
-
 
 @torch.no_grad()
 def choose_prior(
     objective: MyopicObjective, state: State, priors: Sequence[ObjectPrior], n_iterations: int
 ) -> ObjectPrior:
-    """Go down `priors`, the heaviest first, until two in a row are no better than the best so far, and return that.
+    """Return the one of `priors`, which are given the heaviest first, under which frames predict each other best.
 
     What counts is the misfit of each half of the frames to an object that is fitted to the other half, in
     `n_iterations` from the one before; the first has twice as many, from the object of all frames on. Frames take
-    turns. One frame, or one prior, leaves no choice.
+    turns. All priors are compared, as misfits may rise before they fall: in faint light the objects of the heaviest
+    are not at rest yet, and look better than they are. One frame, or one prior, leaves no choice.
 
     Raises ValueError without any prior.
     """
     if not priors:
         raise ValueError("there are no priors to choose from: `choices` has to return at least one")
-    best, least, its_number = priors[0], math.inf, 0
     if len(priors) == 1 or len(state.z) == 1:
-        return best
+        return priors[0]
     halves = [_Misfit.of(objective, state, slice(first, None, 2)) for first in (0, 1)]
     # the object of all frames knows the half that it is to predict
     changes = [half.settle(torch.zeros_like(state.image), priors[0], n_iterations) for half in halves]
-    for number, prior in enumerate(priors):
+    misfits = []
+    for prior in priors:
         changes = [half.settle(change, prior, n_iterations) for half, change in zip(halves, changes, strict=True)]
-        misfit = sum(half.rise(change) for half, change in zip(halves, reversed(changes), strict=True))
-        if misfit < least:
-            best, least, its_number = prior, misfit, number
-        elif number - its_number == _PATIENCE:
-            break
-    return best
+        misfits.append(sum(half.rise(change) for half, change in zip(halves, reversed(changes), strict=True)))
+    return priors[misfits.index(min(misfits))]
 
 
 @dataclass(frozen=True)

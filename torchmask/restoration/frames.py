@@ -65,12 +65,6 @@ class FrameStack:
         rays and hot pixels, which get no weight, and if the object seems to extend beyond the field.
         """
         frames, valid = check_frames(frames, valid, grid)
-        if copies := copies_among(frames):
-            warnings.warn(
-                f"frames {copies} of this stack, counted from 0, repeat earlier ones pixel by pixel, as a file that is "
-                "read twice does: they tell nothing new, but count as much, so leave them out",
-                stacklevel=4,
-            )
         frames, valid = leave_out_spikes(frames, valid, grid, aperture, stacklevel=4)
         errors = None if errors is None else check_errors(errors, frames, valid)
         variance = expected_variance(frames, grid, aperture, readout_noise, valid, errors)
@@ -90,6 +84,12 @@ class FrameStack:
             warnings.warn(
                 "the frames are bright at the border: does the object extend beyond the field? If it is sky, give its "
                 "level [electrons per pixel]",
+                stacklevel=4,
+            )
+        if copies := copies_among(frames):
+            warnings.warn(
+                f"frames {copies} of this stack, counted from 0, repeat earlier ones pixel by pixel, as a file that is "
+                "read twice does: they tell nothing new, but count as much, so leave them out",
                 stacklevel=4,
             )
         return cls(frames / unit, valid, unit, variance, known, free, errors, slope)

@@ -67,9 +67,8 @@ class MyopicDeconvolution:
     weights : sequence of float, optional
         Relative flux at each wavelength, any positive numbers. None: equal.
     static_modes : int
-        Number of Zernike modes per sub-aperture, Noll 1 to static_modes, of aberrations common to all frames (of the
-        telescope), with r0 the sub-aperture diameter in their prior, besides the `n_modes` of each frame. Coefficients
-        are the sum of both, with max(n_modes, static_modes) modes.
+        Number of Zernike modes per sub-aperture, Noll 1 to static_modes, of aberrations common to all frames, with r0
+        the sub-aperture diameter in their prior. Coefficients are the sum, with max(n_modes, static_modes) modes.
     background : Background, float or tensor
         Uniform light that does not come from the object, see `Background`; or the known background [electrons per
         pixel], a number or a tensor that broadcasts to the frames. Its photon noise is taken into account.
@@ -232,8 +231,7 @@ class MyopicDeconvolution:
             Earlier result to continue from (warm start). It may come from the first T' <= T of these frames: the
             aberrations of the new frames are then fitted to its object before everything is refined together.
         n_samples : int
-            Number of posterior samples for the standard deviations of object and coefficients; each costs about as much
-            as 50 iterations, and 8 are enough. 0: no standard deviations.
+            Number of posterior samples for standard deviations, 0 for none; each takes as 50 iterations, 8 are enough.
         seed : int
             Seed of random starts, candidates and samples of aberrations.
         checkpoint : path, optional
@@ -252,7 +250,8 @@ class MyopicDeconvolution:
         Warns
         -----
         UserWarning
-            If noise, border or fringes of the frames contradict `readout_noise`, the field or the mask.
+            If noise, border or fringes of the frames contradict `readout_noise`, the field or the mask, or if they show
+            too little of the object for the standard deviations that `n_samples` asks for.
         """
         started = time.perf_counter()
         n_samples = number_of_samples(n_samples)
@@ -276,6 +275,7 @@ class MyopicDeconvolution:
             file = Checkpoint.of(checkpoint, objective, settings, (*known.tensors, *tensors_of(start)))
             progress = solver.solve(known, start, file)
             verdict = replace(solver.judge.verdict(solver.objective, progress.ending), **look._asdict())
+            verdict = verdict.of_measured_noise() if self.readout_noise is None and errors is None else verdict
             result = assemble_result(solver.objective, stack, progress, solver.prior_r0, verdict, n_modes=self.n_modes)
             if n_samples:
                 result = add_deviations(result, solver.objective, stack, progress, n_samples)

@@ -39,5 +39,7 @@ class PlacedSamples:
 
     def pull_back(self, weights: Tensor, basis: Tensor) -> Tensor:
         """Return the gradient (2,) in the step from those in the samples' weights (P,) and basis (P, K)."""
-        (slope,) = torch.autograd.grad((self._moved.weights, self._moved.basis), self._step, (weights, basis))
+        pairs = ((self._moved.weights, weights), (self._moved.basis, basis))
+        moved, by_moved = zip(*(pair for pair in pairs if pair[0].requires_grad), strict=True)  # pistons do not move
+        (slope,) = torch.autograd.grad(moved, self._step, by_moved)
         return slope

@@ -179,7 +179,8 @@ class Solver:
         """Let all starts of a faint search have the prior that suits the object of the first, once it is sharp."""
         is_sharp = progress.starts == 1 and progress.iterations >= max(self.schedule.sharp_after, 1)
         if is_sharp and math.isinf(progress.rate):
-            progress.rate = rate_in_search(self.objective, progress.state, self.stack.change) or math.inf
+            placed = self.setting.objective_at(self.objective, progress.state)
+            progress.rate = rate_in_search(placed, progress.state, self.stack.change) or math.inf
         if math.isfinite(progress.rate) and progress.rate != 1:
             self.objective = self.objective.with_changes(prior=self.given.in_search(progress.rate))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from enum import Enum
 from statistics import NormalDist
 from typing import Any, NamedTuple
@@ -16,6 +16,7 @@ from torchmask.restoration.noise import FrameNoise
 
 _SURE = 5.0  # standard deviations of the noise that do not occur by chance
 _LOST = 2.0  # times the minimum tolerance of a stack is allowed for single frames: they end in minima of their own
+_TELLING = 200.0  # signal to noise: below 180 errors are 1 to 20 times their standard deviations, above 0.6 to 1.8
 _BY_CHANCE = 0.01  # of the good stacks have a frame that is named because of its noise
 
 
@@ -45,6 +46,7 @@ class Verdict:
     contradiction : what the fringes say against the mask as given, and which fits better; empty if nothing
     unseen : other orientations of the mask that would make the same fringes; empty if there are none
     least : chi-square below which no fit comes; 0 if that cannot be told
+    is_scarce : whether the frames show too little of the object to tell it from others, such as much smoother ones
 
     Examples
     --------
@@ -65,6 +67,7 @@ class Verdict:
     contradiction: str = ""
     unseen: str = ""
     least: float = 0.0
+    is_scarce: bool = False
 
     @property
     def explained(self) -> bool:
@@ -75,6 +78,16 @@ class Verdict:
     def excess(self) -> float:
         """Chi-square in excess of that of noise."""
         return self.chi_square - 1
+
+    def of_measured_noise(self) -> Verdict:
+        """Return the verdict for frames whose noise was not told but measured, which advises otherwise on it."""
+        if self.finding is not Finding.TOO_MUCH_NOISE:
+            return self
+        advice = (
+            "what was measured as noise in the frames: light that is cut off at their border, cosmic rays and hot "
+            "pixels raise it, so tell readout_noise= or mark such pixels in valid="
+        )
+        return replace(self, check=advice)
 
     def __str__(self) -> str:
         numbers = f"chi-square is {self.chi_square:.4g} over {self.degrees_of_freedom} degrees of freedom"
@@ -136,15 +149,16 @@ class FrameFits(NamedTuple):
 
 
 def judge(
-    frames: FrameFits, contrast: float, error: ModelError, tolerance: Tolerance, *, at_rest: bool, alone: bool = False
+    frames: FrameFits, contrast: float, error: ModelError, tolerance: Tolerance, *, at_rest: bool, blind: bool
 ) -> Verdict:
     """Return the verdict on frames.
 
     `contrast` is the chi-square per pixel of the mean frame against a uniform one; `at_rest` says whether the search
-    ran to its end, and `alone` that object and aberrations were restored from a single frame. Noise gives a frame the
-    chi-square of its own noise level, whose variance is 2 over the degrees of freedom times `unevenness`; what the
-    model lacks adds in proportion to the square of its transmission. Each free parameter takes the noise of one pixel
-    at most, of a bright one where noise is uneven.
+    ran to its end, and `blind` that neither object nor aberrations were known. Then light is scarce if less than 200^2
+    of the mean frame's chi-square is beyond noise. Noise gives a frame the chi-square of its own noise level, whose
+    variance is 2 over the degrees of freedom times `unevenness`; what the model lacks adds in proportion to the square
+    of its transmission. Each free parameter takes the noise of one pixel at most, of a bright one where noise is
+    uneven.
     """
     chi_square, pixels, transmission, level, unevenness = (
         values.double().cpu() for values in (*frames[:3], *frames.noise)
@@ -167,30 +181,34 @@ def judge(
         finding = Finding.ONLY_NOISE
     else:
         finding = Finding.EXPLAINED if found <= limit else Finding.NOT_EXPLAINED
-    check = _what_to_check(finding, len(lost), len(pixels), at_rest)
-    if finding is Finding.EXPLAINED and alone:
+    scarce = blind and (contrast - 1) * float(pixels.max()) < _TELLING**2
+    check = _what_to_check(finding, len(lost), len(pixels), at_rest=at_rest, scarce=scarce)
+    if finding is Finding.EXPLAINED and blind and len(pixels) == 1:
         check = "against other frames: one alone is explained by many objects with aberrations to suit"
     numbers = (found, round(total), error.excess, limit, error.phase)
-    return Verdict(finding, *numbers, lost, len(pixels), check, least=least)
+    return Verdict(finding, *numbers, lost, len(pixels), check, least=least, is_scarce=scarce)
 
 
-def _what_to_check(finding: Finding, n_lost: int, n_frames: int, at_rest: bool) -> str:
+def _what_to_check(finding: Finding, n_lost: int, n_frames: int, *, at_rest: bool, scarce: bool) -> str:
     if finding is Finding.ONLY_NOISE:
         return "the pointing, the crop and the exposure time"
     if finding is Finding.TOO_MUCH_NOISE:
         return "read-out noise, gain and errors of pixels"
+    steps = []
+    if scarce:
+        steps.append("again with more light or more frames, as these show too little of the object to tell it")
     few = 0 < n_lost <= n_frames / 2
     if finding is Finding.EXPLAINED:
-        return "those frames for clouds and tracking errors" if n_lost else ""
-    if few and at_rest:
-        return "those frames for clouds and tracking errors, or leave them out"
-    setting = (
-        "the mask (which one, how it lies), wavelength and pixel scale, gain and read-out noise, dead and hot "
-        "pixels, and that all frames show one object"
-    )
-    return (
-        setting if at_rest else f"again after more iterations, since this search was stopped early, and then {setting}"
-    )
+        steps += ["those frames for clouds and tracking errors"] if n_lost else []
+    elif few and at_rest:
+        steps.append("those frames for clouds and tracking errors, or leave them out")
+    else:
+        steps += [] if at_rest else ["again after more iterations, since this search was stopped early"]
+        steps.append(
+            "the mask (which one, how it lies), wavelength and pixel scale, gain and read-out noise, dead and hot "
+            "pixels, and that all frames show one object"
+        )
+    return ", and then ".join(steps)
 
 
 def _listed(frames: tuple[int, ...], n_frames: int) -> str:
