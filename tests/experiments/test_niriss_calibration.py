@@ -42,6 +42,10 @@ def test_a_tiny_run_finds_the_mask_of_the_pipeline_where_it_lies_so(tmp_path, ex
     primary = fits.PrimaryHDU()
     primary.header.update({"INSTRUME": "NIRISS", "FILTER": "F480M"})
     fits.HDUList([primary, sci]).writeto(tmp_path / "hd-37093_0.fits")
+    fits.HDUList([primary, sci]).writeto(tmp_path / "hd-37093_1.fits")
+    both = niriss_calibration.read_star(niriss_calibration.Options(data=tmp_path, crop=40))  # --smoke reads the first
+    assert both.frames.shape == (2, 40, 40)
+    assert both.frame_numbers == (0, 1)
     assert niriss_calibration.main(["--data", str(tmp_path), "--smoke", "--out", str(tmp_path / "run")]) == 0
     rows = json.loads((tmp_path / "run/niriss_calibration.json").read_text())["rows"]
     for row in rows:
