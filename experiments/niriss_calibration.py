@@ -82,7 +82,11 @@ def read_star(options: Options) -> Observation:
     valid = [torch.ones_like(part.frames, dtype=torch.bool) if part.valid is None else part.valid for part in parts]
     together = [each.expand_as(part.frames) for each, part in zip(valid, parts, strict=True)]
     return dataclasses.replace(
-        parts[0], frames=torch.cat([part.frames for part in parts]), valid=torch.cat(together), errors=None, frame_numbers=()
+        parts[0],
+        frames=torch.cat([part.frames for part in parts]),
+        valid=torch.cat(together),
+        errors=None,
+        frame_numbers=(),
     )
 
 

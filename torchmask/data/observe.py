@@ -176,7 +176,7 @@ def read_observation(
         kept = kept[best_frames(frames[kept], valid[kept], keep, keep_by)]
     known = [noise for noise in noises if noise is not None]
     if readout_noise is None and len(known) == len(files):
-        readout_noise = math.sqrt(sum(noise**2 for noise in known) / len(known))
+        readout_noise = math.sqrt(np.average(np.square(known), weights=[len(stack[0]) for stack in stacks]))
     side = frames.shape[-1] if frames.shape[-1] == frames.shape[-2] else frames.shape[-2:]
     return Observation(
         frames=torch.from_numpy(frames),

@@ -73,7 +73,8 @@ class Polygon(Shape):
     def askew(self) -> float:
         # The result puts the middle of the widest gap between the normals along y.
         angles = [angle for angle, _ in self.strips()]
-        gap, first = max((after - angle, angle) for angle, after in zip(angles, [*angles[1:], math.pi], strict=True))
+        following = [*angles[1:], angles[0] + math.pi]
+        gap, first = max((after - angle, angle) for angle, after in zip(angles, following, strict=True))
         return math.pi / 2 - self.orientation - first - gap / 2
 
     def _normals(self) -> list[tuple[float, float]]:
