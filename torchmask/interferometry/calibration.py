@@ -26,8 +26,9 @@ from torchmask.interferometry.star_fit import (
     require_all_holes,
     start_frame,
 )
-from torchmask.interferometry.star_frames import StarFrames, StarVerdict, judge_star, require_star
+from torchmask.interferometry.star_frames import StarFrames
 from torchmask.interferometry.star_model import MAP, PLACE, Shared, StarModel
+from torchmask.interferometry.star_verdict import StarVerdict, judge_star, require_star
 from torchmask.interferometry.which_mask import require_mask
 from torchmask.observation import check_frames
 from torchmask.optics.aperture import SparseAperture

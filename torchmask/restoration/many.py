@@ -62,11 +62,11 @@ def restore_many(
     >>> from torchmask.optics.aperture import SparseAperture
     >>> mask = SparseAperture([[0.0, 0.3], [-0.3, -0.2], [0.3, -0.2]], 0.2, 1.0)
     >>> method = MyopicDeconvolution(mask, Grid.nyquist(1.0, 550e-9, 32), n_modes=3, max_iterations=3)
-    >>> frames = torch.full((4, 32, 32), 20.0); frames[:, 12:20, 12:20] = 1000.0
+    >>> x = torch.arange(32.0) - 16; frames = (20 + 1000 * torch.exp(-(x[:, None] ** 2 + x**2) / 20)).expand(4, 32, 32)
     >>> frames = torch.poisson(frames, generator=torch.Generator().manual_seed(0))
     >>> one, other = restore_many(method, [frames, -frames], n_workers=1)
-    >>> one.object.shape, other
-    (torch.Size([32, 32]), ValueError('frames [0, 1, 2, 3] hold no light: leave them out'))
+    >>> one.object.shape, type(other)
+    (torch.Size([32, 32]), <class 'ValueError'>)
     """
     turns = restore_in_turn(
         method, stacks, n_samples=n_samples, seed=seed, backend=backend, n_workers=n_workers, callback=callback

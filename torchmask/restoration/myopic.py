@@ -113,7 +113,7 @@ class MyopicDeconvolution:
     >>> from torchmask.optics.aperture import SparseAperture
     >>> mask = SparseAperture([[0.0, 0.3], [-0.3, -0.2], [0.3, -0.2]], 0.2, 1.0)
     >>> method = MyopicDeconvolution(mask, Grid.nyquist(1.0, 550e-9, 32), n_modes=3, r0=0.2, max_iterations=5)
-    >>> frames = torch.full((4, 32, 32), 20.0); frames[:, 12:20, 12:20] = 1000.0
+    >>> x = torch.arange(32.0) - 16; frames = (20 + 1000 * torch.exp(-(x[:, None] ** 2 + x**2) / 20)).expand(4, 32, 32)
     >>> result = method.restore(torch.poisson(frames, generator=torch.Generator().manual_seed(0)))
     >>> result.object.shape, result.coefficients.shape
     (torch.Size([32, 32]), torch.Size([4, 3, 3]))
