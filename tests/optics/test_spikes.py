@@ -106,7 +106,9 @@ def test_hot_and_dead_pixels_are_found_in_every_frame():
     assert places(found) == set().union(*(around(number, 20, 33) for number in range(len(frames))))
     bright = 1e4 + torch.poisson(torch.full_like(frames, 1e4), generator=torch.Generator().manual_seed(0))
     bright[:, 20, 33] = 0.0
-    assert bool(find_spikes(bright, everywhere(bright), GRID, MASK)[:, 20, 33].all())
+    dead = find_spikes(bright, everywhere(bright), GRID, MASK)
+    assert bool(dead[:, 20, 33].all())
+    assert int(dead.sum()) == int(dead[:, 18:23, 31:36].sum())  # what touches it has side lobes above zero
 
 
 @pytest.mark.parametrize("shape", ["pair", "column", "corner", "line", "block"])
@@ -153,11 +155,53 @@ def test_marked_pixels_may_hold_anything_finite_and_are_not_found_again():
     assert places(find_spikes(frames, valid, GRID, MASK)) == around(4, 15, 20)
 
 
-def test_light_of_another_aperture_is_not_taken_for_spikes():
-    """Told a wavelength that is twice too long, half of what frames hold lies beyond the cut-off."""
-    frames = exposures(1e7)
-    told = Grid(48, GRID.pixel_scale, 2 * GRID.wavelength)
-    assert not bool(find_spikes(frames, everywhere(frames), told, MASK).any())
+@pytest.mark.parametrize(("share", "found"), [(0.02, False), (0.0005, True)])
+def test_an_image_that_no_optics_have_blurred_is_not_taken_apart(share, found):
+    """A fiftieth of its pixels are a thousand times as bright as the others: more
+    than cosmic rays hit. One of two thousand is a few spikes."""
+    generator = torch.Generator().manual_seed(4)
+    frames = torch.where(torch.rand(4, *GRID.shape, generator=generator) < share, 1e4, 10.0).double()
+    frames = torch.poisson(frames, generator=generator)
+    assert bool(find_spikes(frames, everywhere(frames), GRID, MASK).any()) is found
+
+
+def test_near_the_border_none_is_found():
+    """In a twelfth of the side, 4 pixels of 48: there the light that the border cuts off stands out too."""
+    frames = exposures(1e6)
+    for row, found in ((0, False), (3, False), (4, True), (43, True), (44, False)):
+        hit = frames.clone()
+        hit[2, row, 20] += 5 * frames.max()
+        assert bool(find_spikes(hit, everywhere(hit), GRID, MASK).any()) is found
+
+
+def test_a_bright_star_that_the_border_cuts_off_is_no_spike():
+    """In pixels of half the size there is room to look as far beyond the cut-off as a fading border spreads light."""
+    grid, star = Grid(48, 0.5 * GRID.pixel_scale, 550e-9), torch.zeros(48, 48)
+    star[2, 28] = 1e8
+    for seed in range(4):
+        frames = exposures(1e8, 3, seed, star, grid)
+        assert not bool(find_spikes(frames, everywhere(frames), grid, MASK).any())
+
+
+def test_photons_of_a_bright_core_are_no_spikes():
+    """In the core of a blob there is more noise than around it, and a single frame does not show how much.
+
+    Of 200 frames one in five thousand has a spike by chance.
+    """
+    x = torch.arange(48, dtype=torch.float64) - 24
+    blob = 400 * torch.exp(-(x[:, None] ** 2 + x**2) / (2 * 1.6**2))
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(200):
+        frame = torch.poisson(blob[None], generator=generator) + 0.5 * torch.randn(1, 48, 48, generator=generator)
+        assert not bool(find_spikes(frame, everywhere(frame), GRID, MASK).any())
+
+
+def test_readout_noise_makes_no_spikes():
+    """Of dark frames all noise is of the detector, and the largest of 55296 deviates is above four."""
+    generator = torch.Generator().manual_seed(0)
+    frames = 5 + 30 * torch.randn(24, *GRID.shape, dtype=torch.float64, generator=generator)
+    assert frames.max() > 4 * 30
+    assert not bool(find_spikes(frames, everywhere(frames), GRID, MASK).any())
 
 
 def test_without_frequencies_beyond_the_cutoff_none_is_found():

@@ -57,12 +57,12 @@ def leave_out_spikes(
 def find_spikes(frames: Tensor, valid: Tensor, grid: Grid, aperture: Aperture) -> Tensor:
     """Return which valid pixels of `frames` (T, H, W) [electrons] are spikes or their neighbours, (T, H, W) bool.
 
-    Pixels that are not `valid` (T, H, W) must hold finite values. A pixel is a spike if noise would reach what it holds
-    beyond the cut-off in one of a thousand stacks, by Bernstein's inequality, which holds for few photons too
-    (Boucheron, Lugosi & Massart, Concentration Inequalities, 2013, section 2.8). The variance of the noise is measured
-    there, and is at least that of the photons. Near the border, in a twelfth of the frame's side, there are none. Nor
-    are there any if more than a twentieth of all pixels would be, as with light of a larger aperture or another
-    wavelength, or if fewer than eight frequencies lie beyond the cut-off.
+    Pixels that are not `valid` (T, H, W) must hold finite values. A pixel is a spike if normal noise would reach what
+    it holds beyond the cut-off in one of a thousand stacks at most. The variance of the noise is measured there, and is
+    at least that of the photons that the pixel itself and its neighbours hold, so that few photons make no spike. Near
+    the border, in a twelfth of the frame's side, there are none. Nor are there any if more than a twentieth of all
+    pixels would be, as in an image that no optics have blurred, or if fewer than eight frequencies lie beyond the
+    cut-off.
     """
     found = torch.zeros_like(valid)
     beyond = _frequencies(frames, grid, aperture)
@@ -88,13 +88,11 @@ def find_spikes(frames: Tensor, valid: Tensor, grid: Grid, aperture: Aperture) -
             seen = tapered.clone()
             seen[spoilt] = fill_with_least_power(tapered[spoilt], known[spoilt], beyond)
         residual = torch.fft.irfft2(torch.fft.rfft2(seen) * half, s=frames.shape[1:])
-        residual = torch.where(counts, residual, 0.0)
+        residual = torch.where(known, residual, 0.0)
         square = residual**2
-        photon = _per_electron(frames, square / share, counts)
-        least, step = torch.addcmul(uneven, photon, photons), photon * log_odds * share / 3
-        limit = step + (step**2 + 2 * log_odds * torch.maximum(_spread(square, counts), least)).sqrt()
-        # dark pixels come last: beside bright ones that touch there are side lobes below zero
-        more = _peaks(residual, limit) if bool((residual > limit).any()) else _peaks(-residual, limit)
+        least = torch.addcmul(uneven, _per_electron(frames, square / share, counts), photons)
+        limit = (2 * log_odds * torch.maximum(_spread(square, counts), least)).sqrt()
+        more = counts & _peaks(residual, limit)  # a dark pixel has bright side lobes, by which it is found
         if not bool(more.any()):
             break
         found = found | (valid & (_largest(more.to(frames), _GROWN) > 0))
