@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -22,6 +23,9 @@ _AT_A_TIME = 32  # frames
 _RING = 2  # width of a ring of spatial frequencies, in units of their spacing
 _FLOOR = 0.03  # of the mean power of a ring: light between the fringes that the pattern lacks, as of a cut-out's border
 _LEAST = 8  # frequencies needed to tell anything
+# Errors of shares hold for light at all frequencies, and until light in few rings has made the variance of a share this
+# many times as large. With that, the shares of other masks scatter by 0.8 to 1.3 errors.
+_HOLDS = 4.0
 _LIT = 0.1  # of the largest share: wavelengths with less hardly show, as power goes by its square
 
 
@@ -88,7 +92,8 @@ class FringePower:
 
         The share is the slope of the logarithm of the power over that of a point source behind the mask, within rings
         of similar frequencies: an object and turbulence change the power from ring to ring. It scatters as if each of
-        the N (N - 1) baselines were one independent measurement.
+        the N (N - 1) baselines were one independent measurement, and by `wider` times that where light
+        lies in few rings.
         """
         pattern = _smoothed(expected_power(aperture, self.grid, self.wavelengths))[self.chosen].clamp(min=0)
         light = self._means(self.power - self.noise).clamp(min=0)
@@ -100,6 +105,21 @@ class FringePower:
             return Match(0.0, math.inf)
         error = math.sqrt(float(measured @ measured) / contrast / (n * (n - 1)))
         return Match(float(measured @ expected) / contrast, error)
+
+    @cached_property
+    def wider(self) -> float:
+        """By how much errors are larger since light lies in few rings; 1 where it lies in all.
+
+        A share is told by frequencies with light. In faint frames these are the ones of a few rings, in which the
+        object makes a difference too, while all others hold hardly anything but noise, which scatters little in the
+        mean of many frames. So a ring's scatter counts by the square of the share of light in its power, as the
+        contrast of the pattern does.
+        """
+        square = self._within_rings(self.power.log()) ** 2
+        weights = (1 - self.noise / self._means(self.power)).clamp(min=0) ** 2
+        everywhere = float(square.mean() * weights.sum())
+        ratio = float(weights @ square) / everywhere if everywhere > 0 else 0.0
+        return math.sqrt(max(1.0, ratio / _HOLDS))
 
     def _means(self, values: Tensor) -> Tensor:
         """Return the mean of values (F,) over the ring of each."""

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
 from torchmask.grid import Grid
@@ -27,9 +26,6 @@ ORIENTATIONS = {
 _NAMED = 2.5  # standard errors of the share by which another orientation must show
 _RIGHT = 0.6  # least share of the right mask, with two standard errors added, see docs/method.md
 _FOUND = 4.0  # standard errors by which one of some hundred candidates must show
-# Errors of shares hold for light at all frequencies, and until light in few rings has made the variance of a share this
-# many times as large. With that, the shares of other masks scatter by 0.8 to 1.3 errors.
-_HOLDS = 4.0
 _SCALES = 0.7, 1.4  # range of magnifications that are tried
 _ALIKE = 0.95  # correlation of two patterns above which frames do not tell them apart
 
@@ -62,8 +58,8 @@ def look_at_mask(frames: Tensor, aperture: Aperture, grid: Grid, band: Band | No
     others = {name: geometry.apply(aperture) for name, geometry in ORIENTATIONS.items()}
     light = [] if band is None else fringe_wavelengths(aperture, grid, band)
     unseen = " or ".join(name for name, other in others.items() if likeness(aperture, other, grid, light) > _ALIKE)
-    fringes = _Fringes.of(frames, aperture, grid, light)
-    return MaskLook("" if fringes is None else _contradiction(fringes, aperture, others), unseen)
+    power = FringePower.of(frames, aperture, grid, light)
+    return MaskLook("" if power is None else _contradiction(power, aperture, others), unseen)
 
 
 def require_mask(frames: Tensor, aperture: SparseAperture, grid: Grid) -> None:
@@ -71,63 +67,25 @@ def require_mask(frames: Tensor, aperture: SparseAperture, grid: Grid) -> None:
 
     The message names the mask of the catalogue that they fit, if one fits clearly.
     """
-    fringes = _Fringes.of(frames, aperture, grid)
-    if fringes is None or _may_be(told := fringes.match(aperture)):
+    power = FringePower.of(frames, aperture, grid)
+    if power is None or _may_be(told := _match(power, aperture)):
         return
-    found = _clearest(fringes, _catalogue(aperture, grid))
+    found = _clearest(power, _catalogue(aperture, grid))
     raise ValueError(
         f"the fringes of the frames are not those of this mask at any angle ({_shown(told)} of its pattern): "
         + (f"they fit {found[0]} ({_shown(found[1])})" if found else "no mask of the catalogue fits clearly either")
     )
 
 
-class _Fringes(NamedTuple):
-    """The power of fringes in some frames, and the factor by which errors of shares are larger than it tells.
-
-    A share is told by frequencies with light, most of all by those of high contrast. In faint frames these are the ones
-    of a few rings, in which the object makes a difference too, while all others hold hardly anything but noise, which
-    scatters little in the mean of many frames. So the scatter that counts is that of the rings with light.
-    """
-
-    power: FringePower
-    wider: float
-
-    @classmethod
-    def of(
-        cls, frames: Tensor, aperture: SparseAperture, grid: Grid, wavelengths: Sequence[float] = ()
-    ) -> _Fringes | None:
-        """Return the power as `FringePower.of` does."""
-        power = FringePower.of(frames, aperture, grid, wavelengths)
-        return None if power is None else cls(power, _wider(power))
-
-    def match(self, aperture: SparseAperture) -> Match:
-        """Return how much of the pattern of a mask the power shows."""
-        share, error = self.power.match(aperture)
-        return Match(share, self.wider * error)
+def _match(power: FringePower, aperture: SparseAperture) -> Match:
+    """Return how much of the pattern of a mask the power shows, with the error that light in few rings leaves."""
+    share, error = power.match(aperture)
+    return Match(share, power.wider * error)
 
 
-def _wider(power: FringePower) -> float:
-    """Return by how much errors are larger since light lies in few rings; 1 where it lies in all.
-
-    A ring counts by the square of the share of light in its power, as the contrast of the pattern does.
-    """
-    counts = torch.bincount(power.rings).to(power.power)
-
-    def means(values: Tensor) -> Tensor:
-        return torch.bincount(power.rings, values) / counts.clamp(min=1)
-
-    logarithm = power.power.log()
-    scatter = (means(logarithm**2) - means(logarithm) ** 2).clamp(min=0)
-    light = 1 - power.noise / means(power.power).clamp(min=torch.finfo(counts.dtype).tiny)
-    weights = counts * light.clamp(min=0) ** 2
-    everywhere = float(counts @ scatter) * float(weights.sum())
-    ratio = float(weights @ scatter) * float(counts.sum()) / everywhere if everywhere > 0 else 0.0
-    return math.sqrt(max(1.0, ratio / _HOLDS))
-
-
-def _contradiction(fringes: _Fringes, aperture: SparseAperture, others: dict[str, SparseAperture]) -> str:
-    told = fringes.match(aperture)
-    matches = {name: fringes.match(other) for name, other in others.items()}
+def _contradiction(power: FringePower, aperture: SparseAperture, others: dict[str, SparseAperture]) -> str:
+    told = _match(power, aperture)
+    matches = {name: _match(power, other) for name, other in others.items()}
     name = max(matches, key=lambda key: matches[key].share)
     best = matches[name]
     if best.share > max(told.share + best.error, _NAMED * best.error) and _may_be(best):
@@ -138,7 +96,7 @@ def _contradiction(fringes: _Fringes, aperture: SparseAperture, others: dict[str
     if _may_be(told):
         return ""
     seen = f"the fringes of the frames are not those of the mask in any of its eight orientations ({_shown(told)}"
-    found = _clearest(fringes, _catalogue(aperture, fringes.power.grid)) or _clearest(fringes, _moved(aperture))
+    found = _clearest(power, _catalogue(aperture, power.grid)) or _clearest(power, _moved(aperture))
     if found is not None:
         return f"{seen} of its pattern), but fit {found[0]} ({_shown(found[1])})"
     return (
@@ -156,9 +114,9 @@ def _shown(match: Match) -> str:
     return f"{match.share:.2f} +- {match.error:.2f}"
 
 
-def _clearest(fringes: _Fringes, candidates: Iterator[tuple[str, SparseAperture]]) -> tuple[str, Match] | None:
+def _clearest(power: FringePower, candidates: Iterator[tuple[str, SparseAperture]]) -> tuple[str, Match] | None:
     """Return name and match of the candidate whose pattern is seen most clearly, if one is seen clearly."""
-    matches = [(name, fringes.match(mask)) for name, mask in candidates]
+    matches = [(name, _match(power, mask)) for name, mask in candidates]
     best = max(matches, key=lambda pair: pair[1].share / pair[1].error, default=None)
     return best if best is not None and best[1].share > _FOUND * best[1].error else None
 
