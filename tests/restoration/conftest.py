@@ -17,10 +17,12 @@ from torchmask.optics.band import Band
 from torchmask.optics.detector import Detector
 from torchmask.restoration.aberrations import AberrationBasis, turbulent_basis
 from torchmask.restoration.forward import ExposureModel
+from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.result import RestorationResult
 from torchmask.restoration.state import Calibration, State
+from torchmask.restoration.traits import Refinement, Traits
 from torchmask.restoration.variation import TotalVariation
 from torchmask.simulation.exposures import simulate_observation
 
@@ -190,3 +192,30 @@ def off() -> Callable[[MyopicObjective, State, list], State]:
         return replace(state, z=state.z + objective.model.aberrations.parameters_of_pistons(pistons))
 
     return move
+
+
+@pytest.fixture(scope="session")
+def traits() -> Traits:
+    """Of a mask in turbulence that is told, restored in one start or more."""
+    return Traits(
+        many_minima=False,
+        estimated=False,
+        prior_on_aberrations=True,
+        r0_is_open=False,
+        r0=R0,
+        outer_scale=OUTER_SCALE,
+        max_iterations=1000,
+        tolerance=0.0,
+        seed=0,
+        refinement=Refinement.OFF,
+    )
+
+
+@pytest.fixture(scope="session")
+def stack_of() -> Callable[[MyopicObjective], FrameStack]:
+    """Makes a stack of an objective's frames, whose noise is 0.003 of their unit."""
+
+    def make(objective: MyopicObjective) -> FrameStack:
+        return FrameStack(objective.frames, torch.ones_like(objective.frames, dtype=torch.bool), 1.0, 0.003**2)
+
+    return make
