@@ -13,7 +13,7 @@ from torchmask.interferometry.oifits import save_oifits
 from torchmask.observation import Observation
 from torchmask.optics.aperture import SparseAperture
 
-pytest.importorskip("astropy.io.fits")
+fits = pytest.importorskip("astropy.io.fits")
 
 MASK = SparseAperture([[0.0, 0.42], [0.38, -0.2], [-0.4, -0.15], [0.1, -0.05], [-0.2, 0.28]], 0.1, 1.0)
 GRID = Grid.nyquist(MASK.extent, 550e-9, 48, 1.1)
@@ -74,6 +74,9 @@ def test_a_resolved_source_is_no_companion(write, tmp_path, capsys):
     assert json.loads((tmp_path / "run/status.json").read_text())["explained"] is False
     said = capsys.readouterr().out
     assert "not explained: a star and one companion leave a chi-square of" in said
+    with np.load(tmp_path / "run/companion.npz") as stored:
+        farthest = float(np.linalg.norm(stored["offsets"], axis=1).max())
+    assert f"one companion at most, within {farthest / MAS:.4g} mas (--most-arcsec looks farther)" in said
     assert "would be found" not in said
 
 
@@ -108,3 +111,16 @@ def test_a_mistake_is_one_line_and_nothing_is_written(write, tmp_path, capsys):
         assert message in err
         assert err.count("\n") == 1
         assert not (tmp_path / "run").exists()
+
+
+def test_a_companion_of_negative_light_is_none(write, tmp_path, capsys):
+    """|V|^2 are too large by 1.5 % where the calibrator has lost as much of its contrast."""
+    single, star = write("single.oifits", ((0, 0, 1),), 2), write("star.oifits", ((0, 0, 1),), 3)
+    with fits.open(star) as hdus:
+        hdus["OI_VIS2"].data["VIS2DATA"] *= 0.985
+        hdus.writeto(tmp_path / "dim.oifits")
+    assert run(single, "--star", tmp_path / "dim.oifits", "--out", tmp_path / "run") == 0
+    found = json.loads((tmp_path / "run/companion.json").read_text())
+    assert found["companion"]["contrast"] < 0
+    assert not found["detected"]
+    assert "no companion; what fits best is one of negative light" in capsys.readouterr().out

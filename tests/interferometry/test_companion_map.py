@@ -65,6 +65,16 @@ def test_errors_that_were_told_too_small_grow_with_what_is_left(measure_pair):
     assert (variance * math.sqrt(2 / SEEDS) + 1 - 1.1).abs().max() < 4 * 1.1 * math.sqrt((2 + 6 / 18) / SEEDS)
 
 
+def test_fringes_stronger_than_those_of_a_star_are_no_companion(measure_pair):
+    """As of a calibrator that is resolved: what fits best takes light away, however clearly."""
+    dark = TRUTH * torch.tensor([-1.0, 1.0, 1.0])
+    fit = fit_pair(measure_pair(dark), dark)
+    assert float(fit.companion[0]) == pytest.approx(-0.08)
+    assert fit.explained
+    assert fit.significance > 5
+    assert not fit.detected
+
+
 def test_errors_never_fall_below_those_of_the_measurements(measure_pair):
     """Without noise nothing is left, which would be no reason to trust the measurements any more than they say."""
     seen = measure_pair(TRUTH)

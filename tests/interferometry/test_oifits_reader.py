@@ -197,3 +197,49 @@ def test_what_is_no_oifits_is_refused(tmp_path, observables):
         load_oifits(tmp_path / "b.fits")
     with pytest.raises(ValueError, match=r"has no squared visibility and no closure phase"):
         load_oifits(tmp_path / "c.fits")
+
+
+def test_an_empty_table_and_places_that_are_not_finite_are_left_out(tmp_path, observables):
+    """Two holes have no triangle, and some programs write a table of none."""
+    seen, observation = observables
+    save_oifits(tmp_path / "a.fits", seen, observation, bandwidth=1e-8)
+    with fits.open(tmp_path / "a.fits") as hdus:
+        hdus["OI_VIS2"].data["VCOORD"][2] = np.nan
+        empty = fits.BinTableHDU(hdus["OI_T3"].data[:0], hdus["OI_T3"].header)
+        kept = [hdu.copy() for hdu in hdus if hdu.name not in ("OI_T3", "OI_CORR")]
+        fits.HDUList([*kept, empty]).writeto(tmp_path / "b.fits")
+    read = load_oifits(tmp_path / "b.fits")
+    torch.testing.assert_close(read.vis2, seen.vis2[[0, 1, 3, 4, 5]], rtol=1e-12, atol=0)
+    assert len(read.closure_phases) == 0
+
+
+@pytest.mark.parametrize(
+    ("table", "column", "factor", "message"),
+    [
+        ("OI_WAVELENGTH", "EFF_WAVE", 1e6, r"b\.fits: EFF_WAVE is 0\.55: .* in m, .* micrometres are 0\.55e-6"),
+        ("OI_T3", "U2COORD", 1 / 550e-9, r"b\.fits: U2COORD reaches .*: it must be in m, not divided by"),
+    ],
+)
+def test_other_units_are_refused(table, column, factor, message, tmp_path, observables):
+    seen, observation = observables
+    save_oifits(tmp_path / "a.fits", seen, observation, bandwidth=1e-8)
+    with fits.open(tmp_path / "a.fits") as hdus:
+        hdus[table].data[column] *= factor
+        hdus.writeto(tmp_path / "b.fits")
+    with pytest.raises(ValueError, match=message):
+        load_oifits(tmp_path / "b.fits")
+
+
+def test_files_with_a_part_missing_are_refused(tmp_path, observables):
+    seen, observation = observables
+    save_oifits(tmp_path / "a.fits", seen, observation, bandwidth=1e-8)
+    with fits.open(tmp_path / "a.fits") as hdus:
+        of_t3, waves = hdus.fileinfo("OI_T3")["hdrLoc"], hdus["OI_WAVELENGTH"]
+        twice = fits.BinTableHDU(np.concatenate([waves.data, waves.data]), waves.header)
+        others = [hdu.copy() for hdu in hdus if hdu.name != "OI_WAVELENGTH"]
+        fits.HDUList([*others, twice]).writeto(tmp_path / "b.fits")
+    (tmp_path / "c.fits").write_bytes((tmp_path / "a.fits").read_bytes()[: of_t3 - 100])
+    with pytest.raises(ValueError, match=r"b\.fits: OI_VIS2 has 6 values of VIS2DATA in 6 rows, and .* 2 wavelengths"):
+        load_oifits(tmp_path / "b.fits")
+    with pytest.raises(ValueError, match=r"c\.fits is not an OIFITS file, or is damaged: File may have been truncated"):
+        load_oifits(tmp_path / "c.fits")

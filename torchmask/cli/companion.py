@@ -82,7 +82,8 @@ def run(options: Options) -> int:
             output.summary.append(
                 "without --star, |V|^2 are taken as calibrated: losses of contrast look like companions"
             )
-        output.summary.extend(summary(fit, limits, sides))
+        farthest = float(torch.linalg.vector_norm(found.offsets, dim=1).max())
+        output.summary.extend(summary(fit, limits, sides, farthest))
     return 0 if fit.explained else NOT_EXPLAINED
 
 
@@ -131,8 +132,11 @@ def describe(fit: PairFit) -> dict[str, Any]:
     }
 
 
-def summary(fit: PairFit, limits: DetectionLimits, side_known: bool) -> Sequence[str]:
-    """Return the lines to print; limits only if the measurements are explained, as they rest on the residuals."""
+def summary(fit: PairFit, limits: DetectionLimits, side_known: bool, farthest: float) -> Sequence[str]:
+    """Return the lines to print; limits only if the measurements are explained, as they rest on the residuals.
+
+    Companions were looked for up to the separation `farthest` [rad].
+    """
     seen = describe(fit)
     errors, freedom = seen["errors"], f"of {fit.degrees_of_freedom} degrees of freedom"
     where = (
@@ -144,10 +148,13 @@ def summary(fit: PairFit, limits: DetectionLimits, side_known: bool) -> Sequence
         return [
             f"not explained: a star and one companion leave a chi-square of {fit.chi_square:.4g} {freedom}; up to "
             f"{fit.limit:.4g} counts as explained; check that the star is a point and has one companion at most, "
-            "that --star is a point seen through the same mask, and the errors in the files",
+            f"within {farthest / MAS:.4g} mas (--most-arcsec looks farther), that --star is a point seen through the "
+            "same mask, and the errors in the files",
             f"the companion that fits best, which the measurements contradict, is {where}",
         ]
     head = "a companion" if fit.detected else f"no companion above {SIGNIFICANCE:g} standard errors; the likeliest is"
+    if seen["contrast"] <= 0:
+        head = "no companion; what fits best is one of negative light, as fringes stronger than a star's make it,"
     lines = [
         f"{head} {where} ({fit.significance:.1f} standard errors; chi-square {fit.chi_square:.4g} {freedom}, "
         f"{fit.star_chi_square:.4g} without it)"

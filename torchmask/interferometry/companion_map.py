@@ -120,8 +120,8 @@ class PairFit(Brief):
 
     @property
     def detected(self) -> bool:
-        """Whether the companion explains the measurements and is worth at least `SIGNIFICANCE` standard errors."""
-        return self.explained and self.significance >= SIGNIFICANCE
+        """Whether the companion explains the measurements, gives light, and is worth `SIGNIFICANCE` standard errors."""
+        return self.explained and self.significance >= SIGNIFICANCE and float(self.companion[0]) > 0
 
 
 def raster(measured: Measurements, least: float | None = None, most: float | None = None) -> Tensor:

@@ -5,6 +5,7 @@ Versions 1 and 2 of the standard are read (Pauls et al. 2005, PASP 117, 1255; Du
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,8 +17,10 @@ from torch import Tensor
 from torchmask.interferometry.measurements import Measurements
 from torchmask.interferometry.oifits_correlations import correlation_of, read_correlations
 from torchmask.io import extra
+from torchmask.numbers import require_wavelength
 
 _SHARED_SIDE = 1 / 3  # correlation of two closure phases that share a baseline, if all baselines are as noisy
+_LONGEST = 1e4  # [m], beyond any interferometer of light, and below baselines that were divided by its wavelength
 
 
 @dataclass(frozen=True)
@@ -53,16 +56,18 @@ def load_oifits(path: str | Path, target: str | None = None) -> Measurements:
     -------
     Measurements
         Values of OI_VIS2 and OI_T3, ordered by table, row and wavelength, without those that are flagged, are not
-        finite or have no positive error. Correlations are those of OI_CORR. Without it, closure phases are taken as
-        sums of phases of equally noisy baselines: if two triangles share a baseline their correlation is 1/3, or -1/3
-        if they traverse it in opposite directions. As independent values they would be counted several times, since
-        only (N - 1)(N - 2)/2 of the N (N - 1)(N - 2)/6 closure phases of N holes are independent.
+        finite, at a place or wavelength that is not, or have no positive error. Correlations are those of OI_CORR.
+        Without it, closure phases are taken as sums of phases of equally noisy baselines: if two triangles share a
+        baseline their correlation is 1/3, or -1/3 if they traverse it in opposite directions. As independent values
+        they would be counted several times, since only (N - 1)(N - 2)/2 of the N (N - 1)(N - 2)/6 closure phases of N
+        holes are independent.
 
     Raises
     ------
     ValueError
-        If the file is missing or is not OIFITS, a table lacks a column or its OI_WAVELENGTH, the target is not in the
-        file or not named although there are several, or no valid measurement is left.
+        If the file is missing, cut off or is not OIFITS, a table lacks a column or its OI_WAVELENGTH or has not as many
+        values as that, wavelengths or baselines are in another unit than m, the target is not in the file or not named
+        although there are several, or no valid measurement is left.
 
     Examples
     --------
@@ -86,14 +91,17 @@ def load_oifits(path: str | Path, target: str | None = None) -> Measurements:
     """
     with extra("oifits"):
         from astropy.io import fits
+        from astropy.utils.exceptions import AstropyUserWarning
 
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"there is no file {path}: an OIFITS file is needed")
     try:
-        with fits.open(path, memmap=False) as hdus:
-            return _read(path, hdus, target)
-    except (OSError, TypeError, KeyError) as error:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("error", "File may have been truncated", AstropyUserWarning)
+            with fits.open(path, memmap=False) as hdus:
+                return _read(path, hdus, target)
+    except (OSError, TypeError, KeyError, AstropyUserWarning) as error:
         raise ValueError(f"{path} is not an OIFITS file, or is damaged: {error}") from error
 
 
@@ -113,6 +121,7 @@ def _read(path: Path, hdus: Any, target: str | None) -> Measurements:
             f"{path} has no squared visibility and no closure phase that is finite and not flagged: give an OIFITS "
             "file with OI_VIS2 or OI_T3 tables, such as `torchmask restore --oifits` writes"
         )
+    _check_units(path, vis2, t3)
     closure_correlation = correlation_of(t3.corrname, t3.place, triplets)
     return Measurements(
         baselines=_tensor(vis2, "UCOORD", "VCOORD"),
@@ -126,6 +135,16 @@ def _read(path: Path, hdus: Any, target: str | None) -> Measurements:
         closure_errors=torch.as_tensor(t3.columns["T3PHIERR"]).deg2rad(),
         closure_correlation=_shared_sides(t3) if closure_correlation is None else closure_correlation,
     )
+
+
+def _check_units(path: Path, *kinds: _Rows) -> None:
+    """Raise ValueError, which names the file, unless wavelengths and baselines are of light, in m."""
+    for rows in kinds:
+        for wavelength in np.unique(rows.wavelength).tolist():
+            require_wavelength(f"{path}: EFF_WAVE", wavelength)
+        for name, values in rows.columns.items():
+            if name.endswith("COORD") and (longest := np.abs(values).max(initial=0.0)) > _LONGEST:
+                raise ValueError(f"{path}: {name} reaches {longest:.4g}: it must be in m, not divided by wavelength")
 
 
 def _target_number(path: Path, hdus: Any, target: str | None) -> int | None:
@@ -153,11 +172,18 @@ def _gather(
     """Read all valid numbers of the tables of a kind; `measured` names the columns of values and errors."""
     parts: list[_Rows] = []
     for hdu in hdus:
-        if hdu.name != kind:
+        if hdu.name != kind or not len(hdu.data):
             continue
         instrument = str(hdu.header["INSNAME"]).strip()
         if instrument not in waves:
             raise ValueError(f"{path}: {kind} is of instrument {instrument}, which has no OI_WAVELENGTH")
+        for name in measured:
+            if hdu.data[name].size != len(hdu.data) * len(waves[instrument]):
+                raise ValueError(
+                    f"{path}: {kind} has {hdu.data[name].size} values of {name} in {len(hdu.data)} rows, and the "
+                    f"OI_WAVELENGTH of its instrument {instrument} {len(waves[instrument])} wavelengths: each row must "
+                    "have a value for each wavelength"
+                )
         parts.append(_good_rows(hdu, len(parts), measured, places, target, waves[instrument]))
     if not parts:
         none = np.zeros(0)
@@ -179,7 +205,9 @@ def _good_rows(
     data, n = hdu.data, len(wave)
     shape = (len(data), n)
     values, errors = (np.asarray(data[name], dtype=float).reshape(shape) for name in measured)
-    good = np.isfinite(values) & np.isfinite(errors) & (errors > 0)
+    good = np.isfinite(values) & np.isfinite(errors) & (errors > 0) & np.isfinite(wave)
+    for name in places:
+        good &= np.isfinite(np.asarray(data[name], dtype=float)).reshape(-1, 1)
     good &= ~np.asarray(data["FLAG"], dtype=bool).reshape(shape)
     if target is not None:
         good &= np.asarray(data["TARGET_ID"]).reshape(-1, 1) == target
