@@ -149,6 +149,40 @@ def test_a_group_blows_the_way_its_members_do():
     assert opposite.winds[0] == pytest.approx((4.0, 0.0), rel=1e-12)
 
 
+@pytest.mark.parametrize("n_layers", [1, 2, 4, 6])
+def test_the_order_in_which_layers_are_given_changes_nothing(n_layers):
+    """Neighbours are neighbours in height."""
+    heights, strengths = (4e3, 0.0, 1.1e4, 300.0, 2e3, 8e3), (2e-13, 9e-13, 4e-14, 3e-13, 1e-13, 7e-14)
+    winds = ((3.0, 9.0), (5.0, 0.0), (-20.0, 4.0), (6.0, 2.0), (1.0, -7.0), (15.0, 15.0))
+    rows = sorted(zip(heights, strengths, winds, strict=True))
+    found = Layers(heights, strengths, winds).grouped(n_layers)
+    expected = Layers(*zip(*rows, strict=True)).grouped(n_layers)
+    for found_height, height in zip(sorted(found.heights), expected.heights, strict=True):
+        assert found_height == pytest.approx(height, rel=1e-12)
+    assert sorted(found.strengths) == pytest.approx(sorted(expected.strengths), rel=1e-12)
+
+
+def test_the_zenith_changes_nothing():
+    assert Layers([4e3], [2e-13], [(3.0, 9.0)]).at_airmass(1.0) == Layers([4e3], [2e-13], [(3.0, 9.0)])
+
+
+def test_a_description_has_shares_of_the_whole_and_speeds_whatever_their_direction():
+    layers = Layers([100.0, 5e3], [6e-13, 2e-13], [(-3.0, 4.0), (0.0, -12.0)])
+    rows = [row.strip("| ").split(" | ") for row in layers.describe(WAVELENGTH).splitlines()]
+    assert rows[2:4] == [["100 m", "0.750", "5.0 m/s"], ["5000 m", "0.250", "12.0 m/s"]]
+    told = {row[0]: row[1] for row in rows[4:] if len(row) == 3}
+    units = {"cm": 1e-2, "ms": 1e-3, "Hz": 1.0, "microrad": 1e-6, "arcsec": math.pi / 180 / 3600}
+    for name, scale in (
+        ("r0", layers.r0),
+        ("theta0", layers.theta0),
+        ("tau0", layers.tau0),
+        ("f_G", layers.greenwood_frequency),
+    ):
+        for part in told[name].split(" = "):
+            number, unit = part.split()
+            assert float(number) * units[unit] == pytest.approx(scale(WAVELENGTH), rel=1e-3)  # of four digits
+
+
 def test_the_structure_function_is_1_at_each_scale():
     layers, close = named_layers("hv57"), {"rel": 1e-10}
     theta0, tau0, r0 = (scale(WAVELENGTH) for scale in (layers.theta0, layers.tau0, layers.r0))

@@ -5,6 +5,8 @@ import math
 import pytest
 import torch
 from exact_turbulence import drawn_mean_square, sampled_mean_square
+from hypothesis import given
+from hypothesis import strategies as st
 
 from torchmask.atmosphere import transfer
 from torchmask.atmosphere.seeing import Seeing
@@ -45,6 +47,40 @@ def test_a_band_blurs_the_phase_between_two_points(even_in, width, kept):
         Seeing(1 / 7).structure(), torch.zeros(2), baseline, baseline, scale[:, None], scale[None, :]
     )
     assert float(shares @ torch.exp(-variance / 2) @ shares) == pytest.approx(kept, abs=1e-3)
+
+
+PLACE = st.tuples(*[st.floats(-3, 3)] * 2)
+SCALE = st.floats(0.3, 3)
+
+
+@given(points=st.tuples(*[PLACE] * 4), scale=SCALE, other_scale=SCALE)
+def test_a_difference_is_made_of_the_distances_of_its_four_points(points, scale, other_scale):
+    """E[(a (phi_1 - phi_2) - a' (phi_3 - phi_4))^2] = a^2 D12 + a'^2 D34 - a a' (D14 + D23 - D13 - D24)."""
+    first, second, third, fourth = torch.tensor(points, dtype=torch.float64)
+    structure = Seeing(0.2, 5.0).structure()
+
+    def between(one, other):
+        return float(structure(one - other))
+
+    crossed = between(first, fourth) + between(second, third) - between(first, third) - between(second, fourth)
+    own = scale**2 * between(first, second) + other_scale**2 * between(third, fourth)
+    expected = own - scale * other_scale * crossed
+    separation, pairs = (third + fourth - first - second) / 2, (second - first, fourth - third)
+    found = float(difference_variance(structure, separation, *pairs, scale, other_scale))
+    # rounding of a displacement, 1e-15 m, and of D, which is at most 2e3 rad^2 and is steepest where it is small
+    assert found == pytest.approx(expected, rel=1e-9, abs=1e-7)
+
+
+@pytest.mark.parametrize("stretch", [0.8, 1.3])
+def test_light_of_one_other_wavelength_is_a_grid_of_that_wavelength(stretch):
+    """r0 goes with the wavelength to the 6/5. Holes of less than r0 / 4 are sampled by their size, whatever r0 is."""
+    mask = SparseAperture([[0.0, 0.3], [0.02, -0.1], [-0.3, -0.1]], 0.2, 1.0)
+    elsewhere = Grid(NYQUIST.n_pixels, NYQUIST.pixel_scale, stretch * NYQUIST.wavelength)
+    nu = torch.tensor([[0.0, 0.05], [0.01, 0.21], [0.16, 0.0]], dtype=torch.float64) / stretch
+    found = mean_square_otf(mask, NYQUIST, nu, Seeing(1.0), Band.of([elsewhere.wavelength]))
+    expected = mean_square_otf(mask, elsewhere, nu, Seeing(stretch**1.2))
+    assert (expected > 1e-3).all()
+    torch.testing.assert_close(found, expected, rtol=1e-9, atol=0)
 
 
 def test_pistons_alone_are_the_denominator_of_mse_a():
