@@ -246,9 +246,22 @@ def test_frames_do_not_depend_on_the_chunks(scene, mask, grid, monkeypatch):
     records = []
     chunked = simulate(scene, mask, grid, n_frames=5, callback=records.append)
     torch.testing.assert_close(chunked.psfs, whole.psfs, rtol=0, atol=1e-15)
-    assert [(r.stage, r.step, r.n_steps) for r in records] == [("simulation", k, 5) for k in (2, 4, 5)]
-    assert [len(r.arrays["frames"]) for r in records] == [2, 4, 5]
+    assert [(r.stage, r.step, r.n_steps) for r in records] == [("simulation", k, 5) for k in (1, 2, 3, 4, 5)]
+    assert [len(r.arrays["frames"]) for r in records if r.arrays] == [2, 4, 5]
     assert all(0.7 < r.scalars["kept_light"] < 1.05 for r in records)
+
+
+def test_the_light_that_is_told_to_be_kept_is_without_noise(scene, mask, grid):
+    """A tenth of a photon in each frame, beneath the noise of 1024 pixels, is kept as much of as of a bright scene."""
+    told = []
+    for light in (0.1, 1e9):
+        records = []
+        simulate(
+            scene * (light / float(scene.sum())), mask, grid, n_frames=2, readout_noise=10.0, callback=records.append
+        )
+        told.append([record.scalars["kept_light"] for record in records])
+    assert told[0] == pytest.approx(told[1], rel=1e-6)
+    assert 0.7 < told[1][-1] < 1
 
 
 def test_read_noise_and_photon_noise_add(mask, grid):

@@ -35,6 +35,7 @@ from torchmask.optics.geometry import MaskGeometry
 from torchmask.optics.passband import Passband
 from torchmask.optics.pixel import jittered, square_pixel
 from torchmask.optics.pupil import Aperture
+from torchmask.record import Record, fan_out
 from torchmask.simulation.conditions import Conditions
 from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
@@ -277,21 +278,19 @@ def run(options: Options) -> None:
     used = None if known is None else used_instrument(known, float(told.area), options)
     with new_run("simulate", options, options.seed) as output:
         output.keep_instrument(used)
-        generator = torch.Generator().manual_seed(options.seed)
+        generator, records = torch.Generator().manual_seed(options.seed), list[Record]()
         observation = simulate_observation(
             *(scene, aperture, grid, turbulence, detector, options.n_frames, generator),
             conditions=conditions,
             told=None if true is None else told,
             allow_overlap=options.allow_overlap,
-            callback=output.callback,
+            callback=fan_out(output.callback, records.append),
         )
         observation.save(output.directory / STACK)
         log_observation("observation", observation, output.logger, conditions.band)
         if isinstance(turbulence, LayeredPhase):
             output.summary.append(turbulence.layers.describe(wavelength))
-        assert observation.transmission is not None
-        light = observation.frames.mean() - conditions.sky
-        kept = float(light * math.prod(grid.shape) / (n_photons * observation.transmission.mean()))
+        kept = records[-1].scalars["kept_light"]
         output.summary.append(
             f"{options.n_frames} frames of {grid.shape[0]} x {grid.shape[1]} pixels of "
             f"{grid.pixel_scale / ARCSEC:.4g} arcsec, {n_photons:.4g} photons in each, {100 * kept:.1f} % of the "

@@ -87,7 +87,8 @@ def simulate_observation(
     allow_overlap : bool
         Whether holes of the mask may overlap, as in some real masks; light in overlaps counts twice.
     callback : callable, optional
-        Receives a `Record` of stage "simulation" after each chunk of frames, with the frames so far.
+        Receives a `Record` of stage "simulation" after each frame, with the share of the scene's light that falls into
+        the field, and after each chunk of frames the frames so far.
 
     Returns
     -------
@@ -101,8 +102,8 @@ def simulate_observation(
         If the scene does not fit the grid or is negative, black or not finite; the aperture is a population; its holes
         overlap by more than a millionth of its diameter and `allow_overlap` is not given; `n_frames` is below 1; the
         grid samples the aperture too coarsely at the shortest wavelength; `exposure_time` is given but the turbulence
-        has no wind, or it exceeds the time between frames; or `keep_phases` is combined with `exposure_time`, `band` or
-        `told`.
+        has no wind, or it exceeds the time between frames or a thousand times tau0; or `keep_phases` is combined with
+        `exposure_time`, `band` or `told`.
     TypeError
         If the scene is no tensor, or `aperture`, `grid`, `detector` or `generator` of another type than it must be.
 
@@ -160,19 +161,21 @@ def simulate_observation(
         screens = torch.Generator().manual_seed(screens_seed)
         stream = wavefronts(turbulence, optics.samples, n_frames, delays, screens)
         frames, psfs, phases = scene.new_empty(n_frames, *grid.shape), scene.new_empty(n_frames, *grid.shape), []
-        chunk = max(1, _CHUNK // math.prod(optics.samples.raster))
+        chunk, kept = max(1, _CHUNK // math.prod(optics.samples.raster)), 0.0
         for first in range(0, n_frames, chunk):
             now = range(first, min(first + chunk, n_frames))
             for t, wavefront in zip(now, stream, strict=False):
                 frames[t], psfs[t] = _expose(points, optics, wavefront, scene)
                 if keep_phases:
                     phases += wavefront(_MIDDLE)
+                kept += float(frames[t].sum() / scene.sum())
+                if callback is not None and t + 1 < now.stop:
+                    callback(Record("simulation", t + 1, n_frames, {"kept_light": kept / (t + 1)}))
             expected = transmission[first : now.stop, None, None] * frames[first : now.stop] + conditions.sky
             frames[first : now.stop] = detector(expected, noise)
             if callback is not None:
-                light = float((frames[first : now.stop] - conditions.sky).sum() / (len(now) * scene.sum()))
-                arrays = {"frames": frames[: now.stop]}
-                callback(Record("simulation", now.stop, n_frames, {"kept_light": light}, arrays))
+                light, arrays = {"kept_light": kept / now.stop}, {"frames": frames[: now.stop]}
+                callback(Record("simulation", now.stop, n_frames, light, arrays))
     return Observation(
         frames=frames,
         aperture=(told or aperture).still(),  # a copy, because the caller's mask may be trained later

@@ -17,6 +17,7 @@ Turbulence = TurbulencePhase | LayeredPhase | None
 Wavefront = Callable[[Vector], Iterator[Tensor | None]]
 """Function from a direction (x, y) [rad] to the successive phases (N, P) [rad] of a frame; None is a perfect one."""
 
+MOST_TAU0 = 1000.0  # of an exposure, whose image is then that of the seeing; longer ones take hours
 STEPS_PER_TAU0 = 8  # of an exposure; fringe contrast is then at most 0.3 % too high (Kolmogorov)
 _BLOCK = 2**23  # phase samples held at once
 
@@ -32,7 +33,8 @@ def with_layers(turbulence: Turbulence, wavelength: float) -> Turbulence:
 def exposure_delays(turbulence: Turbulence, exposure_time: float) -> list[float]:
     """Return the midpoints [s] of the steps into which an exposure is cut, short enough that the phase hardly changes.
 
-    Raises ValueError if `exposure_time` is positive but the turbulence has no wind, or it exceeds the frame interval.
+    Raises ValueError if `exposure_time` is positive but the turbulence has no wind, or it exceeds the frame interval or
+    a thousand times tau0.
     """
     if exposure_time == 0 or turbulence is None:
         return [0.0]
@@ -47,7 +49,14 @@ def exposure_delays(turbulence: Turbulence, exposure_time: float) -> list[float]
             f"exposure_time is {exposure_time:g} s, longer than the {interval:g} s from one frame to the next: shorten "
             "it or increase frame_interval"
         )
-    steps = math.ceil(STEPS_PER_TAU0 * exposure_time / turbulence.layers.tau0(turbulence.wavelength))
+    tau0 = turbulence.layers.tau0(turbulence.wavelength)
+    if exposure_time > MOST_TAU0 * tau0:
+        raise ValueError(
+            f"exposure_time is {exposure_time:g} s, {exposure_time / tau0:.3g} times tau0, the {tau0:.3g} s in which "
+            f"this turbulence changes: at most {MOST_TAU0:g} times are simulated, {MOST_TAU0 * tau0:.3g} s; in s, 5 ms "
+            "are 5e-3"
+        )
+    steps = math.ceil(STEPS_PER_TAU0 * exposure_time / tau0)
     return [(k + 0.5) / steps * exposure_time for k in range(steps)]
 
 
