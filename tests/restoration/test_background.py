@@ -7,7 +7,7 @@ import torch
 
 from torchmask.grid import Grid
 from torchmask.restoration.adjoint import data_fidelity
-from torchmask.restoration.background import Background, check_known_level, darkest_level
+from torchmask.restoration.background import Background, border_brightness, check_known_level, darkest_level
 from torchmask.restoration.calibration import fit_of_frames
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.frames import FrameStack
@@ -182,16 +182,61 @@ def test_a_sky_is_free_where_the_darkest_part_of_the_field_shows_it(three_holes)
     """Holes scatter light too: a level below a tenth of the mean may be theirs."""
     shining = torch.full((4, 40, 40), 1.0, dtype=torch.float64)
     shining[:, 10:30, 10:30] = 9.0  # 3 on average, 1 where it is darkest
+    valid = torch.ones_like(shining, dtype=torch.bool)
     for level, seen in ((0.0, True), (-0.8, False), (-1.1, False)):
         frames = shining + level
         is_seen = 1 + level > 0.1 * (3 + level)
         assert is_seen is seen
-        assert Background.IF_SEEN.of(frames) is (FREE if seen else Background.NONE)
+        assert Background.IF_SEEN.of(frames, valid, 1.0) is (FREE if seen else Background.NONE)
     noisy = shining + 2 * torch.randn(shining.shape, generator=torch.Generator().manual_seed(0)).double()
     stack = FrameStack.of(noisy, None, Grid(40, 2.3e-7, 550e-9), three_holes, 1.0, Background.IF_SEEN)
     assert stack.free is FREE
     for told in (Background.NONE, FREE):
-        assert told.of(shining) is told
+        assert told.of(shining, valid, 1.0) is told
+
+
+@pytest.mark.parametrize(("dark", "filled"), [(4, True), (28, True), (32, False), (36, False)])
+def test_an_object_that_reaches_the_border_leaves_no_sky(dark, filled):
+    """The border's light, above the darkest part, is compared with half of the mean light above it."""
+    frames = torch.full((2, 40, 40), 3.0, dtype=torch.float64)
+    frames[:, 5:35, 5:35] = 8.0  # seen wherever the border is dark
+    frames[:, :, dark:] = 8.0  # on a level of 3, which may be a sky or its own
+    valid = torch.ones_like(frames, dtype=torch.bool)
+    light = frames - 3.0
+    border = 156 - (2 * dark + 38)  # pixels in the light
+    share = (5 * border / 156) / float(light.mean())
+    assert (share > 0.5) is filled
+    assert Background.IF_SEEN.of(frames, valid, 1e-6) is (Background.NONE if filled else FREE)
+    framed = valid.clone()
+    framed[:, 0] = framed[:, -1] = framed[:, :, 0] = framed[:, :, -1] = False
+    assert Background.IF_SEEN.of(frames, framed, 1e-6) is FREE  # pixels without weight tell nothing
+
+
+def test_border_brightness():
+    frames = torch.zeros(2, 4, 6)
+    frames[:, 1:3, 1:5] = torch.tensor([2.0, -8.0])[:, None, None]
+    valid = torch.ones_like(frames, dtype=torch.bool)
+    assert border_brightness(frames + 10, valid) == pytest.approx(10 / (10 - 3 / 3), rel=1e-6)
+
+
+def test_pixels_that_are_not_valid_make_no_border_bright():
+    frames, valid = torch.ones(2, 6, 6), torch.ones(2, 6, 6, dtype=torch.bool)
+    frames[:, 0] = 50.0
+    valid[:, 0] = False
+    assert border_brightness(frames, valid) == 1
+    valid[:, :, [0, -1]] = valid[:, -1] = False
+    assert border_brightness(frames, valid) == 0  # none is known
+
+
+def test_a_border_as_bright_as_its_noise_shows_no_object():
+    """Of noise alone the border is as bright as the rest, above its darkest part, of 5 x 5 pixels in two frames."""
+    frames = torch.full((2, 40, 40), 8.0, dtype=torch.float64)
+    frames[:, 5:10, 5:10] = 3.0
+    above = 5 * (1 - 1 / 64)  # of the mean light over the darkest of 64 parts
+    surely = 50 * (above / 5) ** 2  # the noise of a pixel, at which that is five standard deviations
+    valid = torch.ones_like(frames, dtype=torch.bool)
+    assert Background.IF_SEEN.of(frames, valid, 0.99 * surely) is Background.NONE
+    assert Background.IF_SEEN.of(frames, valid, 1.01 * surely) is FREE
 
 
 def test_a_model_does_not_decide_what_frames_show(three_holes):
@@ -220,7 +265,7 @@ def test_a_restoration_finds_one_sky_for_all_frames_through_clouds(observe, rest
     assert result.sky == pytest.approx(sky, rel=0.1)
 
 
-@pytest.mark.filterwarnings("ignore:the frames are bright at the border")  # where the sky is ignored
+@pytest.mark.filterwarnings("ignore:the frames are bright at the border")  # where no sky is looked for
 def test_a_restoration_finds_the_sky_and_loses_nothing_else(observation, restoring):
     """A sky as bright as the mean pixel: its noise is more, the object is the same."""
     restored = restoring(max_iterations=400).restore(observation.frames)
@@ -250,7 +295,7 @@ def test_the_sky_of_bright_frames_does_not_stay_in_the_object(seed, observe, res
     assert result.sky == pytest.approx(sky, rel=0.06 / 0.5)
 
 
-@pytest.mark.filterwarnings("ignore:the frames are bright at the border")  # and everywhere else
+@pytest.mark.filterwarnings("ignore:much of the light is even")
 def test_noise_is_all_sky_and_no_object(five_holes):
     grid = Grid.nyquist(1.0, 550e-9, 32)
     frames = torch.poisson(torch.full((4, *grid.shape), 200.0), generator=torch.Generator().manual_seed(0)).double()

@@ -1,4 +1,4 @@
-"""A stack of frames: its unit, its weights, what changes from frame to frame, and how bright its border is."""
+"""A stack of frames: its unit, its weights, what changes from frame to frame, and what it warns of."""
 
 import math
 import warnings
@@ -10,7 +10,7 @@ import torch
 from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture
 from torchmask.restoration.background import Background
-from torchmask.restoration.frames import FrameStack, border_brightness
+from torchmask.restoration.frames import FrameStack
 from torchmask.restoration.myopic import MyopicDeconvolution
 
 GRID = Grid.nyquist(1.0, 550e-9, 32)
@@ -80,22 +80,6 @@ def test_a_stack_moves_to_another_precision():
     assert (single.unit, single.variance) == (stack.unit, stack.variance)
 
 
-def test_border_brightness():
-    frames = torch.zeros(2, 4, 6)
-    frames[:, 1:3, 1:5] = torch.tensor([2.0, -8.0])[:, None, None]
-    valid = torch.ones_like(frames, dtype=torch.bool)
-    assert border_brightness(frames + 10, valid) == pytest.approx(10 / (10 - 3 / 3), rel=1e-6)
-
-
-def test_pixels_that_are_not_valid_make_no_border_bright():
-    frames, valid = torch.ones(2, 6, 6), torch.ones(2, 6, 6, dtype=torch.bool)
-    frames[:, 0] = 50.0
-    valid[:, 0] = False
-    assert border_brightness(frames, valid) == 1
-    valid[:, :, [0, -1]] = valid[:, -1] = False
-    assert border_brightness(frames, valid) == 0  # none is known
-
-
 def test_photons_are_counted_over_valid_pixels():
     """Where the dark half of the field is left out, a mean pixel has twice the light."""
     frames, valid = exposures(), torch.ones(GRID.shape, dtype=torch.bool)
@@ -129,8 +113,10 @@ def test_a_cosmic_ray_gets_no_weight_and_is_told():
 
 
 def test_a_bright_border_is_noticed():
-    with pytest.warns(UserWarning, match="does the object extend beyond the field"):
-        FrameStack.of(exposures() + 100.0, None, GRID, PUPIL, None)
+    """And what its light is taken for."""
+    for assumed, taken in ((Background.NONE, "an object that extends beyond"), (Background.PER_FRAME, "for a sky")):
+        with pytest.warns(UserWarning, match=taken):
+            FrameStack.of(exposures() + 100.0, None, GRID, PUPIL, None, assumed)
 
 
 def test_warnings_name_the_line_that_restores():
@@ -141,7 +127,7 @@ def test_warnings_name_the_line_that_restores():
             warnings.simplefilter("always")
             call(exposures() + 100.0)
         ours = {str(one.message)[:24]: one.filename for one in told if one.category is UserWarning}
-        assert ours == dict.fromkeys(("the noise of the frames ", "the frames are bright at"), __file__)
+        assert ours == dict.fromkeys(("the noise of the frames ", "much of the light is eve"), __file__)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

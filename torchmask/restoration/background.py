@@ -13,6 +13,8 @@ from torchmask.io import as_tensor
 _PRICE = 1.0  # relative to a weight of 1 of total variation, see docs/tried.md
 _BLOCKS = 8  # blocks along each side of the field, of which the darkest is sought
 _SEEN = 0.1  # of the mean light in the darkest part, where holes scatter up to 0.06, see docs/tried.md
+_FILLS = 0.5  # of the mean light above the darkest part: halos leave up to 0.4 at the border, see docs/tried.md
+_SURE = 5.0  # standard deviations of a part's noise: by chance the darkest of 64 parts is 2.4 below the mean
 
 
 class Background(Enum):
@@ -27,7 +29,8 @@ class Background(Enum):
     of its darkest part.
 
     If the darkest part of the field has no more light than the optics scatter there, the fit does not need a sky and is
-    quicker without one. `IF_SEEN` makes this decision.
+    quicker without one. If the border is nearly as bright as the rest, the object extends beyond the field, and what is
+    even in its light is its own: a sky cannot be told from it. `IF_SEEN` makes this decision.
 
     Examples
     --------
@@ -42,14 +45,17 @@ class Background(Enum):
     NONE = "none"
     PER_FRAME = "one constant for each frame, not negative"
     COMMON = "one constant for all frames, not negative"
-    IF_SEEN = "one constant for each frame, if the darkest part of the field shows a sky"
+    IF_SEEN = "one constant for each frame, if the darkest part of the field shows a sky and the border no object"
 
-    def of(self, frames: Tensor) -> Background:
-        """Return the assumption for frames (T, H, W), never `IF_SEEN`, which becomes `NONE` or `PER_FRAME`."""
+    def of(self, frames: Tensor, valid: Tensor, variance: float) -> Background:
+        """Return the assumption for frames (T, H, W), never `IF_SEEN`, which becomes `NONE` or `PER_FRAME`.
+
+        `valid` (T, H, W) bool is False where a pixel tells nothing, and `variance` is the noise of a pixel.
+        """
         if self is not Background.IF_SEEN:
             return self
         is_seen = float(darkest_level(frames).mean()) > _SEEN * float(frames.mean())
-        return Background.PER_FRAME if is_seen else Background.NONE
+        return Background.PER_FRAME if is_seen and not fills_field(frames, valid, variance) else Background.NONE
 
     @property
     def price(self) -> float:
@@ -105,6 +111,27 @@ def darkest_level(frames: Tensor) -> Tensor:
     size = [math.ceil(side / _BLOCKS) for side in frames.shape[-2:]]
     means = torch.nn.functional.avg_pool2d(frames[:, None], size, ceil_mode=True)[:, 0]
     return means.flatten(1)[:, means.mean(0).argmin()][:, None, None]
+
+
+def fills_field(frames: Tensor, valid: Tensor, variance: float) -> bool:
+    """Return whether the object of frames (T, H, W) shows at their border, so that it extends beyond the field.
+
+    `valid` (T, H, W) bool is False where a pixel tells nothing, and `variance` is the noise of a pixel.
+    """
+    light = frames - darkest_level(frames).mean()
+    part = math.prod(math.ceil(side / _BLOCKS) for side in frames.shape[-2:])
+    noise = math.sqrt(variance / (part * len(frames)))
+    return float(light.mean()) > _SURE * noise and border_brightness(light, valid) > _FILLS
+
+
+def border_brightness(frames: Tensor, valid: Tensor) -> float:
+    """Return the mean of the outermost valid pixels of frames (T, H, W), divided by the mean of all valid ones; 0 if
+    none of the outermost is valid."""
+    border = valid.clone()
+    border[:, 1:-1, 1:-1] = False
+    if not bool(border.any()):
+        return 0.0
+    return float(frames[border].mean() / frames[valid].mean())
 
 
 def check_known_level(level: float | Tensor, frames: Tensor) -> Tensor:

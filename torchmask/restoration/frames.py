@@ -13,7 +13,7 @@ from torchmask.grid import Grid
 from torchmask.observation import check_frames
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.spikes import leave_out_spikes
-from torchmask.restoration.background import Background, check_known_level
+from torchmask.restoration.background import Background, border_brightness, check_known_level
 from torchmask.restoration.change import Change
 from torchmask.restoration.noise import FrameNoise, check_errors, even_photons, expected_variance, photon_slope
 
@@ -72,7 +72,7 @@ class FrameStack:
         if errors is not None:
             slope = photon_slope(frames, errors, valid)
             errors = even_photons(frames, errors, valid, slope)
-        free = background.of(frames) if isinstance(background, Background) else Background.NONE
+        free = background.of(frames, valid, variance) if isinstance(background, Background) else Background.NONE
         known = check_known_level(0.0 if isinstance(background, Background) else background, frames)
         frames = frames - known
         guess = free.first_guess(frames)
@@ -81,11 +81,7 @@ class FrameStack:
         if not unit > 0:
             raise ValueError("the frames hold only background, no object to restore: check background and the target")
         if border_brightness(light, valid) > _BRIGHT_BORDER or float(guess.mean()) > _EVEN_LIGHT * float(frames.mean()):
-            warnings.warn(
-                "the frames are bright at the border: does the object extend beyond the field? If it is sky, give its "
-                "level [electrons per pixel]",
-                stacklevel=4,
-            )
+            warnings.warn(_what_light_is_taken_for(free), stacklevel=4)
         if copies := copies_among(frames):
             warnings.warn(
                 f"frames {copies} of this stack, counted from 0, repeat earlier ones pixel by pixel, as a file that is "
@@ -149,14 +145,17 @@ class FrameStack:
         return self.precision * self.grain
 
 
-def border_brightness(frames: Tensor, valid: Tensor) -> float:
-    """Return the mean of the outermost valid pixels of frames (T, H, W), divided by the mean of all valid ones; 0 if
-    none of the outermost is valid."""
-    border = valid.clone()
-    border[:, 1:-1, 1:-1] = False
-    if not bool(border.any()):
-        return 0.0
-    return float(frames[border].mean() / frames[valid].mean())
+def _what_light_is_taken_for(free: Background) -> str:
+    """Return the warning of light at the border, or even light."""
+    if free is Background.NONE:
+        return (
+            "the frames are bright at the border, so all light is taken for that of an object that extends beyond the "
+            "field: if some of it is sky, give its level [electrons per pixel]"
+        )
+    return (
+        "much of the light is even or at the border, and what is even is taken for a sky: give its level [electrons "
+        "per pixel] if you know it, or tell that there is none (Background.NONE) if the object extends beyond the field"
+    )
 
 
 def copies_among(frames: Tensor) -> list[int]:
