@@ -309,7 +309,8 @@ def test_arrays_and_frames_with_a_gradient_are_frames_too():
     ("change", "message"),
     [
         (lambda f: f[0], "at least one frame"),
-        (lambda f: f[:, :-1], "the grid needs"),
+        (lambda f: f[:, :-1], "the grid needs .*at least one frame$"),
+        (lambda f: f.permute(1, 2, 0), "at least one frame: move the last axis, which counts frames, to the front"),
         (lambda f: f[:0], "at least one frame"),
         (lambda f: f.index_fill(0, torch.tensor([1]), math.nan), r"frames \[1\] hold values that are not finite"),
         (lambda f: f.index_fill(0, torch.tensor([2]), 0.0), r"frames \[2\] hold no light"),

@@ -234,9 +234,10 @@ def check_frames(
     if frames.is_complex():
         raise ValueError(f"frames are {frames.dtype}: they must be real, in electrons")
     if frames.ndim != 3 or tuple(frames.shape[1:]) != grid.shape or not len(frames):
+        is_last = frames.ndim == 3 and tuple(frames.shape[:2]) == grid.shape
         raise ValueError(
             f"frames has shape {tuple(frames.shape)}: the grid needs (n_frames, {grid.shape[0]}, {grid.shape[1]}), "
-            "with at least one frame"
+            "with at least one frame" + (": move the last axis, which counts frames, to the front" if is_last else "")
         )
     frames = frames.detach().double()
     if valid is None:

@@ -109,6 +109,16 @@ def test_what_frames_alone_lack_is_named_with_its_option(tmp_path, arrays, given
         read_stack([tmp_path / "mine.npz"], StackOptions(**{name: Path(value) for name, value in given.items()}))
 
 
+def test_frames_along_the_last_axis_are_told(tmp_path):
+    options = StackOptions(mask=Path("keck_nirc2_9"), wavelength=2e-6, pixel_scale_arcsec=0.01)
+    np.savez(tmp_path / "mine.npz", frames=np.ones((16, 16, 5)))
+    with pytest.warns(UserWarning, match=r"16 frames of 16 x 5 pixels: if the last axis counts frames, move it"):
+        read_stack([tmp_path / "mine.npz"], options)
+    for shape in ((5, 16, 16), (16, 16, 16), (5, 5, 5), (5, 16, 8)):
+        np.savez(tmp_path / "mine.npz", frames=np.ones(shape))
+        read_stack([tmp_path / "mine.npz"], options)  # warnings are errors
+
+
 def test_what_is_no_stack_is_refused_by_what_it_is(write_fits, fits_cube, tmp_path):
     cube, stack, array = write_fits("a.fits", fits_cube), tmp_path / "b.npz", tmp_path / "c.npy"
     np.savez(stack, frames=fits_cube)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -219,8 +220,15 @@ def _from_frames(
     arrays: dict[str, Any] = {
         name: as_tensor(stored[name], "cpu") for name in ("frames", "valid", "errors") if name in stored
     }
+    shape = tuple(arrays["frames"].shape)
+    if len(shape) == 3 and shape[0] == shape[1] != shape[2]:
+        warnings.warn(
+            f"{path}: frames has shape {shape}, and so holds {shape[0]} frames of {shape[1]} x {shape[2]} pixels: if "
+            "the last axis counts frames, move it to the front",
+            stacklevel=2,
+        )
     try:
-        grid = Grid(tuple(arrays["frames"].shape[-2:]), scale, wavelength)
+        grid = Grid(shape[-2:], scale, wavelength)
         return Observation(aperture=aperture, grid=grid, readout_noise=told.get("readout_noise"), **arrays)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
