@@ -153,6 +153,7 @@ def test_pixels_may_be_finer_than_needed():
     [
         (["golay"], "no mask is called 'golay'"),
         (["--fill-factor", "-0.15"], "--fill-factor is -0.15"),
+        (["--mask-diameter", "8200"], "in m, so 8.2 m are 8.2"),
         (["--wavelength", "550"], "550 nm are 550e-9"),
         (["--pixel-scale-arcsec", "-1", "--wavelength", "550e-9"], "--pixel-scale-arcsec is -1"),
         (["--pixel-scale-arcsec", "0.5", "--wavelength", "550e-9"], "undersamples"),

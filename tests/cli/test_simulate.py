@@ -83,6 +83,7 @@ def test_options_are_the_turbulence_that_they_name():
         (["--pixel-scale-arcsec", "0.5"], r"--pixel-scale-arcsec 0\.5 arcsec undersamples .* at most 0\.06\d+ arcsec"),
         (["--scene.path", "none.png"], "none.png"),
         (["--pixel-fill", "1.5"], r"--pixel-fill is 1\.5"),
+        (["--mask-diameter", "8200"], r"--mask-diameter is 8200\.0: .* in m, so 8\.2 m are 8\.2"),
         (["--jitter", "-1"], r"--jitter is -1\.0"),
         (["--jitter", "9"], r"--jitter is 9\.0: .* at most 8 pixels, half the field"),
         (["--turbulence.wind", "800", "0"], r"--turbulence\.wind is 800\.0: .* the nearest possible is 200 m/s"),

@@ -15,6 +15,7 @@ from torchmask.design.drawing import LIFE_SIZE, save_dxf, save_svg
 from torchmask.design.manufacture import mask_wavelength, save_fits, save_json
 from torchmask.design.redundancy import analyse_redundancy
 from torchmask.io import atomic_write
+from torchmask.numbers import require_diameter
 from torchmask.optics import catalog
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.overlaps import describe_overlaps, find_overlaps
@@ -88,6 +89,7 @@ def show(name: str, options: Options) -> None:
 
 def _from_catalog(mask: catalog.CatalogEntry, options: Options) -> SparseAperture:
     """Return the mask as built or as the options say, with default sizes where the catalogue has none."""
+    require_diameter("--mask-diameter", options.mask_diameter)
     diameter, fill = options.mask_diameter, options.fill_factor
     if mask.pupil_diameter is None and diameter is None:
         diameter = _ANY_SIZE[0]

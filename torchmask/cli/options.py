@@ -13,6 +13,7 @@ from torchmask.design.manufacture import load_mask, mask_wavelength
 from torchmask.grid import ARCSEC
 from torchmask.instrument.instrument import Instrument
 from torchmask.instrument.parts import Telescope
+from torchmask.numbers import require_diameter
 from torchmask.optics import catalog, overlaps
 from torchmask.optics.aperture import Aperture, FullAperture, SparseAperture
 from torchmask.record import Callback
@@ -173,8 +174,10 @@ def load_aperture(options: MaskOptions, telescope: Telescope | None = None) -> A
     """Return the aperture of `options.mask`, float64.
 
     A full pupil, and a pattern of the catalogue that has no size, are those of the telescope where the options say
-    nothing else. Raises ValueError if the aperture is missing, unknown, invalid, or wider than the telescope.
+    nothing else. Raises ValueError if the aperture is missing, unknown, invalid, or wider than the telescope, or the
+    diameter is not that of a telescope or a mask in m.
     """
+    require_diameter("--mask-diameter", options.mask_diameter)
     aperture = _find_aperture(options, telescope)
     if telescope is not None and aperture.mask_diameter > _BEYOND * telescope.diameter:
         raise ValueError(

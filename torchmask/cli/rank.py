@@ -21,6 +21,7 @@ from torchmask.design.rules import MaskRules
 from torchmask.design.search import search_mask
 from torchmask.instrument.instrument import Instrument
 from torchmask.io import atomic_write
+from torchmask.numbers import require_diameter
 from torchmask.optics import catalog
 from torchmask.optics.aperture import SparseAperture
 from torchmask.record import Callback
@@ -141,6 +142,7 @@ def _in_one_run(callback: Callback, n: int) -> Callback:
 
 def ranking(options: Options, output: Run) -> Ranking:
     """Rank, and write everything to the folder of the run."""
+    require_diameter("mask_diameter", options.mask_diameter)
     chosen = patterns(options)
     observed = options.observation(options.n_frequencies, options.exponent, options.knee, options.fill_factor)
     output.keep_instrument(options.used_instrument(observed, options.central_obstruction))
