@@ -7,7 +7,7 @@ import torch
 
 from torchmask.grid import Grid
 from torchmask.restoration.adjoint import data_fidelity
-from torchmask.restoration.background import Background, border_brightness, check_known_level, darkest_level
+from torchmask.restoration.background import Background, check_known_level, darkest_level
 from torchmask.restoration.calibration import fit_of_frames
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.frames import FrameStack
@@ -195,37 +195,30 @@ def test_a_sky_is_free_where_the_darkest_part_of_the_field_shows_it(three_holes)
         assert told.of(shining, valid, 1.0) is told
 
 
-@pytest.mark.parametrize(("dark", "filled"), [(4, True), (28, True), (32, False), (36, False)])
-def test_an_object_that_reaches_the_border_leaves_no_sky(dark, filled):
-    """The border's light, above the darkest part, is compared with half of the mean light above it."""
+@pytest.mark.parametrize(("dark", "filled"), [(4, True), (18, True), (22, False), (36, False)])
+def test_an_object_that_most_of_the_border_shows_leaves_no_sky(dark, filled):
+    """It is in the light to the right of column `dark`, and seen wherever the border is dark."""
     frames = torch.full((2, 40, 40), 3.0, dtype=torch.float64)
-    frames[:, 5:35, 5:35] = 8.0  # seen wherever the border is dark
+    frames[:, 5:35, 5:35] = 8.0
     frames[:, :, dark:] = 8.0  # on a level of 3, which may be a sky or its own
     valid = torch.ones_like(frames, dtype=torch.bool)
-    light = frames - 3.0
-    border = 156 - (2 * dark + 38)  # pixels in the light
-    share = (5 * border / 156) / float(light.mean())
-    assert (share > 0.5) is filled
+    assert (38 + 2 * (40 - dark) > 156 / 2) is filled  # pixels of the border in the light, of all
     assert Background.IF_SEEN.of(frames, valid, 1e-6) is (Background.NONE if filled else FREE)
     framed = valid.clone()
     framed[:, 0] = framed[:, -1] = framed[:, :, 0] = framed[:, :, -1] = False
     assert Background.IF_SEEN.of(frames, framed, 1e-6) is FREE  # pixels without weight tell nothing
 
 
-def test_border_brightness():
-    frames = torch.zeros(2, 4, 6)
-    frames[:, 1:3, 1:5] = torch.tensor([2.0, -8.0])[:, None, None]
+@pytest.mark.parametrize(("share", "filled"), [(0.42, False), (0.44, True)])
+def test_a_halo_at_the_border_is_no_object_that_fills_the_field(share, filled):
+    """All of the border has this share of the mean light above the darkest part."""
+    frames = torch.zeros(2, 40, 40, dtype=torch.float64)
+    frames[:, 10:30, 10:30] = 1.0  # 400 of 1600 pixels
+    frames[:, [0, -1]] = frames[:, :, [0, -1]] = border = share * 400 / (1600 - share * 156)
+    frames += 1.0 + torch.tensor([-0.5, 0.5])[:, None, None]  # the sky changes from frame to frame
+    assert border == pytest.approx(share * float(frames.mean() - 1), rel=1e-12)
     valid = torch.ones_like(frames, dtype=torch.bool)
-    assert border_brightness(frames + 10, valid) == pytest.approx(10 / (10 - 3 / 3), rel=1e-6)
-
-
-def test_pixels_that_are_not_valid_make_no_border_bright():
-    frames, valid = torch.ones(2, 6, 6), torch.ones(2, 6, 6, dtype=torch.bool)
-    frames[:, 0] = 50.0
-    valid[:, 0] = False
-    assert border_brightness(frames, valid) == 1
-    valid[:, :, [0, -1]] = valid[:, -1] = False
-    assert border_brightness(frames, valid) == 0  # none is known
+    assert Background.IF_SEEN.of(frames, valid, 1e-6) is (Background.NONE if filled else FREE)
 
 
 def test_a_border_as_bright_as_its_noise_shows_no_object():

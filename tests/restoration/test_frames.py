@@ -10,7 +10,7 @@ import torch
 from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture
 from torchmask.restoration.background import Background
-from torchmask.restoration.frames import FrameStack
+from torchmask.restoration.frames import FrameStack, border_brightness
 from torchmask.restoration.myopic import MyopicDeconvolution
 
 GRID = Grid.nyquist(1.0, 550e-9, 32)
@@ -78,6 +78,22 @@ def test_a_stack_moves_to_another_precision():
     single = stack.to(torch.float32, torch.device("cpu"))
     assert single.frames.dtype == single.precision.dtype == torch.float32
     assert (single.unit, single.variance) == (stack.unit, stack.variance)
+
+
+def test_border_brightness():
+    frames = torch.zeros(2, 4, 6)
+    frames[:, 1:3, 1:5] = torch.tensor([2.0, -8.0])[:, None, None]
+    valid = torch.ones_like(frames, dtype=torch.bool)
+    assert border_brightness(frames + 10, valid) == pytest.approx(10 / (10 - 3 / 3), rel=1e-6)
+
+
+def test_pixels_that_are_not_valid_make_no_border_bright():
+    frames, valid = torch.ones(2, 6, 6), torch.ones(2, 6, 6, dtype=torch.bool)
+    frames[:, 0] = 50.0
+    valid[:, 0] = False
+    assert border_brightness(frames, valid) == 1
+    valid[:, :, [0, -1]] = valid[:, -1] = False
+    assert border_brightness(frames, valid) == 0  # none is known
 
 
 def test_photons_are_counted_over_valid_pixels():

@@ -13,7 +13,7 @@ from torchmask.io import as_tensor
 _PRICE = 1.0  # relative to a weight of 1 of total variation, see docs/tried.md
 _BLOCKS = 8  # blocks along each side of the field, of which the darkest is sought
 _SEEN = 0.1  # of the mean light in the darkest part, where holes scatter up to 0.06, see docs/tried.md
-_FILLS = 0.5  # of the mean light above the darkest part: halos leave up to 0.4 at the border, see docs/tried.md
+_FILLS = 0.43  # of the mean light above the darkest part: halos leave up to 0.38 at the border, see docs/tried.md
 _SURE = 5.0  # standard deviations of a part's noise: by chance the darkest of 64 parts is 2.4 below the mean
 
 
@@ -29,8 +29,8 @@ class Background(Enum):
     of its darkest part.
 
     If the darkest part of the field has no more light than the optics scatter there, the fit does not need a sky and is
-    quicker without one. If the border is nearly as bright as the rest, the object extends beyond the field, and what is
-    even in its light is its own: a sky cannot be told from it. `IF_SEEN` makes this decision.
+    quicker without one. If most of the border is nearly as bright as the rest, the object extends beyond the field, and
+    what is even in its light is its own: a sky cannot be told from it. `IF_SEEN` makes this decision.
 
     Examples
     --------
@@ -114,24 +114,19 @@ def darkest_level(frames: Tensor) -> Tensor:
 
 
 def fills_field(frames: Tensor, valid: Tensor, variance: float) -> bool:
-    """Return whether the object of frames (T, H, W) shows at their border, so that it extends beyond the field.
+    """Return whether the object of frames (T, H, W) extends beyond the field, since most of the border shows it.
 
-    `valid` (T, H, W) bool is False where a pixel tells nothing, and `variance` is the noise of a pixel.
+    `valid` (T, H, W) bool is False where a pixel tells nothing, and `variance` is the noise of a pixel. A median, as a
+    star at the border makes a part of it bright, and not most.
     """
-    light = frames - darkest_level(frames).mean()
-    part = math.prod(math.ceil(side / _BLOCKS) for side in frames.shape[-2:])
+    light = frames.mean(0) - darkest_level(frames).mean()
+    border = valid.any(0)
+    border[1:-1, 1:-1] = False
+    part = math.prod(math.ceil(side / _BLOCKS) for side in light.shape)
     noise = math.sqrt(variance / (part * len(frames)))
-    return float(light.mean()) > _SURE * noise and border_brightness(light, valid) > _FILLS
-
-
-def border_brightness(frames: Tensor, valid: Tensor) -> float:
-    """Return the mean of the outermost valid pixels of frames (T, H, W), divided by the mean of all valid ones; 0 if
-    none of the outermost is valid."""
-    border = valid.clone()
-    border[:, 1:-1, 1:-1] = False
-    if not bool(border.any()):
-        return 0.0
-    return float(frames[border].mean() / frames[valid].mean())
+    if not bool(border.any()) or float(light.mean()) < _SURE * noise:
+        return False
+    return float(light[border].median()) > _FILLS * float(light.mean())
 
 
 def check_known_level(level: float | Tensor, frames: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from torchmask.grid import Grid
 from torchmask.observation import check_frames
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.spikes import leave_out_spikes
-from torchmask.restoration.background import Background, border_brightness, check_known_level
+from torchmask.restoration.background import Background, check_known_level
 from torchmask.restoration.change import Change
 from torchmask.restoration.noise import FrameNoise, check_errors, even_photons, expected_variance, photon_slope
 
@@ -143,6 +143,16 @@ class FrameStack:
     def photon_share(self) -> Tensor:
         """Fraction of the noise variance that is photon noise of the object, (T, H, W) or (1, 1, 1); 0 if not valid."""
         return self.precision * self.grain
+
+
+def border_brightness(frames: Tensor, valid: Tensor) -> float:
+    """Return the mean of the outermost valid pixels of frames (T, H, W), divided by the mean of all valid ones; 0 if
+    none of the outermost is valid."""
+    border = valid.clone()
+    border[:, 1:-1, 1:-1] = False
+    if not bool(border.any()):
+        return 0.0
+    return float(frames[border].mean() / frames[valid].mean())
 
 
 def _what_light_is_taken_for(free: Background) -> str:
