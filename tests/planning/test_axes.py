@@ -6,7 +6,7 @@ from torchmask.grid import ARCSEC
 from torchmask.instrument.instrument import Instrument
 from torchmask.instrument.parts import Camera, Site, Source, Telescope
 from torchmask.optics.aperture import SparseAperture
-from torchmask.planning.axes import bands_of, sampled
+from torchmask.planning.axes import bands_of, positive, sampled, whole
 
 WAVELENGTH, WIDTH = 550e-9, 20e-9
 
@@ -53,3 +53,17 @@ def test_what_an_aperture_reaches_has_to_be_sampled_but_no_more_than_the_telesco
     for aperture, reach in ((None, 1.0), (narrow, 0.5), (wide, 1.0)):
         assert samples(reach, aperture)
         assert not samples(0.98 * reach, aperture)
+
+
+@pytest.mark.parametrize("values", [(), (0.0, 1.0), (1.0, 1.0), (-1.0,), (float("inf"),)])
+def test_values_of_an_axis_are_positive_and_different(values):
+    with pytest.raises(ValueError, match=r"widths are .* all finite and positive, in m"):
+        positive("widths", values, "m")
+    assert positive("widths", (2.0, 1e-12), "m") == (1e-12, 2.0)
+
+
+@pytest.mark.parametrize("values", [(), (1,), (3, 3), (2.5,)])
+def test_numbers_of_holes_are_whole_from_two_on(values):
+    with pytest.raises(ValueError, match=r"n_subapertures are .* whole, at least 2"):
+        whole(values)
+    assert whole((7, 2.0)) == (2, 7)

@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from torchmask.planning.lattice import Axis, interpolate
 
@@ -28,3 +30,21 @@ def test_a_value_lies_between_points_by_itself_or_by_its_logarithm(logarithmic, 
     axis = Axis("light", "photons", (10.0, 100.0, 1000.0), logarithmic=logarithmic)
     assert axis.place(10**2.5) == pytest.approx(place, rel=1e-12)
     assert [axis.place(value) for value in (1.0, 1e5)] == [0.0, 2.0]  # the nearest beyond them
+
+
+@pytest.mark.parametrize("harder", [False, True])
+@given(end=st.floats(0.1, 1e9), off=st.floats(-1e-12, 1e-12))
+def test_an_end_that_was_computed_in_another_way_is_the_end(harder, end, off):
+    """A few roundings, 1e-16 each, put a value beyond no end; a thousandth does."""
+    axis = Axis("x", "x", (end / 100, end), harder=harder)
+    assert axis.holds(end * (1 + off))
+    assert axis.holds(end / 100 * (1 + off))
+    assert not axis.is_harder(end * (1 + off))
+    assert not axis.holds(end * 1.001)
+    assert not axis.holds(end / 100 * 0.999)
+    assert axis.is_harder(end * 1.001) == harder
+
+
+def test_a_value_that_is_there_twice_is_refused():
+    with pytest.raises(ValueError, match="in rising order"):
+        Axis("x", "x", (1.0, 2.0, 2.0))

@@ -92,6 +92,15 @@ def test_what_instants_lie_outside_of_is_not_said_again():
     assert outlook.outside == ("n_photons", "exposure")
 
 
+def test_what_makes_instants_a_limit_makes_all_else_one():
+    wide = dataclasses.replace(INSTANTS, outside=("d_over_r0",), harder=("d_over_r0",))
+    inside = MAP.outlook(wide, n_photons=1e6, exposure=1.0, spread=0.4)
+    assert (inside.outside, inside.harder) == (("d_over_r0",), ("d_over_r0",))
+    with pytest.warns(UserWarning, match="exposures over tau0"):
+        beyond = MAP.outlook(wide, n_photons=1e6, exposure=9.0, spread=0.4)
+    assert beyond.harder == ("d_over_r0", "exposure")
+
+
 def test_the_error_grows_by_the_square_of_cost_and_ratio():
     """A ratio below 1 lowers it: restorations may be better than the linear estimate that is predicted."""
     for exposure in (0.0, 1.0):

@@ -117,6 +117,7 @@ def test_the_maps_of_the_library_are_as_large_as_they_say(pupil):
         ({"n_frames": (4, 1)}, "rising order"),
         ({"tried": np.ones((2, 3))}, "tried has shape"),
         ({"succeeded": TRIED + 1}, "no more successes"),
+        ({"tried": 0 * TRIED, "succeeded": 0 * TRIED}, "at least one restoration"),
         ({"level": np.ones((2, 3))}, "level has shape"),
         ({"level": np.zeros((2, 3, 2))}, "positive cost and level"),
     ],

@@ -13,7 +13,10 @@ from torchmask.design.spline_patches import cubic_basis
 
 
 class SplineTable:
-    """R functions of a place (x, y) [m] up to `longest` away from the origin, along either axis, as cubic splines."""
+    """R functions of a place (x, y) [m] up to `longest` away from the origin, along either axis, as cubic splines.
+
+    Beyond that they are constant along the axis.
+    """
 
     def __init__(
         self,
@@ -33,7 +36,7 @@ class SplineTable:
 
     def __call__(self, places: Tensor) -> Tensor:
         """Return the functions (B, L, R) at `places` (B, L, 2)."""
-        place = places / self.step + self.half
+        place = (places / self.step + self.half).clamp(1, 2 * self.half - 1)
         start = place.detach().nan_to_num(0.0).floor().clamp(1, 2 * self.half - 2)
         basis = cubic_basis(place - start)  # (B, L, 2, 4)
         index = start.long()[..., None] + torch.arange(-1, 3, device=places.device)
