@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -13,7 +14,7 @@ from scipy.stats import gamma
 from torchmask.atmosphere.seeing import Seeing
 from torchmask.atmosphere.transfer import steady_square_otf
 from torchmask.design.criterion import AsymptoticMSE, wiener_mse
-from torchmask.design.fluctuation import mean_inverse, piston_powers
+from torchmask.design.fluctuation import mean_inverse, piston_powers, steady_lenses
 from torchmask.design.turbulent import TurbulentMSE
 from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture, SparseAperture
@@ -187,3 +188,14 @@ def test_a_full_pupil_is_steady_at_long_waves_and_a_speckle_at_short_ones():
     relative = 1 - steady / mean**2
     assert float(relative[0, 0]) == pytest.approx(0.0, abs=1e-6)
     assert float(relative[0, 8]) == pytest.approx(1.0, abs=0.01)
+
+
+def test_independent_modes_of_a_lens_are_as_steady_as_lenses_of_their_own():
+    """Light of two modes has no phase in common, whichever lens it comes through; N holes with themselves count N^4
+    times, at nu and at -nu alike."""
+    n, kept = 5, torch.rand(2, 1, 3, 4, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    both = steady_lenses(SimpleNamespace(kept=kept), n)
+    alone = [steady_lenses(SimpleNamespace(kept=mode[None]), n) for mode in kept]
+    torch.testing.assert_close(both, alone[0] + alone[1], rtol=1e-12, atol=0)
+    one = torch.ones(1, 1, 3, 1, 1, dtype=torch.float64)
+    assert (2 * steady_lenses(SimpleNamespace(kept=one), n)).flatten().tolist() == [n**4, 2, 2]
