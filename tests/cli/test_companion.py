@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from torchmask.cli.companion import summary
 from torchmask.cli.main import main
 from torchmask.grid import ARCSEC, MAS, Grid
+from torchmask.interferometry.companion_limits import DetectionLimits
+from torchmask.interferometry.companion_map import PairFit
 from torchmask.interferometry.fringes import frame_observables
 from torchmask.interferometry.oifits import save_oifits
 from torchmask.observation import Observation
@@ -124,3 +127,12 @@ def test_a_companion_of_negative_light_is_none(write, tmp_path, capsys):
     assert found["companion"]["contrast"] < 0
     assert not found["detected"]
     assert "no companion; what fits best is one of negative light" in capsys.readouterr().out
+
+
+def test_where_fringes_repeat_no_limit_is_told():
+    companion, covariance = torch.tensor([0.1, 1e-7, 1e-7]).double(), 1e-4 * torch.eye(3).double()
+    fit = PairFit(companion, covariance, 20.0, 400.0, 22)
+    limits = DetectionLimits(np.array([0.1, 0.2]), np.array([0.01, np.inf]), np.array([0.001, np.inf]))
+    near, far = summary(fit, limits, side_known=True, farthest=1e-6)[-2:]
+    assert near == "  at 100 mas a companion of 0.01 +- 0.001 of the star's light would be found"
+    assert far.startswith("  at 200 mas a companion would not be found everywhere")

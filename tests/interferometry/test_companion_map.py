@@ -11,7 +11,7 @@ from torchmask.grid import ARCSEC, Grid
 from torchmask.interferometry.companion_map import CompanionMap, fit_pair, map_companions, raster
 from torchmask.interferometry.fringes import frame_observables
 from torchmask.interferometry.measurements import Measurements, join
-from torchmask.interferometry.pair_model import PairResiduals
+from torchmask.interferometry.pair_model import PairResiduals, pair_visibilities
 from torchmask.observation import Observation
 from torchmask.optics.aperture import SparseAperture
 
@@ -205,5 +205,25 @@ def test_what_cannot_be_is_refused(measure_pair):
         *(line, seen.wavelengths[:5], seen.vis2[:5], seen.vis2_errors[:5], None, few.triangles[:0]),
         *(few.wavelengths, few.closure_phases[:0], few.closure_errors[:0], None),
     )
-    with pytest.raises(ValueError, match="baselines in more than one direction"):
-        fit_pair(flat, TRUTH)
+    for look in (map_companions, lambda measured: fit_pair(measured, TRUTH)):
+        with pytest.raises(ValueError, match="all baselines have one direction"):
+            look(flat)
+
+
+def test_where_fringes_repeat_no_companion_would_be_found():
+    """At a whole period of the lattice of these holes |V|^2 are those of the star alone, whatever the contrast."""
+    stations = torch.tensor([[0, 0], [3, 0], [1, 1], [2, 1]], dtype=torch.float64)
+    pairs = torch.combinations(torch.arange(4))
+    baselines, none = stations[pairs[:, 1]] - stations[pairs[:, 0]], torch.zeros(0, dtype=torch.float64)
+    truth = torch.tensor([0.1, 2e-7, 1e-7], dtype=torch.float64)
+    power = pair_visibilities(baselines / 2e-6, truth).abs() ** 2
+    ones = torch.ones_like(power)
+    seen = Measurements(
+        *(baselines, 2e-6 * ones, power, 0.01 * ones, None, none.view(0, 2, 2), none, none, none, None),
+    )
+    period = torch.tensor([[2e-6, 0.0]], dtype=torch.float64)
+    found = map_companions(seen, torch.cat([truth[None, 1:], period]))
+    assert float(found.contrast[0]) == pytest.approx(0.1, rel=1e-6)
+    assert found.contrast.isfinite().all()
+    assert found.errors[1] > 1e6
+    assert found.limits(1e-6).contrast[1] > 1e6

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from torchmask.grid import ARCSEC
-from torchmask.interferometry.companion_limits import search_offsets
+from torchmask.interferometry.companion_limits import DetectionLimits, search_offsets
 from torchmask.interferometry.companion_map import CompanionMap
 from torchmask.viz.companion import companion_figure
 
@@ -37,3 +37,6 @@ def test_east_is_left_north_up_and_limits_are_magnitudes():
     assert image.lines[1].get_xydata()[0] == pytest.approx([300, -100])
     assert beside.lines[0].get_ydata() == pytest.approx([5.0] * len(limits.contrast))
     assert beside.get_ylim()[0] > beside.get_ylim()[1]
+    contrast = np.where(np.arange(len(limits.contrast)) == 0, np.inf, limits.contrast)
+    beside = companion_figure(found, DetectionLimits(limits.separation, contrast, limits.errors)).axes[1]
+    assert len(beside.lines[0].get_ydata()) == len(contrast) - 1  # where fringes repeat there is no limit

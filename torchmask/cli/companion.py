@@ -162,8 +162,8 @@ def summary(fit: PairFit, limits: DetectionLimits, side_known: bool, farthest: f
     if not side_known:
         lines.append("without closure phases, a companion on the opposite side of the star fits equally well")
     for place, contrast, error in zip(limits.separation, limits.contrast, limits.errors, strict=True):
-        lines.append(
-            f"  at {1000 * place:.4g} mas a companion of {contrast:.2g} +- {error:.1g} of the star's light would be "
-            "found"
-        )
+        found = f"a companion of {contrast:.2g} +- {error:.1g} of the star's light would be found"
+        if contrast > 1:
+            found = "a companion would not be found everywhere: at some places its fringes are those of the star alone"
+        lines.append(f"  at {1000 * place:.4g} mas {found}")
     return lines

@@ -170,7 +170,8 @@ def map_companions(measured: Measurements, offsets: Tensor | None = None) -> Com
     Raises
     ------
     ValueError
-        If there are fewer than 3 independent measurements, as a companion has 3 parameters.
+        If there are fewer than 3 independent measurements, as a companion has 3 parameters, or all baselines have the
+        same direction.
 
     Examples
     --------

@@ -19,7 +19,9 @@ PARAMETERS = 3  # of a companion: contrast, east and north
 _FAINTEST, _BRIGHTEST = -0.5, 0.98  # range of contrasts of a map; at 1 the derivatives in the contrast vanish
 _STEPS = 12  # number of Gauss-Newton steps for the contrast at each position
 _HALVINGS = 20  # maximum number of halvings of a step that makes a fit worse
+_TINY = torch.finfo(torch.float64).tiny  # curvature where fringes repeat exactly, and any contrast fits
 _ENOUGH = 1e-6  # decrease of chi-square per measurement at which a fit ends
+_LEAST_WIDTH = 1e-6  # of the baselines, over their length: below, they have one direction
 _LEAST_EIGENVALUE = 1e-6  # of a correlation matrix, over its largest: below, measurements are redundant
 
 
@@ -56,6 +58,9 @@ class PairResiduals:
             raise ValueError(
                 f"there are {self.size} independent measurements: a companion's contrast and position need {PARAMETERS}"
             )
+        long, wide = torch.linalg.svdvals(torch.cat([self._frequencies, self._sides])).tolist()
+        if not wide > _LEAST_WIDTH * long:
+            raise ValueError("all baselines have one direction: a companion's position needs more than one direction")
 
     def residuals(self, companion: Tensor) -> Tensor:
         """Return whitened differences (..., K) of measurements and model, for companions (..., 3)."""
@@ -101,7 +106,7 @@ class PairResiduals:
             slope = torch.cat([of_vis2 @ self._vis2, of_phases @ self._closures], 1)
             residual, curvature = self.residuals(companion), slope.square().sum(1)
             if step < _STEPS:
-                change = (slope * residual).sum(1) / curvature
+                change = (slope * residual).sum(1) / curvature.clamp(min=_TINY)
                 companion[:, 0] = (companion[:, 0] + change).clamp(_FAINTEST, _BRIGHTEST)
         return companion[:, 0], curvature.rsqrt(), residual.square().sum(1)
 

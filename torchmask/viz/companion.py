@@ -45,8 +45,9 @@ def companion_figure(found: CompanionMap, limits: DetectionLimits) -> Figure:
     ax.set(xlabel=f"east [{unit}]", ylabel=f"north [{unit}]")
     drawing.colorbar(figure, [ax], "standard errors")
     factor = scale / _ARCSEC
-    errors = _MAGNITUDE * limits.errors / limits.contrast
-    beside.errorbar(limits.separation * factor, -_MAGNITUDE * np.log(limits.contrast), errors, **_POINTS)
+    shown = limits.contrast <= 1  # beyond, no companion would be found
+    separation, contrast, errors = (values[shown] for values in (limits.separation, limits.contrast, limits.errors))
+    beside.errorbar(separation * factor, -_MAGNITUDE * np.log(contrast), _MAGNITUDE * errors / contrast, **_POINTS)
     beside.invert_yaxis()  # the brighter, the higher
     beside.set(xlabel=f"separation [{unit}]", ylabel="magnitude difference")
     beside.set_title("faintest companion that would be found")
