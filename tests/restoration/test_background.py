@@ -7,7 +7,7 @@ import torch
 
 from torchmask.grid import Grid
 from torchmask.restoration.adjoint import data_fidelity
-from torchmask.restoration.background import Background, check_known_level, darkest_level
+from torchmask.restoration.background import Background, check_known_level, darkest_level, fills_field
 from torchmask.restoration.calibration import fit_of_frames
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.frames import FrameStack
@@ -182,31 +182,31 @@ def test_a_sky_is_free_where_the_darkest_part_of_the_field_shows_it(three_holes)
     """Holes scatter light too: a level below a tenth of the mean may be theirs."""
     shining = torch.full((4, 40, 40), 1.0, dtype=torch.float64)
     shining[:, 10:30, 10:30] = 9.0  # 3 on average, 1 where it is darkest
-    valid = torch.ones_like(shining, dtype=torch.bool)
     for level, seen in ((0.0, True), (-0.8, False), (-1.1, False)):
         frames = shining + level
         is_seen = 1 + level > 0.1 * (3 + level)
         assert is_seen is seen
-        assert Background.IF_SEEN.of(frames, valid, 1.0) is (FREE if seen else Background.NONE)
+        assert Background.IF_SEEN.of(frames, fills=False) is (FREE if seen else Background.NONE)
+        assert Background.IF_SEEN.of(frames, fills=True) is Background.NONE
     noisy = shining + 2 * torch.randn(shining.shape, generator=torch.Generator().manual_seed(0)).double()
     stack = FrameStack.of(noisy, None, Grid(40, 2.3e-7, 550e-9), three_holes, 1.0, Background.IF_SEEN)
     assert stack.free is FREE
     for told in (Background.NONE, FREE):
-        assert told.of(shining, valid, 1.0) is told
+        assert told.of(shining, fills=told is FREE) is told
 
 
 @pytest.mark.parametrize(("dark", "filled"), [(4, True), (18, True), (22, False), (36, False)])
-def test_an_object_that_most_of_the_border_shows_leaves_no_sky(dark, filled):
+def test_an_object_that_most_of_the_border_shows_fills_the_field(dark, filled):
     """It is in the light to the right of column `dark`, and seen wherever the border is dark."""
     frames = torch.full((2, 40, 40), 3.0, dtype=torch.float64)
     frames[:, 5:35, 5:35] = 8.0
     frames[:, :, dark:] = 8.0  # on a level of 3, which may be a sky or its own
     valid = torch.ones_like(frames, dtype=torch.bool)
     assert (38 + 2 * (40 - dark) > 156 / 2) is filled  # pixels of the border in the light, of all
-    assert Background.IF_SEEN.of(frames, valid, 1e-6) is (Background.NONE if filled else FREE)
+    assert fills_field(frames, valid, 1e-6) is filled
     framed = valid.clone()
     framed[:, 0] = framed[:, -1] = framed[:, :, 0] = framed[:, :, -1] = False
-    assert Background.IF_SEEN.of(frames, framed, 1e-6) is FREE  # pixels without weight tell nothing
+    assert not fills_field(frames, framed, 1e-6)  # pixels without weight tell nothing
 
 
 @pytest.mark.parametrize(("share", "filled"), [(0.42, False), (0.44, True)])
@@ -218,7 +218,7 @@ def test_a_halo_at_the_border_is_no_object_that_fills_the_field(share, filled):
     frames += 1.0 + torch.tensor([-0.5, 0.5])[:, None, None]  # the sky changes from frame to frame
     assert border == pytest.approx(share * float(frames.mean() - 1), rel=1e-12)
     valid = torch.ones_like(frames, dtype=torch.bool)
-    assert Background.IF_SEEN.of(frames, valid, 1e-6) is (Background.NONE if filled else FREE)
+    assert fills_field(frames, valid, 1e-6) is filled
 
 
 def test_a_border_as_bright_as_its_noise_shows_no_object():
@@ -228,8 +228,8 @@ def test_a_border_as_bright_as_its_noise_shows_no_object():
     above = 5 * (1 - 1 / 64)  # of the mean light over the darkest of 64 parts
     surely = 50 * (above / 5) ** 2  # the noise of a pixel, at which that is five standard deviations
     valid = torch.ones_like(frames, dtype=torch.bool)
-    assert Background.IF_SEEN.of(frames, valid, 0.99 * surely) is Background.NONE
-    assert Background.IF_SEEN.of(frames, valid, 1.01 * surely) is FREE
+    assert fills_field(frames, valid, 0.99 * surely)
+    assert not fills_field(frames, valid, 1.01 * surely)
 
 
 def test_a_model_does_not_decide_what_frames_show(three_holes):

@@ -132,7 +132,14 @@ def test_a_bright_border_is_noticed():
     """And what its light is taken for."""
     for assumed, taken in ((Background.NONE, "an object that extends beyond"), (Background.PER_FRAME, "for a sky")):
         with pytest.warns(UserWarning, match=taken):
-            FrameStack.of(exposures() + 100.0, None, GRID, PUPIL, None, assumed)
+            stack = FrameStack.of(exposures() + 100.0, None, GRID, PUPIL, None, assumed)
+        assert not stack.fills_field
+    wide = exposures() + 40.0
+    wide[:, 1:9, 1:9] -= 30.0
+    with pytest.warns(UserWarning, match="an object that extends beyond"):
+        stack = FrameStack.of(wide, None, GRID, PUPIL, None, Background.IF_SEEN)
+    assert stack.fills_field
+    assert stack.free is Background.NONE
 
 
 def test_warnings_name_the_line_that_restores():
@@ -171,6 +178,17 @@ def test_errors_without_photons_weigh_every_pixel_by_itself():
     assert bool((stack.noise_of_frames.level == 1).all())
     single = stack.to(torch.float32, torch.device("cpu"))
     assert single.precision.dtype == torch.float32
+
+
+@pytest.mark.parametrize(("change", "fills", "hides"), [(2.49, True, True), (2.51, True, False), (2.49, False, False)])
+def test_frames_that_hardly_change_hide_an_object_that_fills_the_field(change, fills, hides):
+    """Two frames of 1024 pixels show 2048 beyond their noise if each pixel changes by 1/2 + 2 of its noise variance."""
+    wave = torch.ones(GRID.shape, dtype=torch.float64)
+    wave[:, ::2] = -1.0
+    frames = 1 + math.sqrt(change / 100) * torch.stack([wave, -wave])
+    stack = FrameStack(frames, torch.ones_like(frames, dtype=torch.bool), 10.0, 1.0, fills_field=fills)
+    assert stack.change.each == pytest.approx(change, rel=1e-12)
+    assert stack.hides_object is hides
 
 
 def test_contrast_is_the_chi_square_of_the_weighted_mean_frame_against_an_even_one():

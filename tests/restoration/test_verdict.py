@@ -18,7 +18,9 @@ ERROR = ModelError(excess=0.3, fitted=40.0, phase=0.2)
 TOLERANCE = Tolerance(2.0, 2.0)
 
 
-def verdict_on(*chi_square, contrast=50.0, tolerance=TOLERANCE, at_rest=True, blind=False, error=ERROR, **fits):
+def verdict_on(
+    *chi_square, contrast=50.0, tolerance=TOLERANCE, at_rest=True, blind=False, hides=False, error=ERROR, **fits
+):
     n_frames = len(chi_square)
     told = {
         "chi_square": torch.tensor(chi_square, dtype=torch.float64),
@@ -27,7 +29,8 @@ def verdict_on(*chi_square, contrast=50.0, tolerance=TOLERANCE, at_rest=True, bl
         "noise": FrameNoise(torch.ones(n_frames), torch.ones(n_frames)),
         "parameters": 100.0,
     }
-    return judge(FrameFits(**(told | fits)), contrast, error, tolerance, at_rest=at_rest, blind=blind)
+    seen = {"at_rest": at_rest, "blind": blind, "hides_object": hides}
+    return judge(FrameFits(**(told | fits)), contrast, error, tolerance, **seen)
 
 
 def test_chi_square_is_over_its_degrees_of_freedom():
@@ -68,6 +71,12 @@ def test_light_is_scarce_below_a_signal_to_noise_of_200():
         assert not verdict_on(1.0, 1.0, contrast=contrast).is_scarce
         few = torch.tensor([PIXELS, PIXELS // 2])  # the mean frame has as many as the frame with most of them
         assert verdict_on(1.0, 0.5, contrast=contrast, blind=True, pixels=few).is_scarce is scarce
+
+
+def test_light_is_scarce_where_the_stack_hides_its_object():
+    """Which says nothing against an object or aberrations that are known."""
+    assert verdict_on(1.0, 1.0, contrast=1e3, blind=True, hides=True).is_scarce
+    assert not verdict_on(1.0, 1.0, contrast=1e3, hides=True).is_scarce
 
 
 def test_more_light_is_asked_for_where_it_is_scarce():

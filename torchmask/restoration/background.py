@@ -47,15 +47,15 @@ class Background(Enum):
     COMMON = "one constant for all frames, not negative"
     IF_SEEN = "one constant for each frame, if the darkest part of the field shows a sky and the border no object"
 
-    def of(self, frames: Tensor, valid: Tensor, variance: float) -> Background:
+    def of(self, frames: Tensor, fills: bool) -> Background:
         """Return the assumption for frames (T, H, W), never `IF_SEEN`, which becomes `NONE` or `PER_FRAME`.
 
-        `valid` (T, H, W) bool is False where a pixel tells nothing, and `variance` is the noise of a pixel.
+        `fills` says whether their object extends beyond the field, see `fills_field`.
         """
         if self is not Background.IF_SEEN:
             return self
         is_seen = float(darkest_level(frames).mean()) > _SEEN * float(frames.mean())
-        return Background.PER_FRAME if is_seen and not fills_field(frames, valid, variance) else Background.NONE
+        return Background.PER_FRAME if is_seen and not fills else Background.NONE
 
     @property
     def price(self) -> float:

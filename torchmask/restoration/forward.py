@@ -265,6 +265,6 @@ def _of_a_model(background: Background) -> Background:
     if background is Background.IF_SEEN:
         raise ValueError(
             "background is Background.IF_SEEN, which frames decide and no model: give Background.NONE, PER_FRAME or "
-            "COMMON, or what Background.IF_SEEN.of(frames) returns"
+            "COMMON, or what `FrameStack.of` finds"
         )
     return background

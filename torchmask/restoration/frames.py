@@ -13,7 +13,7 @@ from torchmask.grid import Grid
 from torchmask.observation import check_frames
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.spikes import leave_out_spikes
-from torchmask.restoration.background import Background, check_known_level
+from torchmask.restoration.background import Background, check_known_level, fills_field
 from torchmask.restoration.change import Change
 from torchmask.restoration.noise import FrameNoise, check_errors, even_photons, expected_variance, photon_slope
 
@@ -36,6 +36,7 @@ class FrameStack:
     errors : (T, H, W) standard deviations of the pixels [electrons], with even photon noise; None if all pixels have
         `variance`
     slope : variance of the photon noise per electron of light, at most 1 without errors
+    fills_field : whether the object extends beyond the field
     """
 
     frames: Tensor
@@ -46,6 +47,7 @@ class FrameStack:
     free: Background = Background.NONE
     errors: Tensor | None = None
     slope: float = 0.0
+    fills_field: bool = False
 
     @classmethod
     def of(
@@ -72,7 +74,8 @@ class FrameStack:
         if errors is not None:
             slope = photon_slope(frames, errors, valid)
             errors = even_photons(frames, errors, valid, slope)
-        free = background.of(frames, valid, variance) if isinstance(background, Background) else Background.NONE
+        fills = fills_field(frames, valid, variance)
+        free = background.of(frames, fills) if isinstance(background, Background) else Background.NONE
         known = check_known_level(0.0 if isinstance(background, Background) else background, frames)
         frames = frames - known
         guess = free.first_guess(frames)
@@ -88,7 +91,7 @@ class FrameStack:
                 "read twice does: they tell nothing new, but count as much, so leave them out",
                 stacklevel=4,
             )
-        return cls(frames / unit, valid, unit, variance, known, free, errors, slope)
+        return cls(frames / unit, valid, unit, variance, known, free, errors, slope, fills)
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -128,6 +131,11 @@ class FrameStack:
         mean = (weight * self.frames).sum(0) / total.clamp(min=torch.finfo(total.dtype).tiny)
         level = (total * mean).sum() / total.sum()
         return float((total * (mean - level) ** 2).sum() / (total > 0).sum())
+
+    @property
+    def hides_object(self) -> bool:
+        """Whether aberrations can turn the object into another, as it is dark nowhere and frames hardly change."""
+        return self.fills_field and self.change.is_scarce
 
     @property
     def grain(self) -> float:

@@ -55,6 +55,7 @@ class Judge:
         self.has_twins: bool = not traits.many_minima and setting.still.n_subapertures > 3
         self.one_is_enough: bool = stack.change.is_scarce and stack.change.shown < _ENOUGH
         self.contrast: float = stack.contrast
+        self.hides_object: bool = stack.hides_object
         self.noise: FrameNoise = stack.noise_of_frames
         self.tolerance: Tolerance = Tolerance(schedule.model_errors, schedule.chance, least)
         self._given: dict[tuple[int, bool], tuple[State, Verdict]] = {}  # with the state, which keeps its id
@@ -78,7 +79,8 @@ class Judge:
             chi_square, pixels, state.calibration.transmission, self.noise, _parameters(objective, state)
         )
         blind = Free.OBJECT in objective.free and Free.ABERRATIONS in objective.free and not self.traits.estimated
-        return judge(frames, self.contrast, error, self.tolerance, at_rest=at_rest, blind=blind)
+        told = {"at_rest": at_rest, "blind": blind, "hides_object": self.hides_object}
+        return judge(frames, self.contrast, error, self.tolerance, **told)
 
     def compare(self, objective: MyopicObjective, now: Ending, rival: Ending | None) -> Comparison:
         """Compare the present ending with the best of the earlier ones, if there is one.

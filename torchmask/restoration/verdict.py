@@ -149,16 +149,23 @@ class FrameFits(NamedTuple):
 
 
 def judge(
-    frames: FrameFits, contrast: float, error: ModelError, tolerance: Tolerance, *, at_rest: bool, blind: bool
+    frames: FrameFits,
+    contrast: float,
+    error: ModelError,
+    tolerance: Tolerance,
+    *,
+    at_rest: bool,
+    blind: bool,
+    hides_object: bool = False,
 ) -> Verdict:
     """Return the verdict on frames.
 
     `contrast` is the chi-square per pixel of the mean frame against a uniform one; `at_rest` says whether the search
     ran to its end, and `blind` that neither object nor aberrations were known. Then light is scarce if less than 200^2
-    of the mean frame's chi-square is beyond noise. Noise gives a frame the chi-square of its own noise level, whose
-    variance is 2 over the degrees of freedom times `unevenness`; what the model lacks adds in proportion to the square
-    of its transmission. Each free parameter takes the noise of one pixel at most, of a bright one where noise is
-    uneven.
+    of the mean frame's chi-square is beyond noise, or if the stack `hides_object`, see `FrameStack`. Noise gives a
+    frame the chi-square of its own noise level, whose variance is 2 over the degrees of freedom times `unevenness`;
+    what the model lacks adds in proportion to the square of its transmission. Each free parameter takes the noise of
+    one pixel at most, of a bright one where noise is uneven.
     """
     chi_square, pixels, transmission, level, unevenness = (
         values.double().cpu() for values in (*frames[:3], *frames.noise)
@@ -181,7 +188,7 @@ def judge(
         finding = Finding.ONLY_NOISE
     else:
         finding = Finding.EXPLAINED if found <= limit else Finding.NOT_EXPLAINED
-    scarce = blind and (contrast - 1) * float(pixels.max()) < _TELLING**2
+    scarce = blind and (hides_object or (contrast - 1) * float(pixels.max()) < _TELLING**2)
     check = _what_to_check(finding, len(lost), len(pixels), at_rest=at_rest, scarce=scarce)
     if finding is Finding.EXPLAINED and blind and len(pixels) == 1:
         check = "against other frames: one alone is explained by many objects with aberrations to suit"
