@@ -230,6 +230,17 @@ def test_other_units_are_refused(table, column, factor, message, tmp_path, obser
         load_oifits(tmp_path / "b.fits")
 
 
+@pytest.mark.parametrize("column", ["T3PHI", "T3PHIERR"])
+def test_phases_in_radians_are_refused(column, tmp_path, observables):
+    seen, observation = observables
+    save_oifits(tmp_path / "a.fits", seen, observation, bandwidth=1e-8)
+    with fits.open(tmp_path / "a.fits") as hdus:
+        hdus["OI_T3"].columns[column].unit = "rad"
+        hdus.writeto(tmp_path / "b.fits")
+    with pytest.raises(ValueError, match=rf"b\.fits: {column} is in rad by its TUNIT: OIFITS phases must be in deg"):
+        load_oifits(tmp_path / "b.fits")
+
+
 def test_files_with_a_part_missing_are_refused(tmp_path, observables):
     seen, observation = observables
     save_oifits(tmp_path / "a.fits", seen, observation, bandwidth=1e-8)

@@ -66,8 +66,8 @@ def load_oifits(path: str | Path, target: str | None = None) -> Measurements:
     ------
     ValueError
         If the file is missing, cut off or is not OIFITS, a table lacks a column or its OI_WAVELENGTH or has not as many
-        values as that, wavelengths or baselines are in another unit than m, the target is not in the file or not named
-        although there are several, or no valid measurement is left.
+        values as that, wavelengths or baselines are in another unit than m, phases in rad, the target is not in the file or
+        not named although there are several, or no valid measurement is left.
 
     Examples
     --------
@@ -178,6 +178,9 @@ def _gather(
         if instrument not in waves:
             raise ValueError(f"{path}: {kind} is of instrument {instrument}, which has no OI_WAVELENGTH")
         for name in measured:
+            unit = (hdu.columns[name].unit or "").strip().lower()
+            if unit.startswith(("rad", "mrad")):
+                raise ValueError(f"{path}: {name} is in {unit} by its TUNIT: OIFITS phases must be in deg")
             if hdu.data[name].size != len(hdu.data) * len(waves[instrument]):
                 raise ValueError(
                     f"{path}: {kind} has {hdu.data[name].size} values of {name} in {len(hdu.data)} rows, and the "
