@@ -66,8 +66,8 @@ def load_oifits(path: str | Path, target: str | None = None) -> Measurements:
     ------
     ValueError
         If the file is missing, cut off or is not OIFITS, a table lacks a column or its OI_WAVELENGTH or has not as many
-        values as that, wavelengths or baselines are in another unit than m, phases in rad, the target is not in the file or
-        not named although there are several, or no valid measurement is left.
+        values as that, wavelengths or baselines are in another unit than m, phases in rad, the target is not in the
+        file or not named although there are several, or no valid measurement is left.
 
     Examples
     --------
