@@ -79,7 +79,8 @@ class LensPairs:
         pixels = CommonPixels.of(lenses, self.plane, *pairs[:4])
         if len(pixels.pair) == 0:
             return centers.new_zeros(len(centers), self.plane.n_pixels)
-        start, unit = (pixels.corner * self.pixel - middle) / step, self.pixel / step
+        start = (pixels.corner + lenses.turns.flatten(0, 1)[pairs.first]) * self.pixel - middle
+        start, unit = start / step, self.pixel / step
         lines = _lines(logarithm, start, unit, pixels)
         found = SharedLight.apply(lenses.values.flatten(1), lines, pixels, n_pixels)
         return found.view(len(centers), -1)  # type: ignore[no-any-return]
@@ -89,7 +90,7 @@ class LensPairs:
         n, count = centers.shape[1], lenses.baseline.shape[1]
         numbers = torch.arange(count, device=centers.device)
         one, other = numbers[:, None], numbers
-        x, y = (lenses.baseline * self.pixel).unbind(-1)
+        x, y = ((lenses.baseline + lenses.turns) * self.pixel).unbind(-1)
         limit, found = (2 * self.geometry.reach) ** 2, []
         # lenses at baseline 0 are their own opposites: what they share with another's opposite, they share with it
         for sign, allowed in ((1, one < other), (-1, (one > 0) & (one <= other))):
@@ -110,7 +111,8 @@ class LensPairs:
 
     def _places(self, entries: Entries, lenses: Lenses, centers: Tensor) -> list[Tensor]:
         """Return the baselines of both lenses of each entry and the separation of their middles, (E, 2) [m]."""
-        baselines, middles = (lenses.baseline * self.pixel).flatten(0, 1), lenses.middle.flatten(0, 1)
+        baselines = ((lenses.baseline + lenses.turns) * self.pixel).flatten(0, 1)  # not those on the torus
+        middles = lenses.middle.flatten(0, 1)
         first, second = (baselines.index_select(0, lens) for lens in (entries.first, entries.second))
         middle, other = (middles.index_select(0, lens) for lens in (entries.first, entries.second))
         central = (entries.first % lenses.baseline.shape[1] == 0)[:, None]
