@@ -55,7 +55,7 @@ class Judge:
         self.has_twins: bool = not traits.many_minima and setting.still.n_subapertures > 3
         self.one_is_enough: bool = stack.change.is_scarce and stack.change.shown < _ENOUGH
         self.contrast: float = stack.contrast
-        self.hides_object: bool = stack.hides_object
+        self.hides_object: bool = stack.hides_object and not traits.many_minima  # full pupils show such objects better
         self.noise: FrameNoise = stack.noise_of_frames
         self.tolerance: Tolerance = Tolerance(schedule.model_errors, schedule.chance, least)
         self._given: dict[tuple[int, bool], tuple[State, Verdict]] = {}  # with the state, which keeps its id
