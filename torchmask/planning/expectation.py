@@ -80,7 +80,7 @@ def _expect(criterion: TurbulentMSE, aperture: Aperture, instrument: Instrument)
         warnings.simplefilter("ignore")  # of what lies outside the maps, which the point itself has told
         less = [expect(*point) for point in _less(kind_of(aperture), light, frames)]
     best = min((own, *less), key=lambda one: one.error)
-    blind = replace(best.blind, outside=own.blind.outside, harder=own.blind.harder)
+    blind = replace(best.blind, outside=own.blind.outside)
     return own._replace(error=best.error, blind=blind)
 
 
