@@ -60,6 +60,9 @@ class Observation(Brief):
     frame_numbers : number of each frame in the files it was read from, counted from 0 through all of them; 0 to T - 1
         by default
 
+    Raises ValueError if an array does not fit the grid, the frames or their number, `valid` is not bool, or the
+    read-out noise is negative or not finite.
+
     In real observations the truth (object, psfs, phases, r0, outer_scale, n_photons, background, transmission,
     true_aperture) is None.
 

@@ -67,13 +67,13 @@ class Options(BandOptions, StackOptions, OIFITSOptions, WorkerOptions, RunOption
     outer_scale: float | None = None
     """Outer scale of the turbulence [m]; None: 20 mask diameters."""
     n_modes: int | None = None
-    """Number of Zernike modes per hole, from Noll mode 1 (piston); None: 6, or 231 for a full pupil. In faint frames
-    those after the sixth are found at the end."""
+    """Number of Zernike modes per hole, from Noll mode 1 (piston); None: 6, or 231 for a full pupil, and more in a
+    last descent unless a mask's frames are faint. In faint frames those after the sixth are found at the end."""
     static_modes: int = 0
     """Number of Zernike modes per hole for aberrations that all frames share, such as those of the telescope."""
     sky: float | Literal["if-seen", "per-frame", "common", "none"] = "if-seen"
     """Known sky [electrons per pixel]; or per-frame to fit a constant in each frame, common to fit one for all frames,
-    if-seen: per-frame if the frames show a sky."""
+    none if there is no sky; if-seen: per-frame if the frames show a sky."""
     wind: float | None = None
     """Speed of the wind [m/s]; with --r0 and the exposure time it says how much turbulence changes during a frame, for
     which the model then allows; None: that of --instrument, or else frames are snapshots."""

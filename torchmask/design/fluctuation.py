@@ -6,7 +6,7 @@ number like a speckle. Then the variance of |OTF|^2 over exposures is
 
     V = P^2 - sum over lenses of A^4,   P = E|OTF|^2,
 
-which is exact for holes that turbulence leaves in peace unless pairs with a hole in common overlap: a frequency that
+which is exact for holes without turbulence inside them, unless pairs with a hole in common overlap: a frequency that
 one pair alone transmits does not fluctuate at all, and one that many transmit does so like a speckle.
 """
 

@@ -38,7 +38,7 @@ class TurbulentMSE(AsymptoticMSE):
     """Mean squared error of the multi-frame Wiener restoration under real turbulence, in the limit of many frames.
 
     As `AsymptoticMSE`, with E|OTF|^2 under von Karman turbulence and a finite exposure (Korff's integral, see
-    `torchmask.atmosphere.transfer`) in place of independent pistons on holes that turbulence leaves in peace. The
+    `torchmask.atmosphere.transfer`) in place of independent pistons on holes without turbulence inside them. The
     error of K exposures, on average, is above it by `jensen_term`.
 
     Parameters
@@ -49,19 +49,20 @@ class TurbulentMSE(AsymptoticMSE):
         Fried's parameter at the wavelength of the grid [m]. None: independent uniform pistons, which is `AsymptoticMSE`
         exactly; it knows neither full pupils nor exposures.
     outer_scale : float
-        [m].
+        Outer scale of the turbulence [m].
     exposure : float
-        [s].
+        Exposure time of a frame [s].
     wind : float or (float, float)
-        Its speed [m/s], all directions being equally likely, or its velocity (vx, vy).
+        Speed of the wind [m/s], all directions being equally likely, or its velocity (vx, vy).
     pixel : PixelResponse, optional
         Response of the detector's pixels, such as `SquarePixel()`; None for pixels that are points.
     wavelengths, weights : sequence of float, optional
-        Of a broad band [m] and the share of the light at each (None: equal), such as those of `Band.top_hat`; without
-        them, all light has the wavelength of the grid, to which r0 belongs in any case. Seven do for a width of 20 %.
+        Wavelengths of a broad band [m] and the share of the light at each (None: equal), such as those of
+        `Band.top_hat`; without them, all light has the wavelength of the grid, to which r0 belongs in any case. Seven
+        do for a width of 20 %.
     sky : float
-        [electrons per pixel and exposure]. It adds to the noise as many times as there are pixels: those of
-        `NoisePSD(n_pixels=)`, or else of the grid.
+        Light of the sky [electrons per pixel and exposure]. It adds to the noise as many times as there are pixels:
+        those of `NoisePSD(n_pixels=)`, or else of the grid.
 
     Raises
     ------

@@ -63,9 +63,9 @@ def plan_observation(
     n_subapertures : sequence of int
         Numbers of holes N.
     hole_diameters : sequence of float, optional
-        [m]; None: 0.5, 0.8 and 1.2 r0.
+        Diameters of the holes [m]; None: 0.5, 0.8 and 1.2 r0.
     exposures : sequence of float, optional
-        [s]; None: 0.25, 0.5, 1, 2, 4 and 8 tau0.
+        Exposure times of a frame [s]; None: 0.25, 0.5, 1, 2, 4 and 8 tau0.
     widths : sequence of float, optional
         Widths of the even band [m], all of them on the pixels that the widest needs, or on those of the camera, without
         bands that they undersample; None: the instrument's band.

@@ -123,7 +123,7 @@ class SmearingMap:
 
 @functools.cache
 def smearing_map(pupil: Pupil = "mask") -> SmearingMap:
-    """Return the tables that come with the library, of masks or of the full pupil.
+    """Return the tables that come with the library, of masks ("mask") or of the full pupil ("full").
 
     Raises ValueError for any other kind of pupil.
 

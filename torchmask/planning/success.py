@@ -153,7 +153,7 @@ class SuccessMap:
 
 @functools.cache
 def success_map(pupil: Pupil = "mask") -> SuccessMap:
-    """Return the map that comes with the library, of masks or of the full pupil.
+    """Return the map that comes with the library, of masks ("mask") or of the full pupil ("full").
 
     Raises ValueError for any other kind of pupil.
 
