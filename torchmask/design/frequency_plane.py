@@ -67,6 +67,20 @@ class FrequencyPlane(NamedTuple):
         x, y = corner.nan_to_num(0.0).long().unbind(-1)  # NaN, of an optimiser that diverged, must not become an index
         return (y + self.origin[0]) * self.size[1] + (x + self.origin[1])
 
+    def nearest(self, corner: Tensor, n_rows: int, n_columns: int) -> Tensor:
+        """Return the indices, as `index` does, of patches anywhere, for functions that are even.
+
+        Below the plane it is that of the opposite pixel, elsewhere outside it that of the nearest one.
+        """
+        sign = torch.where(corner[..., 1:] < -self.origin[0], -1, 1)
+        x, y = (
+            (sign * (first.nan_to_num(0.0).long() + torch.arange(n, device=corner.device)) + origin).clamp(0, size - 1)
+            for first, n, origin, size in zip(
+                (corner[..., :1], corner[..., 1:]), (n_columns, n_rows), self.origin[::-1], self.size[::-1], strict=True
+            )
+        )
+        return y[..., :, None] * self.size[1] + x[..., None, :]
+
     def summed(self, index: Tensor, values: Tensor) -> Tensor:
         """Return planes (B, pixels): in each the sum of `values` (B, ...) at the pixels `index`, of the same shape."""
         planes = values.new_zeros(len(values), self.n_pixels)
