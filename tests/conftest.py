@@ -81,6 +81,20 @@ def coarse_figures() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session")
+def lens_points() -> Callable[..., Tensor]:
+    """Samples of the overlap of two discs whose centres are `place` (2,) apart, about its middle, (P, 2) [m], of `side`
+    samples to a diameter."""
+
+    def points_of(place: Tensor, diameter: float, side: int) -> Tensor:
+        axis = ((torch.arange(side, dtype=torch.float64) + 0.5) / side - 0.5) * diameter
+        points = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), -1).flatten(0, 1)
+        inside = [(points + half).norm(dim=-1) < diameter / 2 for half in (place / 2, -place / 2)]
+        return points[inside[0] & inside[1]]
+
+    return points_of
+
+
 @pytest.fixture
 def golay6() -> SparseAperture:
     """Six discs in 1 m, of the reference case's collecting area, one per test."""
