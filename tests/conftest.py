@@ -83,8 +83,7 @@ def coarse_figures() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def lens_points() -> Callable[..., Tensor]:
-    """Samples of the overlap of two discs whose centres are `place` (2,) apart, about its middle, (P, 2) [m], of `side`
-    samples to a diameter."""
+    """Points (P, 2) [m] of the overlap of two discs `place` (2,) apart, about its middle, `side` to a diameter."""
 
     def points_of(place: Tensor, diameter: float, side: int) -> Tensor:
         axis = ((torch.arange(side, dtype=torch.float64) + 0.5) / side - 0.5) * diameter
