@@ -6,10 +6,13 @@ import pytest
 import torch
 from scipy.stats import gamma
 
+from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.grid import Grid
 from torchmask.observation import check_frames
 from torchmask.optics.aperture import FullAperture
+from torchmask.optics.detector import Detector
 from torchmask.optics.noise import noise_variance
+from torchmask.simulation.exposures import simulate_observation
 
 GRID = Grid.nyquist(1.0, 550e-9, 32)
 PUPIL = FullAperture(1.0)
@@ -62,6 +65,22 @@ def test_noise_variance_is_that_of_the_valid_pixels(holes):
     ratios = torch.tensor(ratios)
     assert abs(float(ratios.mean()) - 1) < 4 * float(ratios.std()) / math.sqrt(40) + 0.05  # that of the white noise
     assert min(naive) > 2
+
+
+@pytest.mark.parametrize("readout_noise", [1.5, 30.0])
+def test_a_star_near_the_border_is_no_noise(golay6, seeded, readout_noise):
+    """Its light is cut off there, which has power at all frequencies: here 30 to 60 times that of noise."""
+    grid = Grid.nyquist(1.0, 550e-9, 64)
+    scene = torch.zeros(grid.shape, dtype=torch.float64)
+    scene[32, 61], scene[27, 22] = 7e6, 3e6
+    detector = Detector(readout_noise)
+    seen = simulate_observation(scene, golay6, grid, TurbulencePhase(0.2, 20.0), detector, 5, seeded(0))
+    for valid in (
+        torch.ones_like(seen.frames, dtype=torch.bool),
+        torch.rand(seen.frames.shape, generator=seeded(1)) > 0.02,
+    ):
+        measured = noise_variance(seen.frames, grid, golay6, valid)
+        assert measured == pytest.approx(float(seen.frames.mean()) + readout_noise**2, rel=0.2)
 
 
 def test_noise_variance_needs_frequencies_beyond_the_cutoff():

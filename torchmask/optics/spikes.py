@@ -17,6 +17,7 @@ from torch.nn.functional import max_pool2d, pad
 from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.bad_pixels import fill_bad_pixels
+from torchmask.optics.fading import beyond_faded, fading
 from torchmask.optics.noise import fill_with_least_power
 
 _CHANCE = 0.001  # of finding one in frames without any
@@ -26,7 +27,6 @@ _NEAR = 2  # pixels on either side, among which only the largest spike of a roun
 _GROWN = 1  # pixels on either side that are left out with a spike, as few hits keep to one
 _AROUND = 7  # the same among which the noise is alike
 _UNEVEN = 0.02  # error of the flat, and of what is left of borders, over the light
-_TAPER = 6  # part of the frame's side over which its border fades, so that what is cut off there makes no spike
 _MOST = 0.05  # of all pixels: if there are more, what is beyond the cut-off is light after all
 _MEDIAN = 0.4549  # of the square of a normal deviate, over its mean
 
@@ -65,12 +65,11 @@ def find_spikes(frames: Tensor, valid: Tensor, grid: Grid, aperture: Aperture) -
     cut-off.
     """
     found = torch.zeros_like(valid)
-    beyond = _frequencies(frames, grid, aperture)
+    beyond = beyond_faded(grid, aperture, frames)
     if int(beyond.sum()) < 8:
         return found
     share = float(beyond.double().mean())
-    down, across = (_taper(side).to(frames) for side in frames.shape[1:])
-    window = down[:, None] * across
+    window = fading(frames)  # so that what is cut off at the border makes no spike
     tapered, asked = frames * window, valid & (window > 0.5)
     footprint = torch.fft.rfft2(torch.fft.ifft2(beyond.to(frames)).real ** 2)
     half = beyond[:, : footprint.shape[1]]
@@ -99,22 +98,6 @@ def find_spikes(frames: Tensor, valid: Tensor, grid: Grid, aperture: Aperture) -
         if int(found.sum()) > max((2 * _GROWN + 1) ** 2, _MOST * int(valid.sum())):
             return torch.zeros_like(valid)
     return found
-
-
-def _frequencies(frames: Tensor, grid: Grid, aperture: Aperture) -> Tensor:
-    """Return the frequencies (H, W) at which spikes are looked for.
-
-    Where pixels are fine enough they are as far beyond the cut-off as the fading of the border spreads light.
-    """
-    nu_y, nu_x = grid.frequencies(frames.dtype, frames.device)
-    cutoff, spread = grid.cutoff(aperture.extent), _TAPER / min(frames.shape[1:])
-    return torch.hypot(nu_y, nu_x) > max(cutoff, min(0.5, cutoff + spread))
-
-
-def _taper(side: int) -> Tensor:
-    """Return a window (side,) that rises from 0 at either end to 1."""
-    place = torch.arange(side, dtype=torch.float64, device="cpu") + 0.5
-    return torch.sin(math.pi / 2 * (torch.minimum(place, side - place) * _TAPER / side).clamp(max=1)) ** 2
 
 
 def _largest(values: Tensor, near: int) -> Tensor:
