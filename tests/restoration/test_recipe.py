@@ -135,16 +135,31 @@ def test_a_pixel_scale_in_another_unit_is_told_before_the_holes_are_sampled():
 )
 def test_a_faint_search_has_at_most_six_modes(options, blind, first, then):
     made = recipe(grid=Grid.nyquist(1.0, 550e-9, 48), **options)
-    faint = made.for_frames(blind=blind, faint=True)
+    faint = made.for_frames(blind=blind, faint=True, fills_field=False)
     assert (faint.frame_modes, faint.last_modes) == (first, then)
     assert replace(faint, frame_modes=made.frame_modes, last_modes=made.last_modes) == made
     assert (faint.finer_basis() is None) == (first == then)
-    assert made.for_frames(blind=blind, faint=False) is made
+    assert made.for_frames(blind=blind, faint=False, fills_field=False) is made
 
 
 def test_a_full_pupil_has_all_its_modes_however_faint():
     made = recipe(FullAperture(1.0), frame_modes=10, last_modes=15)
-    assert made.for_frames(blind=True, faint=True) is made
+    assert made.for_frames(blind=True, faint=True, fills_field=True) is made
+
+
+@pytest.mark.parametrize(("period", "margin"), [(0.25, 0.25), (0.5, 0.5), (0.9, 0.9), (1.2, 1.0)])
+def test_around_a_wide_object_is_what_a_hole_brings_in(period, margin):
+    """Twice lambda / d, of the reddest light, over the width of the frames. A quarter is the margin of all others."""
+    reddest = 650e-9
+    hole = 2 * reddest / (period * 48 * GRID.pixel_scale)
+    apart = 1.02 * hole * torch.tensor([[0.0, 0.58], [-0.5, -0.29], [0.5, -0.29]], dtype=torch.float64)
+    grid = Grid((64, 48), GRID.pixel_scale, GRID.wavelength)
+    made = recipe(SparseAperture(apart, hole, 1.0), grid=grid, band=Band.of([550e-9, reddest]))
+    for faint in (False, True):
+        wide = made.for_frames(blind=True, faint=faint, fills_field=True)
+        assert wide.margin == pytest.approx(margin, rel=1e-12)
+        assert made.for_frames(blind=True, faint=faint, fills_field=False).margin == made.margin == 0.25
+    assert wide.turbulent_model().window.field.shape[1] >= (1 + margin) * 48
 
 
 def test_turbulence_that_is_not_told_is_as_wide_as_a_hole():

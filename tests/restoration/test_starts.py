@@ -76,34 +76,48 @@ def test_expected_parameters_are_those_of_the_coefficients(explained):
         expected_parameters(objective, basis.coefficients(state.z) / 0)
 
 
-def test_the_first_object_is_the_clipped_mean_frame(explained):
+def test_the_first_object_is_the_clipped_mean_frame(explained, traits):
     objective, state = explained
-    begun = first_state(objective, state.z, None, 30.0, 0.5)
+    begun = first_state(objective, state.z, None, 30.0, replace(traits, prior_on_aberrations=False))
     mean = objective.frames.mean(0)
     assert float(mean.min()) < 0
     assert torch.equal(objective.model.window.crop(begun.image), mean.clamp(min=0))
     assert float(begun.image[32:].abs().sum() + begun.image[:, 32:].abs().sum()) == 0
     assert begun.z is state.z
     assert begun.calibration.noise_inflation.tolist() == [30.0] * 4
-    assert begun.calibration.aberration_weight == 0.5
+    assert begun.calibration.aberration_weight == 0
+    assert first_state(objective, state.z, None, 30.0, traits).calibration.aberration_weight == 1
     brightness = objective.frames.mean((1, 2))
     torch.testing.assert_close(begun.calibration.transmission, brightness / brightness.mean())
 
 
-def test_a_known_object_is_scaled_to_the_frames(explained):
+def test_around_a_wide_object_there_is_light_at_first(explained, traits):
+    """As much as in a mean pixel, whether the object is known or not."""
+    objective, state = explained
+    window, wide = objective.model.window, replace(traits, fills_field=True)
+    for known in (None, window.crop(state.image)):
+        image = first_state(objective, state.z, known, 30.0, wide).image
+        inside = window.crop(image)
+        around = torch.cat([image[32:].flatten(), image[:32, 32:].flatten()])
+        torch.testing.assert_close(around, torch.full_like(around, float(inside.mean())))
+        dark = window.crop(first_state(objective, state.z, known, 30.0, traits).image)
+        torch.testing.assert_close(inside / inside.mean(), dark / dark.mean())
+
+
+def test_a_known_object_is_scaled_to_the_frames(explained, traits):
     """Its own flux is in any units; negative pixels count as dark."""
     objective, state = explained
     window = objective.model.window
     known = 1e5 * window.crop(state.image)
     known[0, 0] = -3.0
-    image = first_state(objective, state.z, known, 30.0, 1.0).image
+    image = first_state(objective, state.z, known, 30.0, traits).image
     assert float(objective.model(image, state.z).mean()) == pytest.approx(1, rel=1e-12)
     torch.testing.assert_close(image / image.sum(), state.image / state.image.sum())
     with pytest.raises(ValueError, match=r"known_object has shape \(31, 32\): it must be \(32, 32\)"):
-        first_state(objective, state.z, known[1:], 30.0, 1.0)
+        first_state(objective, state.z, known[1:], 30.0, traits)
     for nothing in (0 * known, known / 0):
         with pytest.raises(ValueError, match=r"known_object holds .* not finite, or no light: give the light"):
-            first_state(objective, state.z, nothing, 30.0, 1.0)
+            first_state(objective, state.z, nothing, 30.0, traits)
 
 
 def test_candidates_are_those_of_the_seed(explained):
@@ -129,11 +143,12 @@ def result_of(objective, state, r0=0.25):
     return assemble_result(objective, stack, Progress(Candidates(state, 1)), r0)
 
 
-def begin(objective):
-    return first_state(objective, torch.zeros_like(objective.centre), None, 30.0, 1.0)
+@pytest.fixture(scope="module")
+def begin(traits):
+    return lambda objective: first_state(objective, torch.zeros_like(objective.centre), None, 30.0, traits)
 
 
-def test_an_earlier_result_gives_object_and_aberrations(explained):
+def test_an_earlier_result_gives_object_and_aberrations(explained, begin):
     objective, state = explained
     warm, n_known = start_from_result(objective, begin(objective), result_of(objective, state), 2 * UNIT)
     assert n_known == 4
@@ -142,7 +157,17 @@ def test_an_earlier_result_gives_object_and_aberrations(explained):
     assert warm.calibration.noise_inflation.tolist() == [30.0] * 4
 
 
-def test_what_is_known_now_is_not_taken_from_an_earlier_result(explained):
+def test_an_earlier_result_of_another_margin_gives_its_object_within_the_field(explained, begin):
+    objective, state = explained
+    begun, earlier = begin(objective), result_of(objective, state)
+    narrow = replace(earlier, extended_object=earlier.extended_object[:33, :32])
+    warm, _ = start_from_result(objective, begun, narrow, UNIT)
+    expected = begun.image.clone()
+    expected[:32, :32] = state.image[:32, :32]
+    torch.testing.assert_close(warm.image, expected)
+
+
+def test_what_is_known_now_is_not_taken_from_an_earlier_result(explained, begin):
     objective, state = explained
     begun = begin(objective)
     warm, _ = start_from_result(objective.with_changes(free=Free.OBJECT), begun, result_of(objective, state), UNIT)
@@ -152,7 +177,7 @@ def test_what_is_known_now_is_not_taken_from_an_earlier_result(explained):
     assert torch.equal(warm.image, begun.image)
 
 
-def test_frames_that_are_new_keep_their_own_and_take_what_is_common(five_holes, five_hole_basis, explain):
+def test_frames_that_are_new_keep_their_own_and_take_what_is_common(five_holes, five_hole_basis, explain, begin):
     shared = AberrationBasis(five_hole_basis.mixing, 3, n_common=6)
     objective, state = explain(ExposureModel(five_holes, explain()[0].model.window.grid, shared))
     few = slice(0, 3)
@@ -166,7 +191,7 @@ def test_frames_that_are_new_keep_their_own_and_take_what_is_common(five_holes, 
     assert torch.equal(warm.z[3, shared.n_own :], warm.z[0, shared.n_own :])
 
 
-def test_refuses_results_of_something_else(explained):
+def test_refuses_results_of_something_else(explained, begin):
     objective, state = explained
     result = result_of(objective, state)
     begun = begin(objective)

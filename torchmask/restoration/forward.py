@@ -53,10 +53,10 @@ class Window:
         """Return the frames' pixels (..., H, W) of images (..., H', W')."""
         return image[..., : self.grid.shape[0], : self.grid.shape[1]]
 
-    def embed(self, image: Tensor) -> Tensor:
-        """Pad images (..., H, W) with a margin of zeros to (..., H', W')."""
+    def embed(self, image: Tensor, outside: float = 0.0) -> Tensor:
+        """Pad images (..., H, W) to (..., H', W') with a margin that has the brightness `outside`."""
         rows, columns = self.field.shape
-        return nn.functional.pad(image, (0, columns - image.shape[-1], 0, rows - image.shape[-2]))
+        return nn.functional.pad(image, (0, columns - image.shape[-1], 0, rows - image.shape[-2]), value=outside)
 
 
 class ExposureModel(nn.Module):

@@ -144,9 +144,9 @@ class MyopicDeconvolution:
         dtype: torch.dtype = torch.float32,
         device: torch.device | str | None = None,
     ) -> None:
-        check_given(aperture, grid, readout_noise, tolerance, aberration_prior, schedule, minimizer)
-        if wavelengths is None and weights is not None:
-            raise ValueError("weights are given without wavelengths: give both")
+        check_given(
+            aperture, grid, wavelengths, weights, readout_noise, tolerance, aberration_prior, schedule, minimizer
+        )
         self.many_minima, self.known_r0 = aperture.n_subapertures == 1, r0 is not None
         self.schedule: Schedule = schedule or Schedule()
         self.recipe: ModelRecipe = ModelRecipe(
@@ -253,21 +253,21 @@ class MyopicDeconvolution:
             If noise, border or fringes of the frames contradict `readout_noise`, the field or the mask, or if they show
             too little of the object for the standard deviations that `n_samples` asks for.
         """
-        started = time.perf_counter()
-        n_samples = number_of_samples(n_samples)
+        started, n_samples = time.perf_counter(), number_of_samples(n_samples)
         keep_freed_memory()
         told, stack = self.recipe, self._stack(frames, valid, errors)
         (look := look_at_mask(stack.frames, told.aperture, told.grid, told.band)).warn(stacklevel=2)
-        known = Known.of(coefficients, covariance, known_object)
-        stack = stack.to(self._model.dtype, self._model.device)
-        recipe = told.for_frames(blind=known.nothing and start is None, faint=stack.change.each < self.schedule.faint)
-        model = self.model if recipe.frame_modes == self.recipe.frame_modes else recipe.turbulent_model()
+        known, stack = Known.of(coefficients, covariance, known_object), stack.to(self._model.dtype, self._model.device)
+        faint = stack.change.each < self.schedule.faint
+        recipe = told.for_frames(blind=known.nothing and start is None, faint=faint, fills_field=stack.fills_field)
+        model = self.model if replace(recipe, last_modes=told.last_modes) == told else recipe.turbulent_model()
         model = (model if known.covariance is None else recipe.estimated_model(known.covariance)).beside(stack.free)
         with torch.inference_mode(False), each_on_a_core(model.device) as parallel:
             objective = MyopicObjective(
                 model, stack.frames, stack.precision, self.prior, free=known.free, parallel=parallel
             )
-            traits, later = self._traits(known, seed), recipe.later_bases(model.aberrations, blind=known.nothing)
+            traits = replace(self._traits(known, seed), fills_field=stack.fills_field)
+            later = recipe.later_bases(model.aberrations, blind=known.nothing)
             solver = Solver(objective, stack, traits, self.schedule, self.minimizer, callback, *later)
             unlimited = replace(traits, max_iterations=0, tolerance=0.0)
             settings = (unlimited, self.minimizer, self.schedule, recipe.last_modes, recipe.exposure_tau0)

@@ -22,7 +22,7 @@ from torchmask.restoration.aberrations import (
     moving_basis,
     turbulent_basis,
 )
-from torchmask.restoration.forward import ExposureModel, Window
+from torchmask.restoration.forward import MARGIN, ExposureModel, Window
 
 FULL_MODES = 231  # of a full pupil, as far as nobody says
 MASK_MODES = 6  # of each sub-aperture of a mask; a faint search with 10 and 15 ended 5 % worse on one of five stacks
@@ -45,6 +45,7 @@ class ModelRecipe:
     pixel : response of the detector's pixels; None: they sample the image at their centres
     exposure_tau0 : exposure time of a frame [tau0]; 0: frames are snapshots
     last_modes : number of Zernike modes per sub-aperture of each frame after the search, if it is larger
+    margin : the object's field is at least (1 + margin) times as wide as the frames
 
     Raises
     ------
@@ -66,6 +67,7 @@ class ModelRecipe:
     pixel: PixelResponse | None = None
     exposure_tau0: float = 0.0
     last_modes: int = 0
+    margin: float = MARGIN
 
     def __post_init__(self) -> None:
         shape = tuple(self.aperture.centers.shape)
@@ -88,7 +90,7 @@ class ModelRecipe:
         self._check_modes()
 
     def _check_modes(self) -> None:
-        aperture, field = self.aperture, Window.around(self.grid).field
+        aperture, field = self.aperture, Window.around(self.grid, self.margin).field
         if self.whitened and not aperture.is_full:
             samples = sample_holes(aperture.centers.detach(), aperture.shape, aperture.subaperture_diameter, field)
             most = int((samples.weights > 0).sum(-1).max())
@@ -127,16 +129,25 @@ class ModelRecipe:
         """Grid at the shortest wavelength, which has the highest cut-off."""
         return replace(self.grid, wavelength=self.band.shortest)
 
-    def for_frames(self, *, blind: bool, faint: bool) -> ModelRecipe:
-        """Return the recipe for frames, which differs from this one if they are faint ones of a mask.
+    def for_frames(self, *, blind: bool, faint: bool, fills_field: bool) -> ModelRecipe:
+        """Return the recipe for frames, which differs from this one if those of a mask are faint, or its object wide.
 
-        Then a blind search has at most six modes of each sub-aperture, as more of them bend to the noise. Those that
-        are asked for beyond enter after it, and no others do.
+        In faint ones a blind search has at most six modes of each sub-aperture, as more of them bend to the noise.
+        Those that are asked for beyond enter after it, and no others do. Around an object that fills the field there
+        is a margin from which a hole brings light in.
         """
-        if not faint or self.aperture.n_subapertures == 1:
+        if self.aperture.n_subapertures == 1:
             return self
+        recipe = replace(self, margin=self._wide_margin()) if fills_field else self
+        if not faint:
+            return recipe
         first = min(self.frame_modes, MASK_MODES) if blind and self.whitened else self.frame_modes
-        return replace(self, frame_modes=first, last_modes=self.frame_modes)
+        return replace(recipe, frame_modes=first, last_modes=self.frame_modes)
+
+    def _wide_margin(self) -> float:
+        """Return the margin that holds what a hole spreads, lambda / d on either side, at most the width of frames."""
+        spread = max(self.band.wavelengths) / (self.aperture.subaperture_diameter * self.grid.pixel_scale)
+        return min(max(MARGIN, 2 * spread / min(self.grid.shape)), 1.0)
 
     def turbulent_model(self, *, follows_aperture: bool = False) -> ExposureModel:
         """Return the model with aberrations by turbulence.
@@ -182,5 +193,5 @@ class ModelRecipe:
         return self._build(self.aperture.still(), basis)
 
     def _build(self, aperture: Aperture, basis: AberrationBasis) -> ExposureModel:
-        options = {"pixel": self.pixel, "dtype": self.dtype, "device": self.device}
+        options = {"pixel": self.pixel, "margin": self.margin, "dtype": self.dtype, "device": self.device}
         return ExposureModel(aperture, self.grid, basis, self.band, **options)

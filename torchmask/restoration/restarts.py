@@ -115,8 +115,8 @@ class Restarts:
             progress.candidates = Candidates(twin_of(placed, state, self.first_inflation, seed), 1)
             return
         placed = self.setting.objective_at(objective, replace(state, modes=Modes.STILL))
-        z, weight = expected_parameters(placed, None), self.traits.aberration_weight
-        first = replace(first_state(placed, z, None, self.first_inflation, weight), geometry=state.geometry)
+        first = first_state(placed, expected_parameters(placed, None), None, self.first_inflation, self.traits)
+        first = replace(first, geometry=state.geometry)
         progress.candidates = first_candidates(placed, first, self.traits, self.schedule, seed)
 
     def _temper(self, objective: MyopicObjective, progress: Progress, best: Ending) -> None:

@@ -192,7 +192,7 @@ class Solver:
 
     def _first_state(self, known: Known) -> State:
         z = expected_parameters(self.objective, known.coefficients)
-        return first_state(self.objective, z, known.object, self.first_inflation, self.traits.aberration_weight)
+        return first_state(self.objective, z, known.object, self.first_inflation, self.traits)
 
     def _play(self, progress: Progress) -> None:
         """Play one stage of the tournament; end the tournament if no iterations are left."""

@@ -97,20 +97,25 @@ def expected_parameters(objective: MyopicObjective, coefficients: Tensor | None)
 
 
 def first_state(
-    objective: MyopicObjective, z: Tensor, known_object: Tensor | None, first_inflation: float, aberration_weight: float
+    objective: MyopicObjective, z: Tensor, known_object: Tensor | None, first_inflation: float, traits: Traits
 ) -> State:
     """Return the state with the clipped mean frame, or the known object, and the aberrations z (T, K).
 
-    Raises ValueError if the known object has another shape than the frames, is not finite or has no light.
+    The margin is dark, or as bright as the mean if the object fills the field. Raises ValueError if the known object
+    has another shape than the frames, is not finite or has no light.
     """
     window, model = objective.model.window, objective.model
     neutral = objective.neutral_calibration()
+
+    def embedded(image: Tensor) -> Tensor:
+        return window.embed(image, float(image.mean()) if traits.fills_field else 0.0)
+
     light = objective.frames - model.background.first_guess(objective.frames)
-    image = window.embed(light.mean(0).clamp(min=0)).double()
+    image = embedded(light.mean(0).clamp(min=0)).double()
     if known_object is not None:
         if tuple(known_object.shape) != window.grid.shape:
             raise ValueError(f"known_object has shape {tuple(known_object.shape)}: it must be {window.grid.shape}")
-        image = window.embed(known_object.to(image).clamp(min=0))
+        image = embedded(known_object.to(image).clamp(min=0))
         if not 0 < float(image.sum()) < math.inf:
             raise ValueError(
                 "known_object holds values that are not finite, or no light: give the light of each pixel, 0 where it "
@@ -119,7 +124,7 @@ def first_state(
         with torch.no_grad():
             image = image / float(model(image, z).mean())
     inflation = torch.full_like(neutral.transmission, first_inflation)
-    return State(image, z, Calibration(neutral.transmission, inflation, aberration_weight))
+    return State(image, z, Calibration(neutral.transmission, inflation, traits.aberration_weight))
 
 
 def has_tournament(objective: MyopicObjective, traits: Traits) -> bool:
@@ -170,14 +175,18 @@ def start_from_result(
             f"start is of {known} frames with {given[0]} holes and {given[1]} modes: at most {len(state.z)} frames, "
             f"{expected[0]} holes and {expected[1]} modes are needed, those of this restoration"
         )
-    if start.extended_object.shape != state.image.shape:
-        (rows, columns), own = start.object.shape, objective.model.window.grid.shape
+    (rows, columns), own = start.object.shape, objective.model.window.grid.shape
+    if (rows, columns) != own:
         raise ValueError(
             f"start is of frames of {rows} x {columns} pixels: those of this restoration have {own[0]} x {own[1]}"
         )
     image, z = state.image, state.z.clone()
     if Free.OBJECT in objective.free:
-        image = start.extended_object.to(image) / unit
+        if start.extended_object.shape == image.shape:
+            image = start.extended_object.to(image) / unit
+        else:  # its margin was another, as the object filled the field and did not, or the reverse
+            image = image.clone()
+            objective.model.window.crop(image).copy_(start.object / unit)
     if Free.ABERRATIONS in objective.free:
         z[:known] = basis.parameters_of(start.coefficients)
         z[known:] = basis.with_common_of(z[known:], z[:1])

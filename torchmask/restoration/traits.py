@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -93,6 +94,7 @@ class Traits:
     tolerance : the restoration has converged when a segment lowers the cost by a smaller fraction
     seed : seed of the random starts
     refinement : whether to refine the mask's geometry
+    fills_field : whether the object extends beyond the field
     """
 
     many_minima: bool
@@ -105,6 +107,7 @@ class Traits:
     tolerance: float
     seed: int
     refinement: Refinement
+    fills_field: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "seed", whole_number("seed", self.seed, least=0))
@@ -127,6 +130,8 @@ class Traits:
 def check_given(
     aperture: Aperture,
     grid: Grid,
+    wavelengths: Sequence[float] | None,
+    weights: Sequence[float] | None,
     readout_noise: float | None,
     tolerance: float,
     aberration_prior: bool,
@@ -136,11 +141,13 @@ def check_given(
     """Check what a method is given. `readout_noise` is in electrons rms.
 
     Raises TypeError for an aperture, a grid, a schedule, a minimiser or a switch of another type, and ValueError for a
-    read-out noise or a tolerance out of range.
+    read-out noise or a tolerance out of range, or for weights without wavelengths.
     """
     require_type("aperture", aperture, Aperture)
     require_type("grid", grid, Grid)
     require_type("schedule", schedule or Schedule(), Schedule)
+    if wavelengths is None and weights is not None:
+        raise ValueError("weights are given without wavelengths: give both")
     if isinstance(minimizer, type) or not (minimizer is None or callable(minimizer)):
         given = minimizer.__name__ if isinstance(minimizer, type) else repr(minimizer)
         raise TypeError(
