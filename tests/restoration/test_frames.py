@@ -191,6 +191,28 @@ def test_frames_that_hardly_change_hide_an_object_that_fills_the_field(change, f
     assert stack.hides_object is hides
 
 
+def test_frames_are_still_if_they_change_by_their_noise_alone(seeded):
+    """However bright; a single one tells nothing of it, nor do several where the noise that is told is too large."""
+    y, x = torch.meshgrid(*(torch.arange(32.0) - 16,) * 2, indexing="ij")
+    peak = 1e4 * torch.exp(-(x**2 + y**2) / 20)
+    wave = 1 + 0.05 * torch.sin(x)
+    for number in range(5):
+        still = [torch.poisson(peak, generator=seeded(10 * number + frame)) for frame in range(4)]
+        moved = [*still[:3], torch.poisson(peak * wave, generator=seeded(10 * number + 3))]
+        for frames, readout_noise, expected in (
+            (still, 0.0, True),
+            (moved, 0.0, False),
+            (still[:1], 0.0, False),
+            (still, 40.0, False),
+        ):
+            counts = torch.stack(frames)
+            mean = float(counts.mean())
+            variance = mean + readout_noise**2
+            valid = torch.ones_like(counts, dtype=torch.bool)
+            stack = FrameStack(counts / mean, valid, mean, variance, slope=mean / variance)
+            assert stack.is_still is expected
+
+
 def test_contrast_is_the_chi_square_of_the_weighted_mean_frame_against_an_even_one():
     """Each pixel of the mean has the inverse variance of all its valid frames; pixels without any do not count."""
     generator = torch.Generator().manual_seed(2)

@@ -19,7 +19,15 @@ TOLERANCE = Tolerance(2.0, 2.0)
 
 
 def verdict_on(
-    *chi_square, contrast=50.0, tolerance=TOLERANCE, at_rest=True, blind=False, hides=False, error=ERROR, **fits
+    *chi_square,
+    contrast=50.0,
+    tolerance=TOLERANCE,
+    at_rest=True,
+    blind=False,
+    hides=False,
+    still=False,
+    error=ERROR,
+    **fits,
 ):
     n_frames = len(chi_square)
     told = {
@@ -29,7 +37,7 @@ def verdict_on(
         "noise": FrameNoise(torch.ones(n_frames), torch.ones(n_frames)),
         "parameters": 100.0,
     }
-    seen = {"at_rest": at_rest, "blind": blind, "hides_object": hides}
+    seen = {"at_rest": at_rest, "blind": blind, "hides_object": hides, "is_still": still}
     return judge(FrameFits(**(told | fits)), contrast, error, tolerance, **seen)
 
 
@@ -62,6 +70,20 @@ def test_one_frame_alone_is_explained_by_many_objects():
     assert "check against other frames: one alone is explained by many objects" in str(verdict)
     assert verdict_on(1.0).check == ""
     assert "other frames" not in verdict_on(8.0, blind=True).check
+
+
+def test_frames_that_do_not_change_tell_no_more_than_one():
+    """Where light is scarce, which may hide the change, more of it is asked for instead."""
+    seen = {"contrast": 1e3, "blind": True, "still": True}
+    verdict = verdict_on(1.0, 1.0, **seen)
+    assert verdict.explained
+    assert "check against frames under other aberrations: these do not change" in str(verdict)
+    assert verdict_on(1.0, 2.0, **seen).check.startswith(
+        "those frames for clouds and tracking errors, and then against"
+    )
+    for other in ({"still": False}, {"blind": False}, {"contrast": 30.0}):
+        assert "do not change" not in verdict_on(1.0, 1.0, **(seen | other)).check
+    assert "do not change" not in verdict_on(8.0, 8.0, **seen).check
 
 
 def test_light_is_scarce_below_a_signal_to_noise_of_200():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import dataclass, field, replace
 
@@ -21,6 +22,7 @@ Array = Tensor | np.ndarray
 
 _BRIGHT_BORDER = 0.5  # border brightness, in mean pixels, above which there is a warning
 _EVEN_LIGHT = 0.6  # fraction of even light above which there is a warning: it may be a sky or a wide object
+_BY_CHANCE = 5.0  # standard deviations of what noise changes from frame to frame
 
 
 @dataclass(frozen=True)
@@ -136,6 +138,16 @@ class FrameStack:
     def hides_object(self) -> bool:
         """Whether aberrations can turn the object into another, as it is dark nowhere and frames hardly change."""
         return self.fills_field and self.change.is_scarce
+
+    @property
+    def is_still(self) -> bool:
+        """Whether several frames change by no more than their noise, so that they show one state of the aberrations.
+
+        Nor by clearly less, as they do where the noise that was told is too large.
+        """
+        change, unevenness = self.change, float(self.noise_of_frames.unevenness.mean())
+        scatter = math.sqrt(2 * (len(self) - 1) * change.n_pixels * unevenness) / len(self)
+        return len(self) > 1 and abs(change.beyond_noise) < _BY_CHANCE * scatter
 
     @property
     def grain(self) -> float:

@@ -17,6 +17,7 @@ from torchmask.restoration.noise import FrameNoise
 _SURE = 5.0  # standard deviations of the noise that do not occur by chance
 _LOST = 2.0  # times the minimum tolerance of a stack is allowed for single frames: they end in minima of their own
 _TELLING = 200.0  # signal to noise: below 180 errors are 1 to 20 times their standard deviations, above 0.6 to 1.8
+_MANY_OBJECTS = "is explained by many objects with aberrations to suit"
 _BY_CHANCE = 0.01  # of the good stacks have a frame that is named because of its noise
 
 
@@ -157,15 +158,16 @@ def judge(
     at_rest: bool,
     blind: bool,
     hides_object: bool = False,
+    is_still: bool = False,
 ) -> Verdict:
     """Return the verdict on frames.
 
     `contrast` is the chi-square per pixel of the mean frame against a uniform one; `at_rest` says whether the search
     ran to its end, and `blind` that neither object nor aberrations were known. Then light is scarce if less than 200^2
-    of the mean frame's chi-square is beyond noise, or if the stack `hides_object`, see `FrameStack`. Noise gives a
-    frame the chi-square of its own noise level, whose variance is 2 over the degrees of freedom times `unevenness`;
-    what the model lacks adds in proportion to the square of its transmission. Each free parameter takes the noise of
-    one pixel at most, of a bright one where noise is uneven.
+    of the mean frame's chi-square is beyond noise, or if the stack `hides_object`; one that `is_still` tells no more
+    than a single frame, see `FrameStack`. Noise gives a frame the chi-square of its own noise level, whose variance is
+    2 over the degrees of freedom times `unevenness`; what the model lacks adds in proportion to the square of its
+    transmission. Each free parameter takes the noise of one pixel at most, of a bright one where noise is uneven.
     """
     chi_square, pixels, transmission, level, unevenness = (
         values.double().cpu() for values in (*frames[:3], *frames.noise)
@@ -191,7 +193,10 @@ def judge(
     scarce = blind and (hides_object or (contrast - 1) * float(pixels.max()) < _TELLING**2)
     check = _what_to_check(finding, len(lost), len(pixels), at_rest=at_rest, scarce=scarce)
     if finding is Finding.EXPLAINED and blind and len(pixels) == 1:
-        check = "against other frames: one alone is explained by many objects with aberrations to suit"
+        check = f"against other frames: one alone {_MANY_OBJECTS}"
+    elif finding is Finding.EXPLAINED and blind and is_still and not scarce:
+        still = f"against frames under other aberrations: these do not change, and what they show {_MANY_OBJECTS}"
+        check = f"{check}, and then {still}" if check else still
     numbers = (found, round(total), error.excess, limit, error.phase)
     return Verdict(finding, *numbers, lost, len(pixels), check, least=least, is_scarce=scarce)
 
