@@ -180,17 +180,6 @@ def test_errors_without_photons_weigh_every_pixel_by_itself():
     assert single.precision.dtype == torch.float32
 
 
-@pytest.mark.parametrize(("change", "fills", "hides"), [(2.49, True, True), (2.51, True, False), (2.49, False, False)])
-def test_frames_that_hardly_change_hide_an_object_that_fills_the_field(change, fills, hides):
-    """Two frames of 1024 pixels show 2048 beyond their noise if each pixel changes by 1/2 + 2 of its noise variance."""
-    wave = torch.ones(GRID.shape, dtype=torch.float64)
-    wave[:, ::2] = -1.0
-    frames = 1 + math.sqrt(change / 100) * torch.stack([wave, -wave])
-    stack = FrameStack(frames, torch.ones_like(frames, dtype=torch.bool), 10.0, 1.0, fills_field=fills)
-    assert stack.change.each == pytest.approx(change, rel=1e-12)
-    assert stack.hides_object is hides
-
-
 def test_frames_are_still_if_they_change_by_their_noise_alone(seeded):
     """However bright; a single one tells nothing of it, nor do several where the noise that is told is too large."""
     y, x = torch.meshgrid(*(torch.arange(32.0) - 16,) * 2, indexing="ij")

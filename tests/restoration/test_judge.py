@@ -27,21 +27,6 @@ from torchmask.restoration.verdict import Finding
 TURN = torch.tensor([0.02, 0.0], dtype=torch.float64)
 
 
-@pytest.mark.parametrize("full", [False, True])
-def test_an_object_that_fills_the_field_is_hidden_behind_a_mask(explain, traits, stack_of, full):
-    """Where frames hardly change, as in much noise. A full pupil shows more of such an object, and nothing is said."""
-    objective, state = explain(noise=0.003)
-    stack = replace(stack_of(objective), fills_field=True)
-    seen = replace(traits, many_minima=full)
-    dim = replace(stack, variance=1e9 * stack.variance)
-    for given, hidden in ((stack, False), (dim, True), (replace(dim, fills_field=False), False)):
-        judge = Judge(Setting.of(objective), given, seen, Schedule())
-        assert given.change.is_scarce is (given is not stack)
-        assert judge.hides_object is (hidden and not full)
-        if given is stack:
-            assert not judge.verdict(objective, Ending(state, Status.CONVERGED)).is_scarce
-
-
 def test_each_ending_is_judged_where_it_has_found_the_mask(explain, traits, stack_of):
     """An ending that knows of the turn is explained as if nothing had been turned; one that does not is worse."""
     objective, state = explain(noise=0.003)

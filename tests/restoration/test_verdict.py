@@ -24,7 +24,6 @@ def verdict_on(
     tolerance=TOLERANCE,
     at_rest=True,
     blind=False,
-    hides=False,
     still=False,
     error=ERROR,
     **fits,
@@ -37,7 +36,7 @@ def verdict_on(
         "noise": FrameNoise(torch.ones(n_frames), torch.ones(n_frames)),
         "parameters": 100.0,
     }
-    seen = {"at_rest": at_rest, "blind": blind, "hides_object": hides, "is_still": still}
+    seen = {"at_rest": at_rest, "blind": blind, "is_still": still}
     return judge(FrameFits(**(told | fits)), contrast, error, tolerance, **seen)
 
 
@@ -93,12 +92,6 @@ def test_light_is_scarce_below_a_signal_to_noise_of_200():
         assert not verdict_on(1.0, 1.0, contrast=contrast).is_scarce
         few = torch.tensor([PIXELS, PIXELS // 2])  # the mean frame has as many as the frame with most of them
         assert verdict_on(1.0, 0.5, contrast=contrast, blind=True, pixels=few).is_scarce is scarce
-
-
-def test_light_is_scarce_where_the_stack_hides_its_object():
-    """Which says nothing against an object or aberrations that are known."""
-    assert verdict_on(1.0, 1.0, contrast=1e3, blind=True, hides=True).is_scarce
-    assert not verdict_on(1.0, 1.0, contrast=1e3, hides=True).is_scarce
 
 
 def test_more_light_is_asked_for_where_it_is_scarce():

@@ -135,11 +135,6 @@ class FrameStack:
         return float((total * (mean - level) ** 2).sum() / (total > 0).sum())
 
     @property
-    def hides_object(self) -> bool:
-        """Whether aberrations can turn the object into another, as it is dark nowhere and frames hardly change."""
-        return self.fills_field and self.change.is_scarce
-
-    @property
     def is_still(self) -> bool:
         """Whether several frames change by no more than their noise, so that they show one state of the aberrations.
 

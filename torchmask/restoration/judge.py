@@ -55,7 +55,6 @@ class Judge:
         self.has_twins: bool = not traits.many_minima and setting.still.n_subapertures > 3
         self.one_is_enough: bool = stack.change.is_scarce and stack.change.shown < _ENOUGH
         self.contrast: float = stack.contrast
-        self.hides_object: bool = stack.hides_object and not traits.many_minima  # full pupils show such objects better
         self.is_still: bool = stack.is_still
         self.noise: FrameNoise = stack.noise_of_frames
         self.tolerance: Tolerance = Tolerance(schedule.model_errors, schedule.chance, least)
@@ -80,7 +79,7 @@ class Judge:
             chi_square, pixels, state.calibration.transmission, self.noise, _parameters(objective, state)
         )
         blind = Free.OBJECT in objective.free and Free.ABERRATIONS in objective.free and not self.traits.estimated
-        told = {"at_rest": at_rest, "blind": blind, "hides_object": self.hides_object, "is_still": self.is_still}
+        told = {"at_rest": at_rest, "blind": blind, "is_still": self.is_still}
         return judge(frames, self.contrast, error, self.tolerance, **told)
 
     def compare(self, objective: MyopicObjective, now: Ending, rival: Ending | None) -> Comparison:

@@ -157,17 +157,16 @@ def judge(
     *,
     at_rest: bool,
     blind: bool,
-    hides_object: bool = False,
     is_still: bool = False,
 ) -> Verdict:
     """Return the verdict on frames.
 
     `contrast` is the chi-square per pixel of the mean frame against a uniform one; `at_rest` says whether the search
     ran to its end, and `blind` that neither object nor aberrations were known. Then light is scarce if less than 200^2
-    of the mean frame's chi-square is beyond noise, or if the stack `hides_object`; one that `is_still` tells no more
-    than a single frame, see `FrameStack`. Noise gives a frame the chi-square of its own noise level, whose variance is
-    2 over the degrees of freedom times `unevenness`; what the model lacks adds in proportion to the square of its
-    transmission. Each free parameter takes the noise of one pixel at most, of a bright one where noise is uneven.
+    of the mean frame's chi-square is beyond noise, and a stack that `is_still` tells no more than a single frame, see
+    `FrameStack`. Noise gives a frame the chi-square of its own noise level, whose variance is 2 over the degrees of
+    freedom times `unevenness`; what the model lacks adds in proportion to the square of its transmission. Each free
+    parameter takes the noise of one pixel at most, of a bright one where noise is uneven.
     """
     chi_square, pixels, transmission, level, unevenness = (
         values.double().cpu() for values in (*frames[:3], *frames.noise)
@@ -190,7 +189,7 @@ def judge(
         finding = Finding.ONLY_NOISE
     else:
         finding = Finding.EXPLAINED if found <= limit else Finding.NOT_EXPLAINED
-    scarce = blind and (hides_object or (contrast - 1) * float(pixels.max()) < _TELLING**2)
+    scarce = blind and (contrast - 1) * float(pixels.max()) < _TELLING**2
     check = _what_to_check(finding, len(lost), len(pixels), at_rest=at_rest, scarce=scarce)
     if finding is Finding.EXPLAINED and blind and len(pixels) == 1:
         check = f"against other frames: one alone {_MANY_OBJECTS}"
