@@ -20,14 +20,15 @@ def power_of(mask, shape):
     return TurbulentMSE(grid, PowerLawPSD(1.5, 1e5), NoisePSD(1e5), 20, r0=SEEING.r0).expected_power(mask)
 
 
-def test_a_mask_and_a_grid_that_are_turned_together_show_the_same():
+@pytest.mark.parametrize("shape", [(24, 40), (25, 39)])
+def test_a_mask_and_a_grid_that_are_turned_together_show_the_same(shape):
     """By 90 degrees: the same tables, and sums over the same pixels, whose fits of five terms are rounded otherwise."""
     turned = MASK.replace(centers=MASK.centers.flip(-1) * torch.tensor([-1, 1]))
-    lying, upright = power_of(MASK, (24, 40)), power_of(turned, (40, 24))
+    lying, upright = power_of(MASK, shape), power_of(turned, shape[::-1])
     torch.testing.assert_close(lying, upright.flip(1).roll(1, 1).T, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("shape", [(24, 40), (40, 24)])
+@pytest.mark.parametrize("shape", [(24, 40), (39, 25)])
 def test_masks_on_them_agree_with_the_general_integral(shape):
     """At a few of the frequencies that carry more than 2 % of what a pair of holes gives at most; 3 % are promised."""
     power = power_of(MASK, shape)
