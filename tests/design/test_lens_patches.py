@@ -68,3 +68,21 @@ def test_every_wavelength_of_a_band_keeps_its_own_amplitude():
     torch.testing.assert_close(found[bright], expected[bright], rtol=0.02, atol=0.002)
     squares = sum(one**2 for one in alone).sum(0)
     assert float((expected - squares)[bright].max()) > 0.02
+
+
+def test_patches_beyond_the_plane_are_known_from_the_nearest_pixels_or_the_opposite_ones():
+    """On it they are themselves; a function of the baseline must be even for the opposite to stand for it."""
+    plane = patches_of([1.0], None, None).plane
+    unit = GEOMETRY.period / 64
+    corners = torch.tensor([[3.0, 2.0], [-20.0, -29.0], [90.0, 4.0], [-90.0, -70.0]], dtype=torch.float64)
+    found = plane.baselines[plane.nearest(corners, 4, 5)] / unit
+    x, y = torch.meshgrid(torch.arange(5).double(), torch.arange(4).double(), indexing="xy")
+    pixels = corners[:, None, None] + torch.stack([x, y], -1)
+    torch.testing.assert_close(found[0], pixels[0])
+    torch.testing.assert_close(found[1], -pixels[1])
+    (_, bottom), (right, top) = ((edge / unit).tolist() for edge in (plane.baselines.amin(0), plane.baselines.amax(0)))
+    assert 32 < right < 90
+    assert -29 < bottom < 0
+    expected = torch.stack([torch.full((4, 5), right).double(), pixels[2, ..., 1]], -1)
+    torch.testing.assert_close(found[2], expected)
+    assert (found[3] == torch.tensor([right, top])).all()
