@@ -60,3 +60,26 @@ def test_what_a_lens_keeps_is_decided_by_its_true_baseline(turns, wavelengths):
     aliases = [pixels.flip(-1) / 32 + number * turns.round() for number in (-1, 0, 1)]
     exact = torch.stack([mean_square_otf(mask, grid, nu, seeing, criterion.band) for nu in aliases]).sum(0)
     torch.testing.assert_close(found, exact, rtol=0.03, atol=0)
+
+
+@pytest.mark.parametrize(("longest", "columns"), [(1.01, (0, 1)), (1.3, (9, 10))])
+def test_redundant_baselines_that_alias_share_what_they_do_where_they_are(longest, columns):
+    """Two pairs of holes of half r0 with nearly one baseline, whose lenses lie side by side: what they share was 50 to
+    80 % too bright where they alias onto zero frequency, and 30 % at 0.3 of a period. 3 % are promised."""
+    grid, seeing = Grid.nyquist(1.0, 550e-9, 32), Seeing(0.5, 20.0)
+    end = longest / 2 * grid.period
+    mask = SparseAperture([[-end, 0.0], [end, 0.0], [-end, 0.3], [end, 0.32]], seeing.r0 / 2, 3 * grid.period)
+    criterion = TurbulentMSE(grid, PowerLawPSD(1.5, 1e5), NoisePSD(1e5), 20, r0=seeing.r0, outer_scale=20.0)
+    pixels = torch.tensor([[row, column] for row in (0, 1) for column in columns])
+    found = criterion.expected_power(mask)[pixels[:, 0], pixels[:, 1]]
+    aliases = [pixels.flip(-1).double() / 32 + torch.tensor([turns, 0.0]) for turns in (-1, 0, 1)]
+    exact = torch.stack([mean_square_otf(mask, grid, nu, seeing) for nu in aliases]).sum(0)
+    assert (exact > 0.02 / 4**2).all()
+    torch.testing.assert_close(found, exact, rtol=0.03, atol=0)
+
+
+def test_gradients_of_redundant_baselines_that_alias():
+    grid = Grid.nyquist(1.0, 550e-9, 24)
+    criterion = TurbulentMSE(grid, PowerLawPSD(1.5, 1e5), NoisePSD(1e5), 20, r0=0.5, outer_scale=20.0)
+    centers = torch.tensor([[-1.01, 0.013], [1.013, 0.0], [-1.017, 0.31], [1.0, 0.327]]).double().requires_grad_()
+    torch.autograd.gradcheck(lambda x: criterion.relative(SparseAperture(x, 0.25, 3.0)), centers, eps=1e-6, atol=1e-6)

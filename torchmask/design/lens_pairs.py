@@ -79,11 +79,25 @@ class LensPairs:
         pixels = CommonPixels.of(lenses, self.plane, *pairs[:4])
         if len(pixels.pair) == 0:
             return centers.new_zeros(len(centers), self.plane.n_pixels)
-        start = (pixels.corner + lenses.turns.flatten(0, 1)[pairs.first]) * self.pixel - middle
-        start, unit = start / step, self.pixel / step
-        lines = _lines(logarithm, start, unit, pixels)
-        found = SharedLight.apply(lenses.values.flatten(1), lines, pixels, n_pixels)
-        return found.view(len(centers), -1)  # type: ignore[no-any-return]
+        turns = lenses.turns.flatten(0, 1)[pairs.first]
+        start, unit = ((pixels.corner + turns) * self.pixel - middle) / step, self.pixel / step
+        aliased, values = turns.any(-1), lenses.values.flatten(1)
+        if not aliased.any():
+            lines = _lines(logarithm, start, unit, pixels)
+            return SharedLight.apply(values, lines, pixels, n_pixels).view(len(centers), -1)  # type: ignore[no-any-return]
+        # `far` belongs to true baselines: lenses that alias have planes of their own, and their coherence itself
+        far = self._far_at_nodes(middle, step).log2()
+        lines = _lines(logarithm + torch.where(aliased[:, None, None], far, 0.0), start, unit, pixels)
+        pixels = pixels._replace(target=pixels.target + n_pixels * aliased[pixels.pair])
+        found, others = SharedLight.apply(values, lines, pixels, 2 * n_pixels).view(2, len(centers), -1)
+        far = self.coherence.far(*self.plane.baselines.to(found).unbind(-1))
+        return found + others / far  # type: ignore[no-any-return]
+
+    def _far_at_nodes(self, middle: Tensor, step: Tensor) -> Tensor:
+        """Return `far` (S, y, x) at the nodes of parabolas around `middle` (S, 2), `step` (S, 2) apart, all in m."""
+        node = torch.arange(-1, 2, device=middle.device)
+        x, y = (middle[:, None] + node[:, None] * step[:, None]).unbind(-1)
+        return self.coherence.far(x[:, None], y[:, :, None])
 
     def _select(self, lenses: Lenses, centers: Tensor) -> tuple[Entries, Tensor]:
         """Return the pairs that share something, and about the most that each gives anywhere."""
