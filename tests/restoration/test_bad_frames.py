@@ -122,7 +122,7 @@ def test_one_frame_of_odd_sides(shape):
 
 def test_an_object_wider_than_the_field_is_noticed(seen):
     wide = observe(Grid.nyquist(1.0, 550e-9, 80), panel=(60, 60))
-    with pytest.warns(UserWarning, match="does the object extend beyond the field"):
+    with pytest.warns(UserWarning, match="of an object that extends beyond the field"):
         result = method(max_iterations=5).restore(wide.frames[:, 20:60, 10:50])
     assert bool(torch.isfinite(result.object).all())
     with warnings.catch_warnings():
