@@ -9,7 +9,7 @@ from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.parallel import each_on_a_core
 
 
-@pytest.mark.filterwarnings("ignore:the frames are bright")
+@pytest.mark.filterwarnings("ignore:much of the light is even")
 def test_restoration_is_the_same_on_any_number_of_cores():
     torch.manual_seed(0)
     frames = torch.poisson(1e3 * torch.ones(6, 32, 32)).double()
