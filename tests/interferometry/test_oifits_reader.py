@@ -23,16 +23,25 @@ GRID = Grid.nyquist(MASK.extent, 550e-9, 48, 1.1)
 
 
 @pytest.fixture
-def observables(expose_points):
+def observation(expose_points):
     frames = torch.poisson(expose_points(MASK, GRID, electrons=1e5, n_frames=8), torch.Generator().manual_seed(0))
-    observation = Observation(frames, MASK, GRID, 0.0)
-    return frame_observables(observation), observation
+    return Observation(frames, MASK, GRID, 0.0)
 
 
-def test_what_was_written_is_read_back(tmp_path, observables):
-    seen, observation = observables
+@pytest.fixture
+def seen(observation):
+    return frame_observables(observation)
+
+
+@pytest.fixture
+def path(tmp_path, seen, observation):
+    """A file of what was seen."""
     save_oifits(tmp_path / "a.fits", seen, observation, bandwidth=1e-8)
-    read, expected = load_oifits(tmp_path / "a.fits"), seen.measurements(GRID.wavelength)
+    return tmp_path / "a.fits"
+
+
+def test_what_was_written_is_read_back(path, seen):
+    read, expected = load_oifits(path), seen.measurements(GRID.wavelength)
     for field in dataclasses.fields(expected):
         # EFF_WAVE has single precision in the standard
         tolerance = 1e-7 if "wavelength" in field.name else 1e-12
@@ -40,10 +49,8 @@ def test_what_was_written_is_read_back(tmp_path, observables):
         torch.testing.assert_close(*values, rtol=tolerance, atol=1e-12, msg=field.name)
 
 
-def test_the_package_reads_the_same_correlations(tmp_path, observables):
-    seen, observation = observables
-    save_oifits(tmp_path / "a.fits", seen, observation, bandwidth=1e-8)
-    with fits.open(tmp_path / "a.fits") as hdus:
+def test_the_package_reads_the_same_correlations(path, seen):
+    with fits.open(path) as hdus:
         assert hdus["OI_CORR"].header["NDATA"] == 6 + 4 + 4
         data = package.open(hdus, quiet=True)
     assert data.isvalid()
@@ -150,10 +157,8 @@ def test_a_file_of_a_spectrograph_on_telescopes(revision, tmp_path, recwarn):
     assert int((torch.linalg.eigvalsh(expected) > 1e-9).sum()) == 3
 
 
-def test_values_without_a_positive_error_are_left_out(tmp_path, observables):
-    seen, observation = observables
-    save_oifits(tmp_path / "a.fits", seen, observation, bandwidth=1e-8)
-    with fits.open(tmp_path / "a.fits") as hdus:
+def test_values_without_a_positive_error_are_left_out(tmp_path, path, seen):
+    with fits.open(path) as hdus:
         hdus["OI_VIS2"].data["VIS2ERR"][:2] = [[0.0], [-0.01]]
         hdus["OI_T3"].data["T3PHIERR"][1] = 0.0
         hdus.writeto(tmp_path / "b.fits")
@@ -162,11 +167,9 @@ def test_values_without_a_positive_error_are_left_out(tmp_path, observables):
     torch.testing.assert_close(read.closure_phases, seen.closure_phases[[0, 2, 3]], rtol=1e-12, atol=1e-15)
 
 
-def test_closure_phases_of_two_tables_are_independent_even_at_one_time(tmp_path, observables):
+def test_closure_phases_of_two_tables_are_independent_even_at_one_time(tmp_path, path):
     """As of two instruments in one night: only triangles of one table share the noise of a baseline."""
-    seen, observation = observables
-    save_oifits(tmp_path / "a.fits", seen, observation, bandwidth=1e-8)
-    with fits.open(tmp_path / "a.fits") as hdus:
+    with fits.open(path) as hdus:
         kept = [hdu.copy() for hdu in hdus if hdu.name != "OI_CORR"]
         fits.HDUList([*kept, hdus["OI_T3"].copy()]).writeto(tmp_path / "b.fits")
     correlation = load_oifits(tmp_path / "b.fits").closure_correlation
@@ -174,7 +177,7 @@ def test_closure_phases_of_two_tables_are_independent_even_at_one_time(tmp_path,
     torch.testing.assert_close(correlation, torch.block_diag(one, one))
 
 
-def test_what_is_no_oifits_is_refused(tmp_path, observables):
+def test_what_is_no_oifits_is_refused(tmp_path, path):
     with pytest.raises(ValueError, match=r"there is no file .*none\.fits"):
         load_oifits(tmp_path / "none.fits")
     (tmp_path / "text.fits").write_text("no FITS at all")
@@ -185,9 +188,7 @@ def test_what_is_no_oifits_is_refused(tmp_path, observables):
         ValueError, match=r"image\.fits has no squared visibility and no closure phase .*: give an OIFITS"
     ):
         load_oifits(tmp_path / "image.fits")
-    seen, observation = observables
-    save_oifits(tmp_path / "a.fits", seen, observation, bandwidth=1e-8)
-    with fits.open(tmp_path / "a.fits") as hdus:
+    with fits.open(path) as hdus:
         kept = [hdu.copy() for hdu in hdus if hdu.name != "OI_WAVELENGTH"]
         fits.HDUList(kept).writeto(tmp_path / "b.fits")
         hdus["OI_VIS2"].data["FLAG"] = True
@@ -199,11 +200,9 @@ def test_what_is_no_oifits_is_refused(tmp_path, observables):
         load_oifits(tmp_path / "c.fits")
 
 
-def test_an_empty_table_and_places_that_are_not_finite_are_left_out(tmp_path, observables):
+def test_an_empty_table_and_places_that_are_not_finite_are_left_out(tmp_path, path, seen):
     """Two holes have no triangle, and some programs write a table of none."""
-    seen, observation = observables
-    save_oifits(tmp_path / "a.fits", seen, observation, bandwidth=1e-8)
-    with fits.open(tmp_path / "a.fits") as hdus:
+    with fits.open(path) as hdus:
         hdus["OI_VIS2"].data["VCOORD"][2] = np.nan
         empty = fits.BinTableHDU(hdus["OI_T3"].data[:0], hdus["OI_T3"].header)
         kept = [hdu.copy() for hdu in hdus if hdu.name not in ("OI_T3", "OI_CORR")]
@@ -220,10 +219,8 @@ def test_an_empty_table_and_places_that_are_not_finite_are_left_out(tmp_path, ob
         ("OI_T3", "U2COORD", 1 / 550e-9, r"b\.fits: U2COORD reaches .*: it must be in m, not divided by"),
     ],
 )
-def test_other_units_are_refused(table, column, factor, message, tmp_path, observables):
-    seen, observation = observables
-    save_oifits(tmp_path / "a.fits", seen, observation, bandwidth=1e-8)
-    with fits.open(tmp_path / "a.fits") as hdus:
+def test_other_units_are_refused(table, column, factor, message, tmp_path, path):
+    with fits.open(path) as hdus:
         hdus[table].data[column] *= factor
         hdus.writeto(tmp_path / "b.fits")
     with pytest.raises(ValueError, match=message):
@@ -231,25 +228,21 @@ def test_other_units_are_refused(table, column, factor, message, tmp_path, obser
 
 
 @pytest.mark.parametrize("column", ["T3PHI", "T3PHIERR"])
-def test_phases_in_radians_are_refused(column, tmp_path, observables):
-    seen, observation = observables
-    save_oifits(tmp_path / "a.fits", seen, observation, bandwidth=1e-8)
-    with fits.open(tmp_path / "a.fits") as hdus:
+def test_phases_in_radians_are_refused(column, tmp_path, path):
+    with fits.open(path) as hdus:
         hdus["OI_T3"].columns[column].unit = "rad"
         hdus.writeto(tmp_path / "b.fits")
     with pytest.raises(ValueError, match=rf"b\.fits: {column} is in rad by its TUNIT: OIFITS phases must be in deg"):
         load_oifits(tmp_path / "b.fits")
 
 
-def test_files_with_a_part_missing_are_refused(tmp_path, observables):
-    seen, observation = observables
-    save_oifits(tmp_path / "a.fits", seen, observation, bandwidth=1e-8)
-    with fits.open(tmp_path / "a.fits") as hdus:
+def test_files_with_a_part_missing_are_refused(tmp_path, path):
+    with fits.open(path) as hdus:
         of_t3, waves = hdus.fileinfo("OI_T3")["hdrLoc"], hdus["OI_WAVELENGTH"]
         twice = fits.BinTableHDU(np.concatenate([waves.data, waves.data]), waves.header)
         others = [hdu.copy() for hdu in hdus if hdu.name != "OI_WAVELENGTH"]
         fits.HDUList([*others, twice]).writeto(tmp_path / "b.fits")
-    (tmp_path / "c.fits").write_bytes((tmp_path / "a.fits").read_bytes()[: of_t3 - 100])
+    (tmp_path / "c.fits").write_bytes((path).read_bytes()[: of_t3 - 100])
     with pytest.raises(ValueError, match=r"b\.fits: OI_VIS2 has 6 values of VIS2DATA in 6 rows, and .* 2 wavelengths"):
         load_oifits(tmp_path / "b.fits")
     with pytest.raises(ValueError, match=r"c\.fits is not an OIFITS file, or is damaged: File may have been truncated"):

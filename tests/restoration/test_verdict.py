@@ -36,8 +36,7 @@ def verdict_on(
         "noise": FrameNoise(torch.ones(n_frames), torch.ones(n_frames)),
         "parameters": 100.0,
     }
-    seen = {"at_rest": at_rest, "blind": blind, "is_still": still}
-    return judge(FrameFits(**(told | fits)), contrast, error, tolerance, **seen)
+    return judge(FrameFits(**(told | fits)), contrast, error, tolerance, at_rest=at_rest, blind=blind, is_still=still)
 
 
 def test_chi_square_is_over_its_degrees_of_freedom():

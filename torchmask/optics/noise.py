@@ -13,7 +13,7 @@ from torchmask.optics.conjugate import conjugate_gradients
 from torchmask.optics.fading import beyond_faded, fading
 
 _ITERATIONS = 30  # conjugate-gradient iterations that find values for dead pixels
-_FEWEST = 8  # frequencies beyond the cut-off that tell noise
+FEWEST = 8  # frequencies beyond the cut-off that tell noise
 _SURE = 5.0  # standard errors that do not occur by chance
 
 
@@ -30,12 +30,12 @@ def noise_variance(frames: Tensor, grid: Grid, aperture: Aperture, valid: Tensor
     """
     nu_y, nu_x = grid.frequencies(frames.dtype, frames.device)
     beyond = torch.hypot(nu_y, nu_x) > grid.cutoff(aperture.extent)
-    if int(beyond.sum()) < _FEWEST:
+    if int(beyond.sum()) < FEWEST:
         return None
     variance = _variance(frames, valid, beyond, torch.ones_like(frames[0]))
     beyond = beyond_faded(grid, aperture, frames)
     n_telling = int(beyond.sum())
-    if n_telling < _FEWEST:
+    if n_telling < FEWEST:
         return variance
     inner = _variance_of_faded(frames, valid, beyond)
     # the standard error of a median of squares, half of which are alike, is at most 2 over the root of their number

@@ -18,7 +18,7 @@ from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.bad_pixels import fill_bad_pixels
 from torchmask.optics.fading import beyond_faded, fading
-from torchmask.optics.noise import fill_with_least_power
+from torchmask.optics.noise import FEWEST, fill_with_least_power
 
 _CHANCE = 0.001  # of finding one in frames without any
 _ROUNDS = 30  # in each, spikes that stand beside brighter ones come to light
@@ -66,7 +66,7 @@ def find_spikes(frames: Tensor, valid: Tensor, grid: Grid, aperture: Aperture) -
     """
     found = torch.zeros_like(valid)
     beyond = beyond_faded(grid, aperture, frames)
-    if int(beyond.sum()) < 8:
+    if int(beyond.sum()) < FEWEST:
         return found
     share = float(beyond.double().mean())
     window = fading(frames)  # so that what is cut off at the border makes no spike

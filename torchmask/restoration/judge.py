@@ -79,8 +79,7 @@ class Judge:
             chi_square, pixels, state.calibration.transmission, self.noise, _parameters(objective, state)
         )
         blind = Free.OBJECT in objective.free and Free.ABERRATIONS in objective.free and not self.traits.estimated
-        told = {"at_rest": at_rest, "blind": blind, "is_still": self.is_still}
-        return judge(frames, self.contrast, error, self.tolerance, **told)
+        return judge(frames, self.contrast, error, self.tolerance, at_rest=at_rest, blind=blind, is_still=self.is_still)
 
     def compare(self, objective: MyopicObjective, now: Ending, rival: Ending | None) -> Comparison:
         """Compare the present ending with the best of the earlier ones, if there is one.

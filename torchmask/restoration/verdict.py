@@ -157,7 +157,7 @@ def judge(
     *,
     at_rest: bool,
     blind: bool,
-    is_still: bool = False,
+    is_still: bool,
 ) -> Verdict:
     """Return the verdict on frames.
 
