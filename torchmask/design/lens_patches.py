@@ -155,8 +155,10 @@ class LensPatches:
             return Patch(values, values, index, corner, offset)
         x = ((offset[..., :1] + colour.plan.column) * colour.pixel[0])[..., None, :]
         y = ((offset[..., 1:] + torch.arange(shape[0], device=offset.device)) * colour.pixel[1])[..., :, None]
-        # turbulence acts over the whole baseline, not over what is left of it on the torus
-        pixels, root = self.plane.nearest(corner + turns, *shape).flatten(), values.clamp(min=_NOTHING).sqrt()
+        pixels, root = index, values.clamp(min=_NOTHING).sqrt()
+        if turns.any():  # turbulence acts over the whole baseline, not over what is left of it on the torus
+            pixels = self.plane.nearest(corner + turns, *shape)
+        pixels = pixels.flatten()
         amplitude = lens_sum((part.index_select(0, pixels).view_as(root) for part in colour.factors), root, x, y)
         return Patch(values, values * amplitude, index, corner, offset)
 
