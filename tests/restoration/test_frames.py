@@ -202,6 +202,18 @@ def test_frames_are_still_if_they_change_by_their_noise_alone(seeded):
             assert stack.is_still is expected
 
 
+@pytest.mark.parametrize(("deviations", "still"), [(4.99, True), (5.01, False), (-4.99, True), (-5.01, False)])
+def test_frames_are_still_within_five_standard_deviations_of_what_noise_changes(deviations, still):
+    """Two frames change by half of the noise variance a pixel, over as many degrees of freedom as there are pixels."""
+    wave = torch.ones(GRID.shape, dtype=torch.float64)
+    wave[:, ::2] = -1.0  # so that frames keep their light
+    change = 0.5 * (1 + deviations * math.sqrt(2 / wave.numel()))  # of a pixel against the mean frame
+    frames = 1 + math.sqrt(change / 100) * torch.stack([wave, -wave])
+    stack = FrameStack(frames, torch.ones_like(frames, dtype=torch.bool), 10.0, 1.0)
+    assert stack.change.each == pytest.approx(change, rel=1e-12)
+    assert stack.is_still is still
+
+
 def test_contrast_is_the_chi_square_of_the_weighted_mean_frame_against_an_even_one():
     """Each pixel of the mean has the inverse variance of all its valid frames; pixels without any do not count."""
     generator = torch.Generator().manual_seed(2)
