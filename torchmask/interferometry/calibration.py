@@ -246,7 +246,7 @@ def _first_fit(
         rows.append(fit_frame(model, frame, weight, own, shared, kernels))
         if callback is not None:
             callback(Record("calibration", len(rows), len(data), {}, preparatory=True))
-    return evaluate(model, torch.stack(rows), shared)
+    return evaluate(model, torch.stack(rows), shared, kernels)
 
 
 def _variance(data: Tensor, counted: Tensor, fit: StarFit, readout_noise: float) -> Tensor:

@@ -112,15 +112,17 @@ def fit_frame(
 
 def fit_together(model: StarModel, frames: Tensor, weights: Tensor, fit: StarFit) -> tuple[StarFit, Information]:
     """Fit all parameters jointly to `frames` (T, pixels) with `weights` (T, pixels)."""
-    cost = _cost(model, frames, weights, fit)
+    cost, kernels = _cost(model, frames, weights, fit), model.kernels(fit.shared.matrix)
     for _ in range(_STEPS):
-        step, steps, promised, information = _step(model, frames, weights, fit)
+        step, steps, promised, information = _step(model, frames, weights, fit, kernels)
         for halving in range(_HALVINGS):
             scale = 0.5**halving
-            moved = evaluate(model, fit.own + scale * steps, fit.shared.moved(scale * step))
+            shared = fit.shared.moved(scale * step)
+            there = model.kernels(shared.matrix)
+            moved = evaluate(model, fit.own + scale * steps, shared, there)
             new = _cost(model, frames, weights, moved)
             if new < cost:
-                fit, cost = moved, new
+                fit, cost, kernels = moved, new, there
                 break
         else:
             break
@@ -129,9 +131,8 @@ def fit_together(model: StarModel, frames: Tensor, weights: Tensor, fit: StarFit
     return fit, information
 
 
-def evaluate(model: StarModel, own: Tensor, shared: Shared) -> StarFit:
-    """Return the fit with these parameters and their images."""
-    kernels = model.kernels(shared.matrix)
+def evaluate(model: StarModel, own: Tensor, shared: Shared, kernels: tuple[Tensor, Tensor]) -> StarFit:
+    """Return the fit with these parameters and their images; the kernels are those of the shared matrix."""
     return StarFit(own, shared, torch.stack([model.image(row, shared, kernels) for row in own]))
 
 
@@ -140,12 +141,14 @@ def _cost(model: StarModel, frames: Tensor, weights: Tensor, fit: StarFit) -> fl
     return float((weights * (frames - fit.images) ** 2).sum() + held)
 
 
-def _step(model: StarModel, frames: Tensor, weights: Tensor, fit: StarFit) -> tuple[Tensor, Tensor, float, Information]:
+def _step(
+    model: StarModel, frames: Tensor, weights: Tensor, fit: StarFit, kernels: tuple[Tensor, Tensor]
+) -> tuple[Tensor, Tensor, float, Information]:
     """Return steps of shared (S,) and own (T, K) parameters, the predicted decrease of the cost, and the information.
 
     The own parameters of a frame are eliminated from its normal equations (Schur complement).
     """
-    hold, kernels = prior_weights(model), model.kernels(fit.shared.matrix)
+    hold = prior_weights(model)
     matrices, scores, back, ahead, known, promised = [], [], [], [], [], 0.0
     for frame, weight, own in zip(frames, weights, fit.own, strict=True):
         image, by_own, by_shared = model.linearise(own, fit.shared, kernels)
