@@ -28,6 +28,7 @@ from torchmask.optics.pupil import Aperture
 _HOST = {"dtype": torch.float64, "device": "cpu"}  # whatever the default device
 _PER_R0 = 6  # samples per r0
 _PER_HOLE = 24  # samples across the finest part of a hole at least; a small r0 may need more
+_AROUND = 4  # cells beyond the circle about a hole, where even those on the edges' straight continuations are closed
 _NOTHING = 1e-12  # of a density, below which it is a rounding error of its Fourier transform
 _COARSE = 4  # lattice points to a side of a patch far from zero and from the baseline, where Q hardly changes
 _FAR = 6.0  # in r0, how far that is: a patch is then a ninth as wide as its distance
@@ -151,8 +152,8 @@ class OverlapRaster:
         step = min(seeing.r0 * shortest / _PER_R0, diameter * aperture.shape.fineness / _PER_HOLE)
         reach = float(self.centers.norm(dim=-1).max()) + aperture.outer_diameter / 2
         size = math.ceil(2 * reach / step) + 2
-        axis = (torch.arange(size, **_HOST) - (size - 1) / 2) * step
-        self.points: Tensor = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), -1)  # (size, size, 2)
+        self.axis: Tensor = (torch.arange(size, **_HOST) - (size - 1) / 2) * step
+        self.points: Tensor = torch.stack(torch.meshgrid(self.axis, self.axis, indexing="xy"), -1)  # (size, size, 2)
         self.cell: Tensor = torch.tensor([step, step], **_HOST)
         padded = 2 * _COARSE * math.ceil(size / _COARSE)  # whole patches on both sides of zero
         self.padded: tuple[int, int] = (padded, padded)
@@ -167,8 +168,12 @@ class OverlapRaster:
         """Return the open fraction of each cell of the pupil shifted by -shift (2,)."""
         diameter = self.aperture.subaperture_diameter
         total = torch.zeros(self.points.shape[:-1], **_HOST)
-        for center in self.centers:
-            total += self.aperture.shape.coverage(self.points + shift - center, self.cell, diameter)
+        reach = self.aperture.outer_diameter / 2 + _AROUND * self.cell
+        for center in self.centers:  # cells that are further away are closed
+            ends = torch.stack([center - shift - reach, center - shift + reach], -1)
+            (left, right), (low, high) = torch.searchsorted(self.axis, ends).tolist()
+            some = self.points[low:high, left:right] + shift - center
+            total[low:high, left:right] += self.aperture.shape.coverage(some, self.cell, diameter)
         return total
 
     def samples(self, baseline: Tensor) -> tuple[float, Tensor]:
