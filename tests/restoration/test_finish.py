@@ -41,6 +41,7 @@ GRID = Grid.nyquist(1.0, 550e-9, 32, oversampling=1.2)
 FULL_PUPIL = Traits(True, False, True, False, R0, OUTER_SCALE, 1000, 0.0, 0, Refinement.OFF)
 CHANGE = Change(100.0, 10, 4096)
 TRAITS = Traits(False, False, True, False, R0, OUTER_SCALE, 1000, 0.0, 0, Refinement.OFF)
+BRIEF = {"last_settling": 5, "comparing": 3}  # where it does not matter how well an object is settled
 
 
 def basis_of(mask, n_modes, n_common=0, exposure=0.0, r0=R0):
@@ -152,7 +153,7 @@ def test_the_last_descent_ends_when_half_a_segment_gains_little(traits, end, exp
         return Minimum(start, 1.0, 4, 4, False, "says so")
 
     own, other = ("last_gain_full", "last_gain") if traits.many_minima else ("last_gain", "last_gain_full")
-    setting, schedule = Setting.of(objective), Schedule(**{own: 0.01, other: 0.3})
+    setting, schedule = Setting.of(objective), Schedule(**{own: 0.01, other: 0.3}, **BRIEF)
     _, progress = ended(objective, state, setting, schedule, minimizer=says, traits=traits, end=end)
     assert gains == [0.5]
     assert progress.n_evaluations == 3 * 4
@@ -180,7 +181,7 @@ def test_how_a_restoration_ends_depends_on_how_much_its_frames_change(change, en
 )
 def test_aberrations_are_integrated_out_after_the_last_descent_or_in_its_place(explained, end, stages):
     objective, state = explained
-    schedule, records = Schedule(segment=4, last_segments=1, rounds=5, fine_rounds=3, moves=2), []
+    schedule, records = Schedule(segment=4, last_segments=1, rounds=5, fine_rounds=3, moves=2, **BRIEF), []
     found, progress = ended(objective, state, Setting.of(objective), schedule, records, end=end)
     assert [record.stage for record in records] == stages
     assert progress.integrated is (end is not End.LAST_DESCENT)
@@ -332,7 +333,7 @@ def test_a_prior_is_adapted_to_an_object_that_is_settled_under_itself(explained,
 def test_priors_of_faint_frames_are_not_adapted(each, adapts, explained):
     """They show too little of the object, even where the aberrations are known."""
     objective, state = explained
-    schedule = Schedule(segment=2, last_segments=1, lost=math.inf)
+    schedule = Schedule(segment=2, last_segments=1, lost=math.inf, **BRIEF)
     assert schedule.faint == 5.0
     found, _ = ended(objective, state, Setting.of(objective), schedule, change=Change(each, 10, 4096))
     assert isinstance(found.prior, AdaptedVariation) is adapts
@@ -490,7 +491,8 @@ def test_gentle_slopes_are_held_in_an_integration(squares, expected, end, explai
 def test_a_result_holds_the_modes_of_the_search(observe, five_holes):
     """By default, and it can be continued."""
     seen = observe(n_frames=2, shape=(32, 32))
-    schedule = Schedule(start_iterations=20, segment=10, last_segments=1, last_modes=8, chance=math.inf, faint=0.0)
+    options = {"start_iterations": 20, "segment": 10, "last_segments": 1, "last_modes": 8, "chance": math.inf}
+    schedule = Schedule(**options, **BRIEF, faint=0.0)
     method = MyopicDeconvolution(five_holes, seen.grid, readout_noise=1.5, schedule=schedule)
     stages = []
     result = method.restore(seen.frames, callback=lambda record: stages.append(record.stage))
@@ -543,7 +545,7 @@ def test_one_frame_of_known_aberrations_keeps_the_weight_as_given(explain, monke
 
 def test_an_interrupted_descent_of_known_aberrations_goes_on(observe, five_holes, tmp_path):
     seen = observe(n_frames=4, shape=(32, 32))
-    schedule = Schedule(segment=5, last_segments=3, last_gain=0.0)
+    schedule = Schedule(start_iterations=10, segment=5, last_segments=3, last_gain=0.0, **BRIEF)
     method = MyopicDeconvolution(five_holes, seen.grid, 3, readout_noise=1.5, schedule=schedule)
     told = {"coefficients": torch.zeros(4, 5, 3, dtype=torch.float64)}
     whole = method.restore(seen.frames, **told)
@@ -598,7 +600,7 @@ def test_an_interrupted_last_descent_goes_on(observe, five_holes, tmp_path):
     """After its first segment; what has ended is not done again."""
     seen = observe(n_frames=2, shape=(32, 32))
     options = {"start_iterations": 20, "segment": 10, "last_modes": 8, "chance": math.inf, "faint": 0.0}
-    schedule = Schedule(**options, last_segments=3, last_gain=0.0)
+    schedule = Schedule(**options, **BRIEF, last_segments=3, last_gain=0.0)
     method = MyopicDeconvolution(five_holes, seen.grid, readout_noise=1.5, schedule=schedule)
     whole = method.restore(seen.frames)
     interrupt_last_descent(method, seen.frames, path := tmp_path / "state.npz", 15)
@@ -655,7 +657,7 @@ def test_lost_frames_are_looked_for_between_segments(change, calls, observe, fiv
         "last_gain_full": 1.0,
         "last_modes_full": 15,
     }
-    options |= {"averaged": 1, "candidates": ()}
+    options |= {"averaged": 1, "candidates": (), **BRIEF}
     given = {"wavelengths": change["wavelengths"]} if "wavelengths" in change else {}
     method = MyopicDeconvolution(
         seen.aperture, seen.grid, readout_noise=1.5, schedule=Schedule(**options), tolerance=0.0, **given
@@ -688,7 +690,8 @@ def test_what_a_sensor_has_measured_is_not_retrieved(traits, calls, explained, m
         finish, "retrieve_lost_frames", lambda objective, state, *given: seen.append(state) or (state, 0)
     )
     objective, state = explained
-    ended(objective, state, Setting.of(objective), Schedule(segment=2, last_segments=2, last_gain=0.0), traits=traits)
+    schedule = Schedule(segment=2, last_segments=2, last_gain=0.0, **BRIEF)
+    ended(objective, state, Setting.of(objective), schedule, traits=traits)
     assert len(seen) == calls
 
 
@@ -696,7 +699,8 @@ def test_a_search_that_is_cut_short_has_an_end_once_a_start_was_whole(observe, f
     """And leaves a file from which the search goes on if it may have more iterations."""
     seen = observe(n_frames=2, shape=(32, 32))
     missed = {"chance": -1e9, "starts": 3, "faint": 0.0, "glance": 10**6, "escapes": 0}
-    schedule = Schedule(start_iterations=20, segment=10, sharp_after=15, last_segments=1, last_modes=8, **missed)
+    brief = {"start_iterations": 20, "segment": 10, "sharp_after": 15, "last_segments": 1, "last_modes": 8} | BRIEF
+    schedule = Schedule(**brief, **missed)
 
     def restore(max_iterations, checkpoint=None):
         stages = []
@@ -727,6 +731,7 @@ def test_a_search_need_not_come_to_rest_if_a_last_descent_follows(observe, five_
     """If it explains the frames; without a last descent, or with the limit at 0, it goes on."""
     seen = observe(n_frames=2, shape=(32, 32))
     options = {"start_iterations": 40, "segment": 10, "sharp_after": 10, "escapes": 0, "last_modes": 8, "faint": 0.0}
+    options |= BRIEF
 
     def iterations(**changes):
         schedule = Schedule(**options, **changes, chance=math.inf)
@@ -786,7 +791,7 @@ def test_a_full_pupil_has_as_many_modes_in_its_last_descent_as_the_schedule_says
 def test_frames_of_a_full_pupil_that_fit_badly_count_less(traits, power, explained, monkeypatch):
     """More so than those of a mask, unless the aberrations are known; then they do as the prior is chosen too."""
     objective, state = explained
-    given, schedule = [], Schedule(segment=2, last_segments=1)
+    given, schedule = [], Schedule(segment=2, last_segments=1, **BRIEF)
     monkeypatch.setattr(finish, "recalibrate", lambda objective, state, power, **more: given.append(power) or state)
     ended(objective, state, Setting.of(objective), schedule, traits=traits)
     assert given == [power]
@@ -807,7 +812,7 @@ def test_a_last_descent_that_loses_frames_of_a_full_pupil_is_not_kept(traits, en
         """A minimiser that brings object and aberrations to zero."""
         return Minimum(torch.zeros_like(start), 1.0, 1, 1, False, "says so")
 
-    schedule = Schedule(segment=2, last_segments=1)
+    schedule = Schedule(segment=2, last_segments=1, **BRIEF)
     found, progress = ended(objective, state, Setting.of(objective), schedule, minimizer=loses, traits=traits, end=end)
     assert (progress.state is state) is not kept
     assert (found is objective) is not kept
@@ -854,7 +859,7 @@ def test_an_interrupted_last_descent_of_a_full_pupil_goes_on(retrievals, said, o
     options = {"candidates": ((2, 4),), "segment": 4, "sharp_after": 4, "escapes": 0, "start_iterations": 8}
     options |= {"chance": 1e9, "last_segments": 3, "last_gain_full": 0.0, "reflections_full": 2, "retrieved_from": 0.0}
     options |= {"retrievals": retrievals, "retrieved_gain": math.inf, "retrieved_iterations": 4}
-    schedule = Schedule(**options, last_modes_full=15)
+    schedule = Schedule(**options, **BRIEF, last_modes_full=15)
     method = MyopicDeconvolution(FullAperture(1.0), seen.grid, readout_noise=1.5, tolerance=0, schedule=schedule)
     whole = method.restore(seen.frames)
     assert said in whole.message
