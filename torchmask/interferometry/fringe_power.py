@@ -21,6 +21,7 @@ from torchmask.optics.phasor import phasor
 
 _AT_A_TIME = 32  # frames
 _RING = 2  # width of a ring of spatial frequencies, in units of their spacing
+_SECTORS = 6  # of half a ring; the power of real frames repeats itself in the other half
 _FLOOR = 0.03  # of the mean power of a ring: light between the fringes that the pattern lacks, as of a cut-out's border
 _LEAST = 8  # frequencies needed to tell anything
 # Errors of shares hold for light at all frequencies, and until light in few rings has made the variance of a share this
@@ -49,7 +50,7 @@ class FringePower:
     noise : power of the noise
     grid : grid of the frames
     chosen : (H, W) bool, the F frequencies, in FFT order
-    rings : (F,) number of the ring of similar frequencies to which each belongs
+    rings : (F,) number of the ring of similar frequencies, or of the sector of a ring, to which each belongs
     wavelengths : of the light [m], with equal shares of it; none: that of the grid
     """
 
@@ -105,6 +106,14 @@ class FringePower:
             return Match(0.0, math.inf)
         error = math.sqrt(float(measured @ measured) / contrast / (n * (n - 1)))
         return Match(float(measured @ expected) / contrast, error)
+
+    def in_sectors(self) -> FringePower:
+        """Return the same power, compared within sectors of rings: of an object that is long and narrow, whose power is
+        uneven around a ring, they tell more; of others less."""
+        nu_y, nu_x = self.grid.frequencies(torch.float64, self.power.device)
+        turns = torch.atan2(nu_y, nu_x)[self.chosen] / math.pi
+        sectors = (torch.remainder(turns, 1.0) * _SECTORS).long().clamp(max=_SECTORS - 1)
+        return replace(self, rings=self.rings * _SECTORS + sectors)
 
     @cached_property
     def wider(self) -> float:

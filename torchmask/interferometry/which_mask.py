@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from torch import Tensor
@@ -46,6 +46,18 @@ class MaskLook(NamedTuple):
             warnings.warn(self.contradiction, stacklevel=stacklevel + 1)
 
 
+class _Comparison(NamedTuple):
+    """How much of the pattern of the mask as given the power shows, and the orientation that fits clearly better."""
+
+    told: Match
+    better: tuple[str, Match] | None
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether the power speaks against the mask as given."""
+        return self.better is not None or not _may_be(self.told)
+
+
 def look_at_mask(frames: Tensor, aperture: Aperture, grid: Grid, band: Band | None = None) -> MaskLook:
     """Compare the fringes of frames (T, H, W) with the mask as given, and with others if it does not fit.
 
@@ -59,7 +71,15 @@ def look_at_mask(frames: Tensor, aperture: Aperture, grid: Grid, band: Band | No
     light = [] if band is None else fringe_wavelengths(aperture, grid, band)
     unseen = " or ".join(name for name, other in others.items() if likeness(aperture, other, grid, light) > _ALIKE)
     power = FringePower.of(frames, aperture, grid, light)
-    return MaskLook("" if power is None else _contradiction(power, aperture, others), unseen)
+    if power is None:
+        return MaskLook(unseen=unseen)
+    comparisons = []
+    # Rings tell most, but of a long and narrow object they accuse the right mask: their sectors have to agree.
+    for each in (power, power.in_sectors()):
+        comparisons.append(_compare(each, aperture, others))
+        if not comparisons[-1].contradicts:
+            return MaskLook(unseen=unseen)
+    return MaskLook(_contradiction(power, aperture, comparisons), unseen)
 
 
 def require_mask(frames: Tensor, aperture: SparseAperture, grid: Grid) -> None:
@@ -83,18 +103,25 @@ def _match(power: FringePower, aperture: SparseAperture) -> Match:
     return Match(share, power.wider * error)
 
 
-def _contradiction(power: FringePower, aperture: SparseAperture, others: dict[str, SparseAperture]) -> str:
+def _compare(power: FringePower, aperture: SparseAperture, others: dict[str, SparseAperture]) -> _Comparison:
     told = _match(power, aperture)
     matches = {name: _match(power, other) for name, other in others.items()}
     name = max(matches, key=lambda key: matches[key].share)
     best = matches[name]
-    if best.share > max(told.share + best.error, _NAMED * best.error) and _may_be(best):
-        return (
-            f"the fringes of the frames fit the mask better {name} than as given (they show {best.share:.2f} of its "
-            f"pattern instead of {told.share:.2f}): check its orientation, or calibrate it on frames of a star"
-        )
-    if _may_be(told):
-        return ""
+    is_better = best.share > max(told.share + best.error, _NAMED * best.error) and _may_be(best)
+    return _Comparison(told, (name, best) if is_better else None)
+
+
+def _contradiction(power: FringePower, aperture: SparseAperture, comparisons: Sequence[_Comparison]) -> str:
+    """Return what is said of a mask that all comparisons contradict, and what fits better."""
+    for told, better in comparisons:
+        if better is not None:
+            name, best = better
+            return (
+                f"the fringes of the frames fit the mask better {name} than as given (they show {best.share:.2f} of "
+                f"its pattern instead of {told.share:.2f}): check its orientation, or calibrate it on frames of a star"
+            )
+    told = comparisons[0].told
     seen = f"the fringes of the frames are not those of the mask in any of its eight orientations ({_shown(told)}"
     found = _clearest(power, _catalogue(aperture, power.grid)) or _clearest(power, _moved(aperture))
     if found is not None:
