@@ -262,11 +262,11 @@ def test_what_has_only_an_address_in_memory_has_no_checkpoint(options, name):
 
 
 def test_interrupted_and_resumed_is_the_same(observation, restoring, tmp_path):
-    method = restoring(max_iterations=250, tolerance=0)
+    method = restoring(max_iterations=50, tolerance=0, schedule=Schedule(segment=20))
     whole = method.restore(observation.frames)
 
     def interrupt(record: Record) -> None:
-        if record.step == 150:
+        if record.step == 30:
             raise KeyboardInterrupt
 
     path = tmp_path / "state.npz"
@@ -274,7 +274,7 @@ def test_interrupted_and_resumed_is_the_same(observation, restoring, tmp_path):
         method.restore(observation.frames, checkpoint=path, callback=interrupt)
     steps = []
     resumed = method.restore(observation.frames, checkpoint=path, callback=lambda record: steps.append(record.step))
-    assert steps[0] == 101
+    assert steps[0] == 21
     assert torch.equal(resumed.object, whole.object)
     assert torch.equal(resumed.coefficients, whole.coefficients)
     assert torch.equal(resumed.cost, whole.cost)
