@@ -97,7 +97,7 @@ def _square_otf(
 ) -> Tensor:
     if aperture.centers.ndim != 2:
         raise ValueError(f"centers has shape {tuple(aperture.centers.shape)}: one mask is needed, (n_subapertures, 2)")
-    band = Band.of([grid.wavelength]) if band is None else band
+    band = Band.given(band, grid.wavelength)
     raster = OverlapRaster(aperture, seeing, min(band.shortest / grid.wavelength, 1.0))
     lengths = [wavelength / grid.pixel_scale for wavelength in band.wavelengths]
     shares = band.shares

@@ -115,7 +115,9 @@ class TurbulentMSE(AsymptoticMSE):
             raise ValueError(f"sky is {sky}: it must be finite and not negative, in electrons per pixel")
         if wavelengths is None and weights is not None:
             raise ValueError(f"weights are {list(weights)} without wavelengths: give both, or neither")
-        self.band: Band | None = None if wavelengths is None else Band.of(wavelengths, weights)
+        self.band: Band | None = None
+        if wavelengths is not None:
+            self.band = Band.given(Band.of(wavelengths, weights), grid.wavelength)
         if r0 is None and (exposure != 0 or math.isfinite(outer_scale) or self.band is not None):
             raise ValueError(
                 f"r0 is None, for independent pistons, but outer_scale is {outer_scale}, exposure {exposure} and "
@@ -219,7 +221,7 @@ class TurbulentMSE(AsymptoticMSE):
     def _mask_transfer(self, aperture: Aperture) -> MaskTransfer:
         assert self.seeing is not None
         dtype, device = aperture.centers.dtype, aperture.centers.device
-        band, grid, seeing = Band.of([self.grid.wavelength]) if self.band is None else self.band, self.grid, self.seeing
+        band, grid, seeing = Band.given(self.band, self.grid.wavelength), self.grid, self.seeing
         self._check_sampling(aperture, band)
         if len(band.wavelengths) == 1:  # its tables are best at the wavelength of the light
             grid = replace(grid, wavelength=band.shortest)
@@ -241,7 +243,7 @@ class TurbulentMSE(AsymptoticMSE):
         Thin vanes take as much of it as of T^2.
         """
         assert self.seeing is not None
-        band = Band.of([self.grid.wavelength]) if self.band is None else self.band
+        band = Band.given(self.band, self.grid.wavelength)
         lengths = [wavelength / self.grid.wavelength for wavelength in band.wavelengths]
         reach = aperture.outer_diameter / min(lengths)
         round_ = aperture.shape.is_round and self.seeing.is_isotropic

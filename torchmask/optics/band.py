@@ -16,6 +16,7 @@ from torchmask.optics.passband import Passband, check_curve
 
 MOST_WAVELENGTHS = 32  # largest number of wavelengths, far more than any image needs
 _NANOMETRES = 100.0  # from here on wavelengths were meant in nm; below, they may be in the free units of a grid
+_NEAR = 1e3  # times the wavelength of a grid: light further from it is in another unit
 # Relative width of a band for which one wavelength stands, and for which each one more does: predicted errors are then
 # within 4 % of those of nine wavelengths (masks of 6 and 9 holes, fill factors 0.02 to 0.15, D/r0 = 7).
 _ALONE, _EACH = 0.05, 0.15
@@ -59,6 +60,21 @@ class Band:
         for wavelength, share in zip(wavelengths, shares, strict=True):
             light[float(wavelength)] += share / total
         return cls(tuple(light), tuple(light.values()))
+
+    @classmethod
+    def given(cls, band: Band | None, wavelength: float) -> Band:
+        """Return the band, or if there is none that of the `wavelength` of a grid [the unit of the band's] alone.
+
+        Raises ValueError if the band is so far from the grid's wavelength that they must be in different units.
+        """
+        if band is None:
+            return cls.of([wavelength])
+        if not wavelength / _NEAR <= band.mean <= wavelength * _NEAR:
+            raise ValueError(
+                f"wavelengths are {list(band.wavelengths)}, but that of the grid is {wavelength:g}: give both in m "
+                "(550 nm are 550e-9)"
+            )
+        return band
 
     @classmethod
     def of_curve(cls, wavelengths: Sequence[float], transmission: Sequence[float], n_wavelengths: int = 5) -> Band:

@@ -124,7 +124,7 @@ class ExposureModel(nn.Module):
     ) -> None:
         super().__init__()
         basis = plain_basis(aperture, aberrations) if isinstance(aberrations, int) else aberrations
-        band = band or Band.of([grid.wavelength])
+        band = Band.given(band, grid.wavelength)
         basis = copy.deepcopy(basis).to(device=device)
         self.window: Window = Window.around(grid, margin)
         self.background: Background = _of_a_model(background)

@@ -52,7 +52,7 @@ class ExposedPSF:
     def __init__(
         self, aperture: Aperture, grid: Grid, band: Band | None = None, pixel: PixelResponse | None = None
     ) -> None:
-        band = band or Band.of([grid.wavelength])
+        band = Band.given(band, grid.wavelength)
         finest = Grid(grid.n_pixels, grid.pixel_scale, band.shortest)
         self.samples: PupilSamples = aperture.samples(finest, PHASE_OVERSAMPLING)
         self.shares: tuple[float, ...] = band.shares
