@@ -134,10 +134,10 @@ def test_a_stage_descends_calibrates_and_selects_in_this_order():
     assert torch.equal(played.state.z, best.state.z)
 
 
-def exposures(seed=0):
+def exposures(seed=0, n_frames=4):
     generator = torch.Generator().manual_seed(seed)
     scene = make_scene(GRID.shape, 1e6, SceneOptions(size=0.5))
-    return simulate_observation(scene, PUPIL, GRID, TurbulencePhase(1 / 5, 20.0), Detector(1.5), 4, generator)
+    return simulate_observation(scene, PUPIL, GRID, TurbulencePhase(1 / 5, 20.0), Detector(1.5), n_frames, generator)
 
 
 @pytest.fixture(scope="module")
@@ -187,8 +187,8 @@ def test_static_modes_stay_equal_among_candidates(stack):
     assert float(static.abs().max()) > 0
 
 
-def restore(stack, schedule=None, dtype=torch.float32, **known):
-    method = MyopicDeconvolution(PUPIL, GRID, 66, None, None, 1.5, max_iterations=500, schedule=schedule, dtype=dtype)
+def restore(stack, schedule=None, max_iterations=500, **known):
+    method = MyopicDeconvolution(PUPIL, GRID, 66, None, None, 1.5, max_iterations=max_iterations, schedule=schedule)
     return method.restore(stack.frames, **known)
 
 
@@ -209,27 +209,20 @@ def test_candidates_explain_more_than_a_single_start():
 
 
 @pytest.mark.slow
-def test_a_new_frame_has_candidates_too(stack):
-    first = restore(stack.take([0, 1, 2]), dtype=torch.float64)
-    result = restore(stack, dtype=torch.float64, start=first)
-    assert float(result.chi_square[-1]) < 1.2
-    assert relative_error(result.object, stack.object, 0.5) < relative_error(first.object, stack.object, 0.5)
-
-
-@pytest.mark.slow
 def test_new_frames_with_candidates_are_explained_more_often():
-    """Of six new frames four are explained, in float64 five, of those without candidates one.
+    """Of twelve new frames seven are explained, of those without candidates two; the first six are tested, three to 0.
 
-    Which ones are lost changes with rounding, so that no single frame is a test. The object gains by any of them.
+    Which ones are lost changes with rounding, so that no single frame is a test. The object gains by any of them. By
+    the search alone: neither a last descent nor the retrieval of phases makes up for what has been lost.
     """
-    explained = {True: 0, False: 0}
-    for seed in range(6):
-        stack = exposures(seed)
-        first = restore(stack.take([0, 1, 2]))
-        result = restore(stack, start=first)
-        without = restore(stack, Schedule(candidates=()), start=first)
+    explained, brief = {True: 0, False: 0}, {"last_segments": 0, "retrievals": 0, "averaged": 1, "starts": 1}
+    for seed in range(3):
+        stack = exposures(seed, n_frames=5)
+        first = restore(stack.take([0, 1, 2]), Schedule(**brief), 400)
+        result = restore(stack, Schedule(**brief), 400, start=first)
+        without = restore(stack, Schedule(candidates=(), **brief), 400, start=first)
         for has_candidates, found in ((True, result), (False, without)):
-            explained[has_candidates] += float(found.chi_square[-1]) < 1.2
+            explained[has_candidates] += int((found.chi_square[3:] < 1.2).sum())
         assert relative_error(result.object, stack.object, 0.5) < relative_error(first.object, stack.object, 0.5)
     assert explained[True] > explained[False]
 
