@@ -45,7 +45,7 @@ def error(coefficients, true):
 
 def test_refines_what_was_measured(exposures):
     mask, scene, frames, true, measured = exposures
-    method = MyopicDeconvolution(mask, GRID, N_MODES, max_iterations=1000)
+    method = MyopicDeconvolution(mask, GRID, N_MODES, max_iterations=400)
     fixed = method.restore(frames, coefficients=measured)
     refined = method.restore(frames, coefficients=measured, covariance=ERROR**2 * torch.eye(15))
     assert error(measured, true) == pytest.approx(ERROR, rel=4 / math.sqrt(2 * 120))  # 4 sigma of a sample deviation
