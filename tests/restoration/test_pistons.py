@@ -11,6 +11,7 @@ from torchmask.restoration.adjoint import data_fidelity
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.placed import PlacedSamples, centers_of, moved_centers
+from torchmask.restoration.schedule import Schedule
 
 GRID = Grid.nyquist(1.0, 550e-9, 32, oversampling=1.2)
 NOISE = 0.03  # of a mean pixel
@@ -63,13 +64,15 @@ def test_common_modes_tell_no_strength_of_the_turbulence(n_modes, tells, five_ho
         assert (basis.turbulence_strength(z[:, : basis.n_parameters]) is not None) is tells
 
 
-@pytest.mark.parametrize(
-    "options", [{}, {"refine_geometry": True}, {"static_modes": 6}, {"static_modes": 6, "refine_geometry": True}]
-)
+@pytest.mark.parametrize("options", [{}, {"static_modes": 6, "refine_geometry": True}])
 def test_an_object_is_found_through_pistons_alone(options):
-    """The residual is the noise, and the object is near the true one, however the rest of the model is."""
+    """The residual is the noise, and the object is near the true one, however the rest of the model is.
+
+    In one start, whose object no other one has to improve.
+    """
     image, frames = observe_pistons(static_modes=options.get("static_modes", 0))
-    result = MyopicDeconvolution(small_holes(), GRID, n_modes=1, r0=0.3, max_iterations=800, **options).restore(frames)
+    given = {"n_modes": 1, "r0": 0.3, "max_iterations": 800, "schedule": Schedule(in_vain=0)}
+    result = MyopicDeconvolution(small_holes(), GRID, **given, **options).restore(frames)
     assert result.coefficients.shape == (8, 6, max(1, options.get("static_modes", 0)))
     assert float(result.chi_square.mean()) == pytest.approx(1, abs=0.1)
     cutoff = GRID.cutoff(small_holes().extent)
