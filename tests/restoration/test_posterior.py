@@ -31,7 +31,7 @@ from torchmask.restoration.variation import TotalVariation
 from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
 
-GRID = Grid.nyquist(1.0, 550e-9, 48)
+GRID = Grid.nyquist(1.0, 550e-9, 32)
 
 
 def problem(mask, n_common=0, free=Free.OBJECT | Free.ABERRATIONS | Free.COMMON, n_frames=3, photons=1e4):
@@ -40,7 +40,7 @@ def problem(mask, n_common=0, free=Free.OBJECT | Free.ABERRATIONS | Free.COMMON,
     model = ExposureModel(mask, GRID, basis, margin=0.0)
     generator = torch.Generator().manual_seed(0)
     image = torch.full(GRID.shape, 0.2, dtype=torch.float64)
-    image[18:30, 16:34] = 3.0
+    image[12:20, 10:22] = 3.0
     z = 0.5 * torch.randn(n_frames, basis.n_parameters, dtype=torch.float64, generator=generator)
     z = basis.with_common_of(z, z[:1])
     precision = torch.full((n_frames, 1, 1), photons, dtype=torch.float64)
@@ -93,7 +93,7 @@ def test_the_object_alone_has_the_closed_form(five_holes):
     generator = torch.Generator().manual_seed(1)
     objects, aberrations = _sample(stated, state, power, prior, 0.0, 12, generator)
     assert not bool(aberrations.any())
-    nu = torch.fft.fftfreq(48, dtype=torch.float64)
+    nu = torch.fft.fftfreq(32, dtype=torch.float64)
     smoothness = 4 * ((math.pi * nu[:, None]).sin() ** 2 + (math.pi * nu[None]).sin() ** 2)
     full_power = torch.fft.fft2(torch.fft.irfft2(power, s=GRID.shape)).real
     expected = 1 / (full_power + 40.0 * smoothness)
@@ -190,7 +190,7 @@ def test_coefficients_scatter_as_said(five_holes):
     columns = whitening(five_holes, 3, 1.5, 20.0)
     model = ExposureModel(five_holes, GRID, 3)
     image = torch.zeros(model.window.field.shape, dtype=torch.float64)
-    image[18:30, 16:34], image[20:24, 20:42] = 3000.0, 5000.0
+    image[12:20, 10:22], image[13:16, 13:28] = 3000.0, 5000.0
     method = MyopicDeconvolution(five_holes, GRID, 3, r0=1.5, outer_scale=20.0)
     pulls = []
     for seed in range(6):
@@ -198,7 +198,7 @@ def test_coefficients_scatter_as_said(five_holes):
         z = torch.randn(6, columns.shape[1], dtype=torch.float64, generator=generator)
         true = (z @ columns.T).unflatten(1, (5, 3))
         frames = torch.poisson(model(image, true.flatten(1)).clamp(min=0), generator=generator)
-        result = method.restore(frames, known_object=image[:48, :48], n_samples=12)
+        result = method.restore(frames, known_object=image[:32, :32], n_samples=12)
         error = result.coefficients - true
         error[..., 0] -= error[..., 0].mean(1, keepdim=True)
         pulls.append(float((error / result.coefficients_std).square().mean().sqrt()))
@@ -210,15 +210,15 @@ def test_coefficients_scatter_as_said(five_holes):
 
 @pytest.mark.filterwarnings("ignore:the fringes of the frames are not those")  # no mask was in front of them
 def test_deviations_are_kept_and_asked_for(tmp_path, five_holes):
-    frames = torch.full((2, 48, 48), 20.0, dtype=torch.float64)
-    frames[:, 16:30, 20:28] = 1000.0
+    frames = torch.full((2, 32, 32), 20.0, dtype=torch.float64)
+    frames[:, 10:20, 13:19] = 1000.0
     frames = torch.poisson(smooth(frames, 1.5), generator=torch.Generator().manual_seed(0))
     method = MyopicDeconvolution(five_holes, GRID, 3, max_iterations=3)
     plain = method.restore(frames)
     assert plain.object_std is None
     assert plain.coefficients_std is None
     result = method.restore(frames, n_samples=2)
-    assert result.object_std.shape == (48, 48)
+    assert result.object_std.shape == (32, 32)
     assert result.coefficients_std.shape == (5, 3)
     result.save(tmp_path / "result.npz")
     again = type(result).load(tmp_path / "result.npz")
