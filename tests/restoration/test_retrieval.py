@@ -2,9 +2,11 @@
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import pytest
 import torch
+from torch import Tensor
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture, SparseAperture
@@ -93,42 +95,58 @@ def left(truth, *excess):
 NO, YES, AGAIN = "", "found", "again"
 
 
-def test_reflections_find_most_frames_where_descents_stop():
-    """From the same random aberrations. A frame that is found has the chi-square of noise, 1 +- 0.05.
+class Fitted(NamedTuple):
+    """Random aberrations of 48 frames, how many reflections each was given, and the state fitted to its fields."""
+
+    objective: MyopicObjective
+    start: State
+    spent: Tensor
+    fitted: State
+
+    @classmethod
+    def after(cls, objective, start):
+        """After 200 reflections at most."""
+        fields, spent = retrieve_fields(objective, start, 200)
+        z = parameters_of_fields(objective, fields, start.z)
+        return cls(objective, start, spent, fit_modes(objective, replace(start, z=z), 100))
+
+    @property
+    def found(self):
+        """Which frames are found: they have the chi-square of noise, 1 +- 0.05."""
+        return chi_squares(self.objective, self.fitted) < 1.25
+
+
+@pytest.fixture(scope="module")
+def retrieved():
+    objective, truth = problem(48)
+    generator = torch.Generator().manual_seed(7)
+    z = 0.4 * torch.randn(truth.z.shape, generator=generator, dtype=torch.float64)
+    return Fitted.after(objective, replace(truth, z=z))
+
+
+def test_reflections_find_most_frames_where_descents_stop(retrieved):
+    """From the same random aberrations.
 
     Over other seeds more than half were found, and a quarter by descents. Of 48 frames, the difference of two numbers
     of equal chance has a standard deviation of at most sqrt(2 * 48 / 4) = 4.9, so twice that tells the two apart.
     """
-    objective, truth = problem(48)
-    generator = torch.Generator().manual_seed(7)
-    start = replace(truth, z=0.4 * torch.randn(truth.z.shape, generator=generator, dtype=torch.float64))
-    found = parameters_of_fields(objective, retrieve_fields(objective, start, 200).fields, start.z)
-    reflected = fit_modes(objective, replace(start, z=found), 100)
-    descended = fit_modes(objective, start, 400)
-    number, number_before = (int((chi_squares(objective, state) < 1.25).sum()) for state in (reflected, descended))
-    assert number > number_before + 2 * 4.9
+    descended = fit_modes(retrieved.objective, retrieved.start, 400)
+    number_before = int((chi_squares(retrieved.objective, descended) < 1.25).sum())
+    assert int(retrieved.found.sum()) > number_before + 2 * 4.9
 
 
-def test_reflections_of_a_frame_end_once_its_phases_are_found(monkeypatch):
+def test_reflections_of_a_frame_end_once_its_phases_are_found(retrieved, monkeypatch):
     """Those that end before are found as if they had gone on: of 13 frames one is found by one of the two ways only.
 
     Chance decides which, so the numbers of frames that one way finds and the other does not are alike: a difference of
     three standard deviations of their sum is none.
     """
-    objective, truth = problem(48)
-    generator = torch.Generator().manual_seed(7)
-    start = replace(truth, z=0.4 * torch.randn(truth.z.shape, generator=generator, dtype=torch.float64))
-
-    def found_and_spent(n_reflections=200):
-        fields, spent = retrieve_fields(objective, start, n_reflections)
-        fitted = fit_modes(objective, replace(start, z=parameters_of_fields(objective, fields, start.z)), 100)
-        return chi_squares(objective, fitted) < 1.25, spent, fields
-
-    found, spent, _ = found_and_spent()
-    *_, fields = found_and_spent(104)
+    objective, start, spent, _ = retrieved
+    fields, _ = retrieve_fields(objective, start, 104)
     monkeypatch.setattr(reflections, "_FALLEN", 0.0)
-    found_too, whole, _ = found_and_spent()
-    *_, fields_too = found_and_spent(104)
+    without_end = Fitted.after(objective, start)
+    fields_too, _ = retrieve_fields(objective, start, 104)
+    found, found_too, whole = retrieved.found, without_end.found, without_end.spent
     assert whole.tolist() == [200] * 48
     ended = spent < 200
     assert int(ended.sum()) >= 5
