@@ -11,6 +11,7 @@ from torch import nn
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.geometry import MaskGeometry
 from torchmask.record import Record
 from torchmask.restoration.candidates import several
 from torchmask.restoration.checkpoint import Checkpoint, Ending, Progress, Status, fingerprint_of
@@ -23,7 +24,7 @@ from torchmask.restoration.priors import EdgePreserving
 from torchmask.restoration.projected_lbfgs import ProjectedLBFGS
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.solver import Solver
-from torchmask.restoration.state import Calibration, State
+from torchmask.restoration.state import Calibration, Modes, State
 from torchmask.restoration.traits import Refinement
 from torchmask.restoration.variation import TotalVariation
 
@@ -36,7 +37,12 @@ def random_state(seed, n_frames=3):
     def uniform(*shape):
         return torch.rand(*shape, dtype=torch.float64, generator=generator)
 
-    return State(uniform(4, 5), uniform(n_frames, 2), Calibration(uniform(n_frames), 1 + uniform(n_frames), 0.3 + seed))
+    calibration = Calibration(uniform(n_frames), 1 + uniform(n_frames), 0.3 + seed)
+    image, z, numbers = uniform(4, 5), uniform(n_frames, 2), uniform(4).tolist()
+    geometry = MaskGeometry(
+        numbers[0] - 0.5, 0.9 + numbers[1], 0.9 + numbers[2], 0.5 * numbers[3], mirrored=seed % 2 == 0
+    )
+    return State(image, z, calibration, geometry, list(Modes)[seed % 3])
 
 
 def progress_with(**changes):
@@ -71,6 +77,7 @@ def same_state(one, other):
     for item in fields(Calibration):
         a, b = getattr(one.calibration, item.name), getattr(other.calibration, item.name)
         assert torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b, item.name
+    assert (one.geometry, one.modes) == (other.geometry, other.modes)  # to the last digit
 
 
 @pytest.mark.parametrize(

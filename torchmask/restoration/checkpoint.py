@@ -164,7 +164,13 @@ _NUMBERS = (
     "rate",
 )
 # arrays of an ending
-_NEEDED = ("image", "z", "geometry", "modes", "status", *(item.name for item in fields(Calibration)))
+_NEEDED = (
+    "image",
+    "z",
+    "modes",
+    "status",
+    *(item.name for kind in (MaskGeometry, Calibration) for item in fields(kind)),
+)
 
 
 @dataclass(frozen=True)
@@ -262,8 +268,10 @@ def fingerprint_of(objective: MyopicObjective, settings: Sequence[object], known
 
 def _ending_arrays(prefix: str, ending: Ending) -> dict[str, Any]:
     state, calibration = ending.state, ending.state.calibration
-    values: dict[str, Any] = {"image": state.image, "z": state.z, "geometry": state.geometry.matrix}
+    values: dict[str, Any] = {"image": state.image, "z": state.z}
     values |= {"modes": state.modes.name, "status": ending.status.name}
+    # of the geometry the numbers themselves: those of its matrix would be rounded
+    values |= {item.name: getattr(state.geometry, item.name) for item in fields(MaskGeometry)}
     values |= {item.name: getattr(calibration, item.name) for item in fields(Calibration)}
     if ending.decrease is not None:
         values["decrease"] = ending.decrease
@@ -275,7 +283,7 @@ def _ending(stored: dict[str, np.ndarray], prefix: str, device: torch.device) ->
         return torch.from_numpy(stored[prefix + name]).to(device)
 
     weight = float(stored[prefix + "aberration_weight"])
-    geometry = MaskGeometry.from_matrix(torch.from_numpy(stored[prefix + "geometry"]))
+    geometry = MaskGeometry(**{item.name: stored[prefix + item.name].item() for item in fields(MaskGeometry)})
     calibration = Calibration(tensor("transmission"), tensor("noise_inflation"), weight)
     decrease = stored.get(prefix + "decrease")
     status = Status[stored[prefix + "status"].item()]
