@@ -24,7 +24,10 @@ ATLAS = SuccessMap((1, 9), (1e4, 1e7), (0.1, 2.0), *(number * np.ones((2, 2, 2))
 
 
 def test_a_tiny_map_is_what_the_plan_can_read(tmp_path, monkeypatch):
+    """Through three holes, with the true aberrations by fewer modes: all restorations and bounds, at half the time."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(map_draws, "search_masks", lambda holes, *_: dict.fromkeys(holes, THREE))
+    monkeypatch.setitem(success_map.TRUE_MODES, "mask", 10)
     assert success_map.main(["--smoke", "--workers", "1", "--out", "run"]) == 0
     result = json.loads((tmp_path / "run/success_map.json").read_text())
     measured = SuccessMap(**json.loads((tmp_path / "run/success_mask.json").read_text()))
