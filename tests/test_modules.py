@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor, nn
+from torch._inductor import config as inductor
 
 import torchmask
 from torchmask.atmosphere.phase import LayeredPhase, TurbulencePhase
@@ -279,6 +280,7 @@ def value_and_gradient(function, aperture, phase):
     return value.detach(), aperture.centers.grad.clone()
 
 
+@inductor.patch(compile_threads=1)  # every process that compiles beside this one would import torch
 @pytest.mark.filterwarnings("ignore")  # the compiler warns of its own doings
 @pytest.mark.parametrize(
     ("name", "backend"),
