@@ -191,7 +191,7 @@ def test_either_data_type_goes_on_where_the_other_was(observation, restored, res
 def test_dead_pixels_are_left_out(observation, restored, restoring):
     valid = torch.rand(observation.grid.shape, generator=torch.Generator().manual_seed(0)) > 0.02
     spoilt = torch.where(valid, observation.frames, math.nan)
-    method = restoring()
+    method = restoring(schedule=Schedule(in_vain=0))
     with pytest.raises(ValueError, match="mark those pixels in `valid`"):
         method.restore(spoilt)
     result = method.restore(spoilt, valid=valid)
