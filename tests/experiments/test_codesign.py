@@ -8,6 +8,7 @@ import codesign
 import numpy as np
 import pytest
 import torch
+import yaml
 
 from torchmask.cli.codesign import ImagingOptions, Options, RestorationOptions, design_mask, inversion, with_presets
 from torchmask.cli.options import SearchOptions
@@ -33,7 +34,7 @@ FIGURES = [
 
 
 def tiny(folder: Path, *changes: str) -> int:
-    return codesign.main(["codesign", "--smoke", "--out", str(folder), *changes])
+    return codesign.main(["codesign", "--smoke", "--imaging.n-photons", "1e6", "--out", str(folder), *changes])
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +48,8 @@ def test_every_result_is_in_the_folder(finished):
     assert sorted(path.name for path in finished.glob("*.png")) == sorted(FIGURES)
     assert json.loads((finished / "status.json").read_text())["status"] == "finished"
     assert json.loads((finished / "config.json").read_text())["design"]["n_subapertures"] == 5
+    stored = yaml.safe_load((finished / "config.yaml").read_text())
+    assert (stored["imaging"]["n_photons"], stored["design"]["n_subapertures"]) == (1e6, 5)
     result = load_npz(finished / "result.npz")
     assert result["centers"].shape == (5, 2)
     for name in ("mask", "full"):
@@ -83,9 +86,12 @@ def test_the_full_pupil_gets_photons_by_its_area_and_reaches_as_far(finished):
     assert ratio == pytest.approx(expected, rel=1e-12)
 
 
-def test_same_seed_same_numbers_and_another_seed_others(finished, tmp_path):
+def test_same_seed_same_numbers_and_another_seed_others(finished, tmp_path, capsys):
     assert tiny(tmp_path / "again") == 0
-    assert tiny(tmp_path / "other", "--seed", "1", "--restoration.max-iterations", "1") == 0
+    out = capsys.readouterr().out
+    assert "score" in out
+    assert f"tensorboard --logdir {tmp_path}\n" in out
+    assert tiny(tmp_path / "other", "--seed", "1") == 0
     first, again, other = (load_npz(path / "result.npz") for path in (finished, tmp_path / "again", tmp_path / "other"))
     for name in first:
         np.testing.assert_array_equal(first[name], again[name])
@@ -98,6 +104,12 @@ def test_an_existing_folder_is_never_touched(finished, capsys):
     assert tiny(finished) == 1
     assert "first-2" in capsys.readouterr().err
     assert {path: path.stat().st_mtime_ns for path in finished.rglob("*")} == before
+
+
+def test_a_key_of_the_config_that_is_unknown_is_refused(tmp_path, capsys):
+    (tmp_path / "bad.yaml").write_text("design: {n_holes: 5}")
+    assert tiny(tmp_path / "run", "--config", str(tmp_path / "bad.yaml")) == 1
+    assert "unknown key design.n_holes; known keys are design.n_subapertures" in capsys.readouterr().err
 
 
 def test_a_missing_scene_is_one_line_before_any_work(tmp_path, capsys):
