@@ -13,6 +13,8 @@ from torchmask.grid import ARCSEC, Grid
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.band import FILTERS
 
+pytestmark = pytest.mark.usefixtures("coarse_figures")
+
 GRID = Grid(64, 0.0655 * ARCSEC, FILTERS[("NIRISS", "F480M")].wavelength)
 
 

@@ -19,6 +19,8 @@ from torchmask.planning.smearing import SmearingMap, phase_spread
 from torchmask.planning.success import SuccessMap
 from torchmask.planning.success import success_map as packaged_map
 
+pytestmark = pytest.mark.usefixtures("coarse_figures")
+
 THREE = SparseAperture([[0.0, 0.35], [0.3, -0.2], [-0.3, -0.2]], 0.25, 1.0)
 ATLAS = SuccessMap((1, 9), (1e4, 1e7), (0.1, 2.0), *(number * np.ones((2, 2, 2)) for number in (2, 1, 1.5)))
 
