@@ -291,5 +291,6 @@ def test_a_restoration_keeps_the_instrument_that_it_was_told(n_stacks, folder, r
         shutil.copyfile(files[0], folder / "other.npz")
         files[1] = str(folder / "other.npz")
     told = ["--instrument", str(folder / "instrument.json"), "--out", str(folder / "run"), "--max-iterations", "2"]
+    told += ["--workers", "1"]
     assert main(["restore", *files, *told]) == NOT_EXPLAINED
     assert Instrument.load(folder / "run/instrument.json") == recorded

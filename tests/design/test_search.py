@@ -50,7 +50,7 @@ def test_result_is_feasible_and_measured_where_it_stands(method, budget):
 @pytest.mark.parametrize("method", ["cma", "hybrid"])
 def test_same_seed_same_mask_and_another_seed_another(method):
     def centers(seed):
-        return search_mask(COARSE, 5, 1.0, 0.15, method=method, budget=400, seed=seed).aperture.centers
+        return search_mask(reference(48), 5, 1.0, 0.15, method=method, budget=100, seed=seed).aperture.centers
 
     assert torch.equal(centers(0), centers(0))
     assert not torch.equal(centers(0), centers(1))
@@ -71,7 +71,7 @@ def test_search_leaves_the_process_and_the_folder_alone(tmp_path, monkeypatch):
 @pytest.mark.parametrize("method", ["cma", "hybrid"])
 def test_another_default_device_sees_nothing_of_it(method, constraints):
     """From the room for holes, over the coarse grid, to projections and checks, all is where the criterion is."""
-    criterion = reference(128)
+    criterion = reference(64)
 
     def found():
         return search_mask(criterion, 6, 1.0, 0.1, method=method, budget=96, seed=0, constraints=constraints)
