@@ -22,6 +22,8 @@ from torchmask.planning.smearing import phase_spread, smearing_map
 from torchmask.planning.success import success_map
 from torchmask.spectra import NoisePSD, PowerLawPSD
 
+pytestmark = pytest.mark.usefixtures("coarse_figures")
+
 SCRIPTS = {"anisoplanatism": anisoplanatism, "exposure": exposure, "band": band, "rival_modes": rival_modes}
 
 

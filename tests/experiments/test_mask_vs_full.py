@@ -16,6 +16,8 @@ from torchmask.io import save_npz
 from torchmask.optics.psf import psf_from_samples
 from torchmask.optics.zernike import zernike_basis
 
+pytestmark = pytest.mark.usefixtures("coarse_figures")
+
 CENTERS = [[0.4, 0.0], [-0.2, 0.3], [-0.2, -0.3]]
 
 
