@@ -67,8 +67,8 @@ def test_opposite_frequencies_are_in_one_sector_and_rings_stay_apart():
 
 
 def test_long_and_narrow_objects_hardly_accuse_the_right_mask(frames):
-    """Rings alone accuse it in half of ten. Of 171 others that were simulated, they do in 54, with sectors in 6:
-    that it is more than two of ten has a chance below one in a hundred."""
+    """Rings alone accuse it in half of ten. Of 171 others that were simulated, they do in 54, with sectors in 9:
+    that it is more than two of ten has a chance of one in eighty."""
     powers = [FringePower.of(each, MASK, GRID) for each in frames]
     rings = [power.match(MASK) for power in powers if power is not None]
     accused = [share + 2 * error < 0.6 for share, error in rings]

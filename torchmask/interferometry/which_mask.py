@@ -25,6 +25,7 @@ ORIENTATIONS = {
 
 _NAMED = 2.5  # standard errors of the share by which another orientation must show
 _RIGHT = 0.6  # least share of the right mask, with two standard errors added, see docs/method.md
+_RIGHT_IN_SECTORS = 0.7  # the same within sectors, which an object makes less uneven than rings
 _FOUND = 4.0  # standard errors by which one of some hundred candidates must show
 _SCALES = 0.7, 1.4  # range of magnifications that are tried
 _ALIKE = 0.95  # correlation of two patterns above which frames do not tell them apart
@@ -52,11 +53,6 @@ class _Comparison(NamedTuple):
     told: Match
     better: tuple[str, Match] | None
 
-    @property
-    def contradicts(self) -> bool:
-        """Whether the power speaks against the mask as given."""
-        return self.better is not None or not _may_be(self.told)
-
 
 def look_at_mask(frames: Tensor, aperture: Aperture, grid: Grid, band: Band | None = None) -> MaskLook:
     """Compare the fringes of frames (T, H, W) with the mask as given, and with others if it does not fit.
@@ -75,10 +71,11 @@ def look_at_mask(frames: Tensor, aperture: Aperture, grid: Grid, band: Band | No
         return MaskLook(unseen=unseen)
     comparisons = []
     # Rings tell most, but of a long and narrow object they accuse the right mask: their sectors have to agree.
-    for each in (power, power.in_sectors()):
-        comparisons.append(_compare(each, aperture, others))
-        if not comparisons[-1].contradicts:
+    for each, least in ((power, _RIGHT), (power.in_sectors(), _RIGHT_IN_SECTORS)):
+        comparison = _compare(each, aperture, others)
+        if comparison.better is None and _may_be(comparison.told, least):
             return MaskLook(unseen=unseen)
+        comparisons.append(comparison)
     return MaskLook(_contradiction(power, aperture, comparisons), unseen)
 
 
@@ -132,9 +129,9 @@ def _contradiction(power: FringePower, aperture: SparseAperture, comparisons: Se
     )
 
 
-def _may_be(match: Match) -> bool:
+def _may_be(match: Match, least: float = _RIGHT) -> bool:
     """Return whether the fringes may be those of the mask; a share below 0 is noise."""
-    return max(match.share, 0.0) + 2 * match.error > _RIGHT
+    return max(match.share, 0.0) + 2 * match.error > least
 
 
 def _shown(match: Match) -> str:
