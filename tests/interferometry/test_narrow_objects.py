@@ -32,17 +32,17 @@ def galaxy(angle):
 
 @pytest.fixture(scope="module")
 def frames():
-    """Of ten galaxies at angles all around."""
+    """Of twenty galaxies at angles all around."""
     turbulence, generator = TurbulencePhase(r0=1 / 7, outer_scale=20.0), torch.Generator().manual_seed(3)
     return [
         simulate_observation(galaxy(angle), MASK, GRID, turbulence, Detector(1.5), 5, generator).frames
-        for angle in torch.arange(0.1, math.pi, math.pi / 10).tolist()
+        for angle in torch.arange(0.1, math.pi, math.pi / 20).tolist()
     ]
 
 
 @pytest.mark.parametrize("light", [3.0, 1e4])
 def test_a_mask_has_all_of_its_own_pattern_where_each_sector_has_its_own_brightness(light):
-    """Within rings it has hardly any of it where one of six sectors of 30 degrees has a hundred times the light."""
+    """Where one sector of 30 degrees has a hundred times the light of the others, rings show 0.60 and 0.73 of it."""
     some = FringePower.of(torch.rand(2, 64, 64, generator=torch.Generator().manual_seed(0)), MASK, GRID)
     assert some is not None
     nu_y, nu_x = GRID.frequencies(torch.float64)
@@ -51,7 +51,7 @@ def test_a_mask_has_all_of_its_own_pattern_where_each_sector_has_its_own_brightn
     values = (uneven * _smoothed(expected_power(MASK, GRID)).clamp(min=0))[some.chosen]
     power = FringePower(values + 1.0, 1.0, GRID, some.chosen, some.rings)
     assert power.in_sectors().match(MASK).share == pytest.approx(1.0, abs=1e-9)
-    assert power.match(MASK).share < 0.9
+    assert power.match(MASK).share < 0.8
 
 
 def test_opposite_frequencies_are_in_one_sector_and_rings_stay_apart():
@@ -67,18 +67,19 @@ def test_opposite_frequencies_are_in_one_sector_and_rings_stay_apart():
 
 
 def test_long_and_narrow_objects_hardly_accuse_the_right_mask(frames):
-    """Rings alone accuse it in half of ten. Of 171 others that were simulated, they do in 54, with sectors in 9:
-    that it is more than two of ten has a chance of one in eighty."""
+    """Rings alone accuse it in nearly half of twenty. Of 171 others that were simulated, they do in 54, sectors besides
+    in 9: by chance these come to more than four of twenty once in 300.
+    """
     powers = [FringePower.of(each, MASK, GRID) for each in frames]
     rings = [power.match(MASK) for power in powers if power is not None]
     accused = [share + 2 * error < 0.6 for share, error in rings]
     still = [bool(look_at_mask(each, MASK, GRID).contradiction) for each in frames]
-    assert sum(accused) >= 4
-    assert sum(still) <= 2
+    assert sum(accused) >= 8
+    assert sum(still) <= 4
 
 
 def test_another_orientation_is_named_where_sectors_alone_tell_it(frames):
-    """Of 171 others sectors name it in 43 where rings name none, and a wrong one in 3."""
+    """Of 171 others it is named in 91, in 43 of them by sectors alone; below six of twenty comes once in a hundred."""
     told = ORIENTATIONS["with x reversed"].apply(MASK)
     said = [look_at_mask(each, told, GRID).contradiction for each in frames]
-    assert sum("fit the mask better with x reversed than as given" in each for each in said) >= 3
+    assert sum("fit the mask better with x reversed than as given" in each for each in said) >= 6

@@ -187,9 +187,9 @@ def test_static_modes_stay_equal_among_candidates(stack):
     assert float(static.abs().max()) > 0
 
 
-def restore(stack, schedule=None, max_iterations=500, **known):
-    method = MyopicDeconvolution(PUPIL, GRID, 66, None, None, 1.5, max_iterations=max_iterations, schedule=schedule)
-    return method.restore(stack.frames, **known)
+def restore(stack, schedule=None, max_iterations=500, dtype=torch.float32, **known):
+    options = {"max_iterations": max_iterations, "schedule": schedule, "dtype": dtype}
+    return MyopicDeconvolution(PUPIL, GRID, 66, None, None, 1.5, **options).restore(stack.frames, **known)
 
 
 @pytest.mark.slow
@@ -206,6 +206,14 @@ def test_candidates_explain_more_than_a_single_start():
         found = [restore(seen, schedule, known_object=seen.object) for seen in stacks]
         logs.append(float(torch.cat([result.chi_square for result in found]).log().mean()))
     assert logs[0] < logs[1]
+
+
+@pytest.mark.slow
+def test_a_new_frame_has_candidates_too(stack):
+    first = restore(stack.take([0, 1, 2]), dtype=torch.float64)
+    result = restore(stack, dtype=torch.float64, start=first)
+    assert float(result.chi_square[-1]) < 1.2
+    assert relative_error(result.object, stack.object, 0.5) < relative_error(first.object, stack.object, 0.5)
 
 
 @pytest.mark.slow

@@ -108,8 +108,11 @@ class FringePower:
         return Match(float(measured @ expected) / contrast, error)
 
     def in_sectors(self) -> FringePower:
-        """Return the same power, compared within sectors of rings: of an object that is long and narrow, whose power is
-        uneven around a ring, they tell more; of others less."""
+        """Return the same power, compared within sectors of rings.
+
+        Of an object that is long and narrow, whose power is uneven around a ring, they tell more than rings; of others
+        less.
+        """
         nu_y, nu_x = self.grid.frequencies(torch.float64, self.power.device)
         turns = torch.atan2(nu_y, nu_x)[self.chosen] / math.pi
         sectors = (torch.remainder(turns, 1.0) * _SECTORS).long().clamp(max=_SECTORS - 1)

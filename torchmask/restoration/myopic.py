@@ -152,7 +152,7 @@ class MyopicDeconvolution:
         self.recipe: ModelRecipe = ModelRecipe(
             aperture,
             grid,
-            Band.of([grid.wavelength] if wavelengths is None else wavelengths, weights),
+            Band.given(Band.of([grid.wavelength] if wavelengths is None else wavelengths, weights), grid.wavelength),
             frame_modes=(FULL_MODES if self.many_minima else MASK_MODES) if n_modes is None else n_modes,
             last_modes=self.schedule.most_modes(self.many_minima) if n_modes is None else 0,
             static_modes=static_modes,

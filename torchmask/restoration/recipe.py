@@ -85,7 +85,6 @@ class ModelRecipe:
             raise ValueError(
                 "n_modes is 1: the piston of a single opening does not show, take at least 3 for its tilts"
             )
-        Band.given(self.band, self.grid.wavelength)
         self._check_exposure()
         self.aperture.require_sampling(self.bluest_grid)
         self._check_modes()
