@@ -17,6 +17,7 @@ from torchmask.atmosphere.von_karman import (
     von_karman_structure_function,
 )
 from torchmask.optics.aperture import FullAperture, SparseAperture
+from torchmask.optics.polygons import Square
 from torchmask.optics.zernike import aperture_modes, noll
 
 # Variance [rad^2] of the modes over a pupil with (D/r0)^(5/3) = 1, by D/L0: all modes, piston, each tilt, each mode of
@@ -280,6 +281,24 @@ def test_float64_whatever_the_centres_and_no_gradient():
     assert not covariance.requires_grad
     exact = modal_covariance(SparseAperture(centers.detach().double(), 0.2, 1.0), 3, 0.2, 20.0)
     torch.testing.assert_close(covariance, exact)
+
+
+def test_what_is_kept_is_of_the_same_holes_and_turbulence_only():
+    """A mask that moves, and every other argument, has a covariance of its own; nobody can change what is kept."""
+    mask = SparseAperture([[0.0, 0.0], [0.5, 0.1]], 0.2, 2.0)
+    first = modal_covariance(mask, 3, 0.2, 20.0)
+    kept = first.clone()
+    first.zero_()
+    assert torch.equal(modal_covariance(mask, 3, 0.2, 20.0), kept)
+    smaller = mask.replace(subaperture_diameter=0.1)
+    square = mask.replace(shape=Square())
+    others = [(smaller, 3, 0.2, 20.0), (square, 3, 0.2, 20.0), (mask, 3, 0.1, 20.0), (mask, 3, 0.2, 10.0)]
+    assert not any(torch.allclose(modal_covariance(*other), kept, rtol=1e-2) for other in others)
+    assert not torch.allclose(modal_covariance(mask, 3, 0.2, 20.0, 0.3), kept, rtol=1e-2)
+    assert modal_covariance(mask, 6, 0.2, 20.0).shape == (12, 12)
+    with torch.no_grad():
+        mask.centers[1] += 0.2
+    assert not torch.allclose(modal_covariance(mask, 3, 0.2, 20.0), kept, rtol=1e-2)
 
 
 # ---- bad input

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +21,7 @@ from torch import Tensor
 from torchmask.atmosphere.mode_transforms import directions, mode_transforms
 from torchmask.optics.phasor import phasor
 from torchmask.optics.pupil import Aperture
+from torchmask.optics.shape_base import Shape
 from torchmask.optics.zernike import noll
 
 STRUCTURE_CONSTANT = 2 * (24 / 5 * math.gamma(6 / 5)) ** (5 / 6)  # 6.883877
@@ -28,6 +31,7 @@ _VARIANCE_CONSTANT = PSD_CONSTANT * 6 * math.pi / 5  # total variance in units o
 # coupling of sub-apertures, and where it ends.
 _SHARED = 10
 _HIGHEST = 24
+_KEPT = 16  # covariances: a restoration asks for three or four, and the next one of the same mask for the same
 
 
 def require_turbulence(r0: float, outer_scale: float) -> None:
@@ -118,6 +122,7 @@ def modal_covariance(
 
     Notes
     -----
+    The last few covariances are kept, so that the next restoration of the same mask does not compute its own again.
     The covariance is the integral of W(f) M_p(f) M_q(f)* over frequencies, with M the Fourier transforms of the modes.
     For the change, the spectrum is 2 W(f) (1 - J_0(2 pi f drift)) instead of W(f).
     The quadrature has the same form, a Gram matrix, so the result is positive semi-definite to rounding. It is polar:
@@ -140,14 +145,23 @@ def modal_covariance(
             f"centers has shape {tuple(aperture.centers.shape)}: one mask, (n_subapertures, 2), is needed; pass the "
             "masks of a population one by one"
         )
-    centers = aperture.centers.detach().cpu().double()
-    bend = math.pi * aperture.outer_diameter / outer_scale + 2 * noll(n_modes)[0]
-    shared, highest = _SHARED + bend, (_HIGHEST + bend) / aperture.shape.fineness
-    spectrum = _Spectrum(r0, outer_scale, drift)
-    total = _gram(aperture, n_modes, spectrum, centers, 0.0, shared)
-    own = _gram(aperture, n_modes, spectrum, torch.zeros_like(centers[:1]), shared, highest)
-    total = total + torch.kron(torch.eye(len(centers), dtype=own.dtype, device=own.device), own)
-    return ((total + total.T) / 2).to(aperture.centers.device)
+    spectrum = _Spectrum(float(r0), float(outer_scale), None if drift is None else float(drift))
+    return _covariance(_Holes.of(aperture), n_modes, spectrum).to(aperture.centers.device, copy=True)
+
+
+@dataclass(frozen=True)
+class _Holes:
+    """All that the covariance depends on in an aperture, to look up what was computed; `centers` in m."""
+
+    shape: Shape
+    diameter: float
+    centers: tuple[tuple[float, ...], ...]
+    aperture: Aperture = field(compare=False)
+
+    @classmethod
+    def of(cls, aperture: Aperture) -> _Holes:
+        still = aperture.still().to("cpu")
+        return cls(still.shape, still.subaperture_diameter, tuple(map(tuple, still.centers.tolist())), still)
 
 
 class _Spectrum(NamedTuple):
@@ -162,6 +176,18 @@ class _Spectrum(NamedTuple):
         if self.drift is None:
             return phase
         return 2 * phase * (1 - torch.special.bessel_j0(2 * math.pi * self.drift * frequency))
+
+
+@lru_cache(maxsize=_KEPT)
+def _covariance(holes: _Holes, n_modes: int, spectrum: _Spectrum) -> Tensor:
+    """Return the joint covariance (N J, N J); it is kept, so nobody may change it."""
+    aperture, centers = holes.aperture, torch.tensor(holes.centers, dtype=torch.float64, device="cpu")
+    bend = math.pi * aperture.outer_diameter / spectrum.outer_scale + 2 * noll(n_modes)[0]
+    shared, highest = _SHARED + bend, (_HIGHEST + bend) / aperture.shape.fineness
+    total = _gram(aperture, n_modes, spectrum, centers, 0.0, shared)
+    own = _gram(aperture, n_modes, spectrum, torch.zeros_like(centers[:1]), shared, highest)
+    total = total + torch.kron(torch.eye(len(centers), dtype=own.dtype, device=own.device), own)
+    return (total + total.T) / 2
 
 
 def _gram(aperture: Aperture, n_modes: int, spectrum: _Spectrum, places: Tensor, start: float, stop: float) -> Tensor:
