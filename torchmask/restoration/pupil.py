@@ -147,10 +147,10 @@ class SampledPupil(nn.Module):
         aperture, grid = self.aperture, replace(self.grid, wavelength=wavelength)
         samples = sample_holes(centers, aperture.shape, aperture.subaperture_diameter, grid)
         modes = zernike_basis(samples, aperture, self.aberrations.n_modes)  # (N, P, J)
-        is_open = samples.weights > 0
+        chosen = None if with_closed else (samples.weights.flatten() > 0).nonzero().flatten()
 
         def kept(values: Tensor) -> Tensor:  # (N, P, ...), as one list of samples
-            return values.flatten(0, 1) if with_closed else values[is_open]
+            return values.flatten(0, 1) if chosen is None else values.flatten(0, 1).index_select(0, chosen)
 
         mixing = self.aberrations.mixing_at(instant).to(modes).unflatten(0, (len(modes), self.aberrations.n_modes))
         ratio = self.grid.wavelength / wavelength
