@@ -16,7 +16,14 @@ from torchmask.optics.aperture import Aperture
 from torchmask.optics.spikes import leave_out_spikes
 from torchmask.restoration.background import Background, check_known_level, fills_field
 from torchmask.restoration.change import Change
-from torchmask.restoration.noise import FrameNoise, check_errors, even_photons, expected_variance, photon_slope
+from torchmask.restoration.noise import (
+    FrameNoise,
+    check_errors,
+    even_photons,
+    expected_variance,
+    photon_slope,
+    uneven_light,
+)
 
 Array = Tensor | np.ndarray
 
@@ -39,6 +46,8 @@ class FrameStack:
         `variance`
     slope : variance of the photon noise per electron of light, at most 1 without errors
     fills_field : whether the object extends beyond the field
+    light : (T,) mean light of each frame [electrons], with that of the background, for the photon noise of its own;
+        None if the frames are about alike, and have the noise of their mean light
     """
 
     frames: Tensor
@@ -50,6 +59,7 @@ class FrameStack:
     errors: Tensor | None = None
     slope: float = 0.0
     fills_field: bool = False
+    light: Tensor | None = None
 
     @classmethod
     def of(
@@ -75,7 +85,9 @@ class FrameStack:
         slope = min(1.0, variance / float(frames[valid].mean()))
         if errors is not None:
             slope = photon_slope(frames, errors, valid)
-            errors = even_photons(frames, errors, valid, slope)
+        own_light = uneven_light(frames, valid, variance, slope)
+        if errors is not None:
+            errors = even_photons(frames, errors, valid, slope, own_light)
         fills = fills_field(frames, valid, variance)
         free = background.of(frames, fills) if isinstance(background, Background) else Background.NONE
         known = check_known_level(0.0 if isinstance(background, Background) else background, frames)
@@ -93,7 +105,7 @@ class FrameStack:
                 "read twice does: they tell nothing new, but count as much, so leave them out",
                 stacklevel=4,
             )
-        return cls(frames / unit, valid, unit, variance, known, free, errors, slope, fills)
+        return cls(frames / unit, valid, unit, variance, known, free, errors, slope, fills, own_light)
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -106,15 +118,20 @@ class FrameStack:
             valid=self.valid.to(device),
             known=self.known.to(device, dtype),
             errors=None if self.errors is None else self.errors.to(device, dtype),
+            light=None if self.light is None else self.light.to(device, dtype),
         )
 
     @property
     def precision(self) -> Tensor:
-        """Inverse noise variance of the pixels in units of the stack, (T, H, W), or (1, 1, 1) if all are equal."""
+        """Inverse noise variance of the pixels in units of the stack, (T, H, W), or (T, 1, 1) or (1, 1, 1) if those of
+        a frame or all are equal."""
         if self.errors is not None:
             return torch.where(self.valid, self.unit / self.errors, 0).square()
         weight = self.valid.new_ones(1, 1, 1) if bool(self.valid.all()) else self.valid
-        return weight.to(self.frames) * (self.unit**2 / self.variance)
+        weight = weight.to(self.frames)
+        if self.light is None:
+            return weight * (self.unit**2 / self.variance)
+        return weight * (self.unit**2 / (self.variance + self.slope * (self.light - self.light.mean())))[:, None, None]
 
     @property
     def change(self) -> Change:
@@ -152,12 +169,16 @@ class FrameStack:
     @property
     def noise_of_frames(self) -> FrameNoise:
         """Noise of each frame relative to what `precision` says."""
-        return FrameNoise.of(self.frames + self.known / self.unit, self.valid, self.precision, self.grain)
+        light = None if self.light is None else self.light / self.unit
+        return FrameNoise.of(self.frames + self.known / self.unit, self.valid, self.precision, self.grain, light)
 
     @property
     def photon_share(self) -> Tensor:
-        """Fraction of the noise variance that is photon noise of the object, (T, H, W) or (1, 1, 1); 0 if not valid."""
-        return self.precision * self.grain
+        """Fraction of the noise variance that is photon noise of the object, as `precision`; 0 if not valid."""
+        share = self.precision * self.grain
+        if self.light is None:
+            return share
+        return share * (self.frames - self.free.first_guess(self.frames)).mean((1, 2), keepdim=True)
 
 
 def border_brightness(frames: Tensor, valid: Tensor) -> float:

@@ -218,8 +218,8 @@ class MyopicDeconvolution:
         valid : (H, W) or (T, H, W) boolean tensor or array, optional
             False where a pixel is dead or saturated; it is ignored, whatever its value.
         errors : (H, W) or (T, H, W) tensor or array, optional
-            Standard deviations of the pixels' noise [electrons]. Photon noise in them, which follows the frames, is
-            evened out (`even_photons`), so that bright pixels keep their weight. None: the same for all pixels.
+            Standard deviations of the pixels' noise [electrons]. Photon noise in them is evened out (`even_photons`),
+            so that bright pixels keep their weight. None: the same for all pixels of frames of about the same light.
         coefficients : (T, N, J) tensor or array, optional
             Known aberrations [rad rms], which stay fixed (non-blind); the frames choose how heavy the prior is then.
         covariance : (N J, N J) tensor or array, optional

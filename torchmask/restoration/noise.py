@@ -16,6 +16,7 @@ from torchmask.observation import number_frames
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.noise import noise_variance
 
+_UNEVEN = 1.25  # times the least variance of a frame: below, one variance for all costs 1 % of the light at most
 _CLEARLY_MORE = 1.1  # times the expected variance, a few times the error of the estimate from one small frame
 
 
@@ -30,15 +31,19 @@ class FrameNoise(NamedTuple):
     unevenness: Tensor
 
     @classmethod
-    def of(cls, frames: Tensor, valid: Tensor, precision: Tensor, grain: float) -> FrameNoise:
+    def of(
+        cls, frames: Tensor, valid: Tensor, precision: Tensor, grain: float, light: Tensor | None = None
+    ) -> FrameNoise:
         """Return the noise of frames (T, H, W) over their valid pixels.
 
-        The assumed variance is 1 / `precision`, (T, H, W) or (1, 1, 1), of which the photons of a mean pixel are
-        `grain` times its light. Where the light is more by d, the variance is 1 + precision grain d of the assumed one.
-        Of the mean square of that, the part that the noise in d makes is taken off.
+        The assumed variance is 1 / `precision`, which broadcasts to the frames; the photons of a pixel with the light
+        (T,) that it assumes for each frame are `grain` times that light. None: that of a mean pixel of all frames.
+        Where the light is more by d, the variance is 1 + precision grain d of the assumed one. Of the mean square of
+        that, the part that the noise in d makes is taken off.
         """
-        mean, squares, levels = float(frames[valid].mean()), [], []
-        for frame, seen, weight in zip(frames, valid, precision.expand_as(frames), strict=True):
+        means = [float(frames[valid].mean())] * len(frames) if light is None else light.tolist()
+        squares, levels = [], []
+        for frame, seen, weight, mean in zip(frames, valid, precision.expand_as(frames), means, strict=True):
             by_light = grain * weight[seen].double()
             variance = 1 + by_light * (frame[seen].double() - mean)
             levels.append(variance.mean())
@@ -127,11 +132,24 @@ def photon_slope(frames: Tensor, errors: Tensor, valid: Tensor) -> float:
     return max(0.0, float(slopes[int((weight < weight[-1] / 2).sum())]))
 
 
-def even_photons(frames: Tensor, errors: Tensor, valid: Tensor, slope: float) -> Tensor:
-    """Return `errors` (T, H, W) [electrons] whose photon noise is that of a mean valid pixel in all pixels.
+def uneven_light(frames: Tensor, valid: Tensor, variance: float, slope: float) -> Tensor | None:
+    """Return the mean light (T,) of each frame's valid pixels, if clouds make their noise clearly unlike, else None.
+
+    Their noise has `variance` in the mean, which rises by `slope` with the light. A frame of next to no light counts as
+    one that has a hundredth of that variance, so that none can rule the others.
+    """
+    seen = frames.where(valid, 0).sum((1, 2)) / valid.sum((1, 2)).clamp(min=1)
+    light = torch.maximum(seen, frames[valid].mean() - 0.99 * variance / slope) if slope else seen
+    own = variance + slope * (light - frames[valid].mean())
+    return light if float(own.max()) > _UNEVEN * float(own.min()) else None
+
+
+def even_photons(frames: Tensor, errors: Tensor, valid: Tensor, slope: float, light: Tensor | None = None) -> Tensor:
+    """Return `errors` (T, H, W) [electrons] whose photon noise is that of a mean valid pixel in all pixels, or of a
+    pixel with the `light` (T,) of its frame.
 
     True photon noise would weigh bright pixels least, where most of the object is to be seen. Restorations lose by it,
     see docs/tried.md. `slope` is that of `photon_slope`; the rest of the variance stays as it is.
     """
     rest = (errors.square() - slope * frames.clamp(min=0)).clamp(min=0)
-    return (slope * frames[valid].mean() + rest).sqrt()
+    return (slope * (frames[valid].mean() if light is None else light[:, None, None]) + rest).sqrt()
