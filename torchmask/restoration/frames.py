@@ -46,7 +46,7 @@ class FrameStack:
         `variance`
     slope : variance of the photon noise per electron of light, at most 1 without errors
     fills_field : whether the object extends beyond the field
-    light : (T,) mean light of each frame [electrons], with that of the background, for the photon noise of its own;
+    excess : (T,) by how much the mean light of each frame exceeds that of all [electrons], for photon noise of its own;
         None if the frames are about alike, and have the noise of their mean light
     """
 
@@ -59,7 +59,7 @@ class FrameStack:
     errors: Tensor | None = None
     slope: float = 0.0
     fills_field: bool = False
-    light: Tensor | None = None
+    excess: Tensor | None = None
 
     @classmethod
     def of(
@@ -85,9 +85,9 @@ class FrameStack:
         slope = min(1.0, variance / float(frames[valid].mean()))
         if errors is not None:
             slope = photon_slope(frames, errors, valid)
-        own_light = uneven_light(frames, valid, variance, slope)
+        excess = uneven_light(frames, valid, variance, slope)
         if errors is not None:
-            errors = even_photons(frames, errors, valid, slope, own_light)
+            errors = even_photons(frames, errors, valid, slope, excess)
         fills = fills_field(frames, valid, variance)
         free = background.of(frames, fills) if isinstance(background, Background) else Background.NONE
         known = check_known_level(0.0 if isinstance(background, Background) else background, frames)
@@ -105,7 +105,7 @@ class FrameStack:
                 "read twice does: they tell nothing new, but count as much, so leave them out",
                 stacklevel=4,
             )
-        return cls(frames / unit, valid, unit, variance, known, free, errors, slope, fills, own_light)
+        return cls(frames / unit, valid, unit, variance, known, free, errors, slope, fills, excess)
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -118,7 +118,7 @@ class FrameStack:
             valid=self.valid.to(device),
             known=self.known.to(device, dtype),
             errors=None if self.errors is None else self.errors.to(device, dtype),
-            light=None if self.light is None else self.light.to(device, dtype),
+            excess=None if self.excess is None else self.excess.to(device, dtype),
         )
 
     @property
@@ -129,9 +129,9 @@ class FrameStack:
             return torch.where(self.valid, self.unit / self.errors, 0).square()
         weight = self.valid.new_ones(1, 1, 1) if bool(self.valid.all()) else self.valid
         weight = weight.to(self.frames)
-        if self.light is None:
+        if self.excess is None:
             return weight * (self.unit**2 / self.variance)
-        return weight * (self.unit**2 / (self.variance + self.slope * (self.light - self.light.mean())))[:, None, None]
+        return weight * (self.unit**2 / (self.variance + self.slope * self.excess))[:, None, None]
 
     @property
     def change(self) -> Change:
@@ -169,14 +169,14 @@ class FrameStack:
     @property
     def noise_of_frames(self) -> FrameNoise:
         """Noise of each frame relative to what `precision` says."""
-        light = None if self.light is None else self.light / self.unit
-        return FrameNoise.of(self.frames + self.known / self.unit, self.valid, self.precision, self.grain, light)
+        excess = None if self.excess is None else self.excess / self.unit
+        return FrameNoise.of(self.frames + self.known / self.unit, self.valid, self.precision, self.grain, excess)
 
     @property
     def photon_share(self) -> Tensor:
         """Fraction of the noise variance that is photon noise of the object, as `precision`; 0 if not valid."""
         share = self.precision * self.grain
-        if self.light is None:
+        if self.excess is None:
             return share
         return share * (self.frames - self.free.first_guess(self.frames)).mean((1, 2), keepdim=True)
 

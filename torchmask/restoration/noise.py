@@ -16,7 +16,7 @@ from torchmask.observation import number_frames
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.noise import noise_variance
 
-_UNEVEN = 1.25  # times the least variance of a frame: below, one variance for all costs 1 % of the light at most
+_UNEVEN = 1.25  # times the least variance of a frame: below, one variance for all costs 1.3 % of the light at most
 _CLEARLY_MORE = 1.1  # times the expected variance, a few times the error of the estimate from one small frame
 
 
@@ -32,16 +32,17 @@ class FrameNoise(NamedTuple):
 
     @classmethod
     def of(
-        cls, frames: Tensor, valid: Tensor, precision: Tensor, grain: float, light: Tensor | None = None
+        cls, frames: Tensor, valid: Tensor, precision: Tensor, grain: float, excess: Tensor | None = None
     ) -> FrameNoise:
         """Return the noise of frames (T, H, W) over their valid pixels.
 
-        The assumed variance is 1 / `precision`, which broadcasts to the frames; the photons of a pixel with the light
-        (T,) that it assumes for each frame are `grain` times that light. None: that of a mean pixel of all frames.
-        Where the light is more by d, the variance is 1 + precision grain d of the assumed one. Of the mean square of
-        that, the part that the noise in d makes is taken off.
+        The assumed variance is 1 / `precision`, which broadcasts to the frames; of it the photons of a mean pixel are
+        `grain` times its light, with what a frame has in `excess` (T,) of the mean. Where the light is more by d, the
+        variance is 1 + precision grain d of the assumed one. Of the mean square of that, the part that the noise in d
+        makes is taken off.
         """
-        means = [float(frames[valid].mean())] * len(frames) if light is None else light.tolist()
+        mean = float(frames[valid].mean())
+        means = [mean] * len(frames) if excess is None else (mean + excess).tolist()
         squares, levels = [], []
         for frame, seen, weight, mean in zip(frames, valid, precision.expand_as(frames), means, strict=True):
             by_light = grain * weight[seen].double()
@@ -133,23 +134,27 @@ def photon_slope(frames: Tensor, errors: Tensor, valid: Tensor) -> float:
 
 
 def uneven_light(frames: Tensor, valid: Tensor, variance: float, slope: float) -> Tensor | None:
-    """Return the mean light (T,) of each frame's valid pixels, if clouds make their noise clearly unlike, else None.
+    """Return by how much the mean light (T,) of each frame's valid pixels exceeds that of all, if clouds make their
+    noise clearly unlike, else None.
 
     Their noise has `variance` in the mean, which rises by `slope` with the light. A frame of next to no light counts as
     one that has a hundredth of that variance, so that none can rule the others.
     """
-    seen = frames.where(valid, 0).sum((1, 2)) / valid.sum((1, 2)).clamp(min=1)
-    light = torch.maximum(seen, frames[valid].mean() - 0.99 * variance / slope) if slope else seen
-    own = variance + slope * (light - frames[valid].mean())
-    return light if float(own.max()) > _UNEVEN * float(own.min()) else None
+    light = frames.where(valid, 0).sum((1, 2)) / valid.sum((1, 2)).clamp(min=1)
+    excess = light - frames[valid].mean()
+    if slope:
+        excess = excess.clamp(min=-0.99 * variance / slope)
+    own = variance + slope * excess
+    return excess if float(own.max()) > _UNEVEN * float(own.min()) else None
 
 
-def even_photons(frames: Tensor, errors: Tensor, valid: Tensor, slope: float, light: Tensor | None = None) -> Tensor:
-    """Return `errors` (T, H, W) [electrons] whose photon noise is that of a mean valid pixel in all pixels, or of a
-    pixel with the `light` (T,) of its frame.
+def even_photons(frames: Tensor, errors: Tensor, valid: Tensor, slope: float, excess: Tensor | None = None) -> Tensor:
+    """Return `errors` (T, H, W) [electrons] whose photon noise is that of a mean valid pixel in all pixels, with what a
+    frame has in `excess` (T,) of its light.
 
     True photon noise would weigh bright pixels least, where most of the object is to be seen. Restorations lose by it,
     see docs/tried.md. `slope` is that of `photon_slope`; the rest of the variance stays as it is.
     """
     rest = (errors.square() - slope * frames.clamp(min=0)).clamp(min=0)
-    return (slope * (frames[valid].mean() if light is None else light[:, None, None]) + rest).sqrt()
+    light = frames[valid].mean()
+    return (slope * (light if excess is None else light + excess[:, None, None]) + rest).sqrt()
