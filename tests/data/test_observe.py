@@ -135,6 +135,22 @@ def test_saturated_pixels_carry_no_weight_and_are_counted(write_fits, mask, cube
     assert (~seen.valid).nonzero().tolist() == [[0, 9, 12], [1, 9, 12], [2, 9, 12]]
 
 
+def test_a_camera_that_cuts_off_at_a_value_that_no_header_tells_is_noticed_before_calibration(write_fits, mask):
+    """12 bits in a file of 16: after division by a flat the pixels at 4095 would be unequal."""
+    generator = np.random.default_rng(0)
+    axis = np.arange(32) - 16
+    light = 6000 * np.exp(-(axis[:, None] ** 2 + axis**2) / 50)
+    counts = np.minimum(generator.poisson(light, (4, 32, 32)), 4095)
+    path = write_fits("a.fits", counts.astype(np.int16), BUNIT="adu", GAIN=2.0)
+    flat = generator.uniform(0.9, 1.1, (32, 32))
+    n = int((counts == 4095).sum())
+    with pytest.warns(
+        UserWarning, match=rf"a\.fits: {n} pixels in 4 frames are saturated \(4095 at which they pile up"
+    ):
+        seen = read_observation(path, mask, flat=flat)
+    assert np.array_equal(~seen.valid.numpy(), counts == 4095)
+
+
 def test_darks_among_the_files_are_left_out_and_alone_are_refused(write_fits, mask, cube):
     light, dark = write_fits("light.fits", cube), write_fits("dark.fits", cube[0] / 50, IMAGETYP="DARK")
     with pytest.warns(

@@ -11,7 +11,7 @@ from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.detector import Detector
-from torchmask.optics.spikes import find_spikes, leave_out_spikes
+from torchmask.optics.spikes import find_spikes
 from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import make_scene
 
@@ -219,19 +219,3 @@ def test_the_unit_of_frames_does_not_matter_as_long_as_it_is_no_larger_than_an_e
     for factor in (1.0, 1e-3, 1e-9):
         scaled = factor * frames
         assert places(find_spikes(scaled, everywhere(frames), GRID, MASK)) == expected
-
-
-def test_spikes_are_filled_in_and_told():
-    frames = exposures(1e6)
-    hit = frames.clone()
-    hit[3, 30, 12] += 1e5
-    said = r"9 pixels of frames \[3\] of this stack, counted from 0, hold what no optics can make.*\(3, 30, 12\)"
-    with pytest.warns(UserWarning, match=said) as told:
-        filled, valid = leave_out_spikes(hit, everywhere(hit), GRID, MASK, stacklevel=1)
-    assert told[0].filename == __file__
-    assert places(~valid) == around(3, 30, 12)
-    torch.testing.assert_close(filled[valid], frames[valid], rtol=0, atol=0)
-    assert float(filled[3, 30, 12]) <= float(frames[3].max())
-    same, all_valid = leave_out_spikes(frames, everywhere(frames), GRID, MASK, stacklevel=1)
-    assert same is frames
-    assert bool(all_valid.all())

@@ -128,6 +128,18 @@ def test_a_cosmic_ray_gets_no_weight_and_is_told():
     assert stack.variance == pytest.approx(FrameStack.of(frames, None, GRID, PUPIL, None).variance, rel=0.25)
 
 
+def test_pixels_at_which_a_camera_cuts_off_get_no_weight_and_are_told():
+    """As if they had been marked."""
+    frames = exposures()
+    level = float(frames.quantile(0.98))
+    with pytest.warns(UserWarning, match=rf"hold exactly {level:.5g} electrons.*seems to cut off there"):
+        stack = FrameStack.of(frames.clamp(max=level), None, GRID, PUPIL, None)
+    marked = FrameStack.of(frames, frames < level, GRID, PUPIL, None)
+    assert torch.equal(stack.valid, frames < level)
+    assert torch.equal(stack.frames, marked.frames)
+    assert stack.variance == marked.variance
+
+
 def test_a_bright_border_is_noticed():
     """And what its light is taken for."""
     for assumed, taken in ((Background.NONE, "an object that extends beyond"), (Background.PER_FRAME, "for a sky")):

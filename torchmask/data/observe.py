@@ -22,6 +22,7 @@ from torchmask.grid import Grid
 from torchmask.numbers import whole_number
 from torchmask.observation import Observation
 from torchmask.optics.aperture import Aperture
+from torchmask.optics.saturation import find_saturated
 
 PathLike = str | Path
 
@@ -81,7 +82,7 @@ def read_observation(
         Read-out noise [electrons rms]. Header: RDNOISE, READNOIS. It may remain unknown.
     saturation : float, optional
         Value in the file, in its unit, at and above which a pixel is saturated and not valid. Header: SATURATE, or
-        FULLWELL [electrons].
+        FULLWELL [electrons]. Without them it is the largest value, if pixels pile up there (`find_saturated`).
     dark : path or (H, W) array, optional
         Dark image in the units of the file, of the same exposure time. Of a cube the median is used, as for `flat` and
         `bad_pixels`.
@@ -164,7 +165,7 @@ def read_observation(
     stacks, headers = [], []
     for file, factor in zip(files, factors, strict=True):
         full = keywords.saturation(file.header, file.path, factor, saturation)
-        stack, header = _stack(_below(file, full), factor, images, crop, target, blur)
+        stack, header = _stack(_mark_saturated(file, full), factor, images, crop, target, blur)
         stacks.append(stack)
         headers.append(header)
     frames = np.concatenate([stack[0] for stack in stacks])
@@ -191,13 +192,22 @@ def read_observation(
     ).take(kept)
 
 
-def _below(file: FITSImages, full: float | None) -> FITSImages:
-    """Mark pixels of the value `full` or more, in the unit of the file, as not valid, with a warning."""
-    spoilt = np.zeros_like(file.valid) if full is None else file.valid & (file.values >= full)
+def _mark_saturated(file: FITSImages, full: float | None) -> FITSImages:
+    """Mark pixels of the value `full` or more, in the unit of the file, as not valid, with a warning.
+
+    If it is None, as it often is, it is the value at which pixels pile up, if there is one.
+    """
+    why = "or more"
+    if full is None:
+        piled = find_saturated(torch.from_numpy(file.values), torch.from_numpy(file.valid)).numpy()
+        if not piled.any():
+            return file
+        full, why = file.values[piled].min(), "at which they pile up"
+    spoilt = file.valid & (file.values >= full)
     if not spoilt.any():
         return file
     warnings.warn(
-        f"{file.path}: {spoilt.sum()} pixels in {spoilt.any((1, 2)).sum()} frames are saturated ({full:.5g} or more) "
+        f"{file.path}: {spoilt.sum()} pixels in {spoilt.any((1, 2)).sum()} frames are saturated ({full:.5g} {why}) "
         "and ignored",
         stacklevel=3,
     )

@@ -34,7 +34,7 @@ from torchmask.observation import check_frames
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.geometry import MaskGeometry, turn_and_stretch
 from torchmask.optics.pixel import PixelResponse, SquarePixel
-from torchmask.optics.spikes import leave_out_spikes
+from torchmask.optics.unmarked import leave_out_unmarked
 from torchmask.record import Callback, Record
 
 _REACH = 1.6  # radius of the pixels compared [wavelength / hole diameter]: beyond the first dark ring of a hole
@@ -201,7 +201,7 @@ def calibrate_mask(
     if estimate_pixel and pixel is not None:
         raise ValueError(f"pixel is {pixel}, which is known, and estimate_pixel is true: leave one of them out")
     frames, valid = (values.cpu() for values in check_frames(frames, valid, grid))
-    frames, valid = leave_out_spikes(frames, valid, grid, aperture, stacklevel=2)
+    frames, valid = leave_out_unmarked(frames, valid, grid, aperture, stacklevel=2)
     reach = min(math.ceil(_REACH * grid.period / aperture.subaperture_diameter), (min(grid.shape) - 1) // 2)
     star = StarFrames.around(frames, valid, reach)
     centers = aperture.centers.detach().double().cpu()

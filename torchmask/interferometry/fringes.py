@@ -17,7 +17,7 @@ from torchmask.interferometry.visibilities import sky_stations, triangle_sides
 from torchmask.observation import Observation, check_frames
 from torchmask.optics.noise import noise_variance
 from torchmask.optics.phasor import phasor
-from torchmask.optics.spikes import leave_out_spikes
+from torchmask.optics.unmarked import leave_out_unmarked
 
 
 def frame_observables(observation: Observation) -> Observables:
@@ -50,7 +50,8 @@ def frame_observables(observation: Observation) -> Observables:
 
     Notes
     -----
-    Cosmic rays and hot pixels that stand out beyond the cut-off get no weight, and are told (`find_spikes`).
+    Saturated pixels get no weight, nor do cosmic rays and hot pixels that stand out beyond the cut-off, and a warning
+    tells of them (`find_saturated`, `find_spikes`).
     The variances of light and fringes are subtracted from their squares, and the mean contribution of the pixels' noise
     from triple products (Wirnitzer 1985, J. Opt. Soc. Am. A 2, 14, for photon noise), so that means are unbiased even
     for few photons. All frames share the centre of their mean. Light at an angle s from it is attenuated by the overlap
@@ -73,7 +74,7 @@ def frame_observables(observation: Observation) -> Observables:
     aperture, grid = observation.aperture, observation.grid
     model = FringeModel(aperture, grid, observation.pixel)
     frames, valid = (values.cpu() for values in check_frames(observation.frames, observation.valid, grid))
-    frames, valid = leave_out_spikes(frames, valid, grid, aperture, stacklevel=2)
+    frames, valid = leave_out_unmarked(frames, valid, grid, aperture, stacklevel=2)
     fit = fit_fringes(frames, valid, _pixel_noise(observation, frames, valid), model)
     n = aperture.n_subapertures
     values, noise = fit.fringes * n, fit.fringe_noise * n**2

@@ -8,7 +8,6 @@ A times the share of the plane that lies there, whatever the object. Hits of sev
 from __future__ import annotations
 
 import math
-import warnings
 
 import torch
 from torch import Tensor
@@ -16,7 +15,6 @@ from torch.nn.functional import max_pool2d, pad
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture
-from torchmask.optics.bad_pixels import fill_bad_pixels
 from torchmask.optics.fading import beyond_faded, fading
 from torchmask.optics.noise import FEWEST, fill_with_least_power
 
@@ -29,29 +27,6 @@ _AROUND = 7  # the same among which the noise is alike
 _UNEVEN = 0.02  # error of the flat, and of what is left of borders, over the light
 _MOST = 0.05  # of all pixels: if there are more, what is beyond the cut-off is light after all
 _MEDIAN = 0.4549  # of the square of a normal deviate, over its mean
-
-
-def leave_out_spikes(
-    frames: Tensor, valid: Tensor, grid: Grid, aperture: Aperture, stacklevel: int
-) -> tuple[Tensor, Tensor]:
-    """Return frames (T, H, W) with spikes filled in, and `valid` (T, H, W) without them.
-
-    If there are any, a warning says so, as if it were raised `stacklevel` calls above.
-    """
-    found = find_spikes(frames, valid, grid, aperture)
-    if not bool(found.any()):
-        return frames, valid
-    where = torch.where(found, frames, -math.inf).argmax()
-    place = tuple(int(one) for one in torch.unravel_index(where, frames.shape))
-    numbers = found.any(2).any(1).nonzero()[:, 0].tolist()
-    warnings.warn(
-        f"{int(found.sum())} pixels of frames {numbers} of this stack, counted from 0, hold what no optics can make, "
-        f"such as cosmic rays, hot and dead pixels, or lie beside it; the brightest has {float(frames[place]):.3g} "
-        f"electrons at (frame, row, column) {place}. They get no weight, as if they were marked in `valid`",
-        stacklevel=stacklevel + 1,
-    )
-    valid = valid & ~found
-    return fill_bad_pixels(frames, valid), valid
 
 
 def find_spikes(frames: Tensor, valid: Tensor, grid: Grid, aperture: Aperture) -> Tensor:

@@ -13,7 +13,8 @@ from torch import Tensor
 from torchmask.grid import Grid
 from torchmask.observation import check_frames
 from torchmask.optics.aperture import Aperture
-from torchmask.optics.spikes import leave_out_spikes
+from torchmask.optics.copies import copies_among
+from torchmask.optics.unmarked import leave_out_unmarked
 from torchmask.restoration.background import Background, check_known_level, fills_field
 from torchmask.restoration.change import Change
 from torchmask.restoration.noise import (
@@ -75,11 +76,12 @@ class FrameStack:
         """Check `frames` (T, H, W) [electrons] and measure their noise.
 
         `grid` is that of the shortest wavelength; `readout_noise` [electrons rms] may be None. Raises ValueError as
-        `check_frames`, `check_errors` and `expected_variance` do. Warns of frames that repeat others, of cosmic
-        rays and hot pixels, which get no weight, and if the object seems to extend beyond the field.
+        `check_frames`, `leave_out_unmarked`, `check_errors` and `expected_variance` do. Warns of frames that repeat
+        others, of saturated pixels, cosmic rays and hot pixels, which get no weight, and if the object seems to extend
+        beyond the field.
         """
         frames, valid = check_frames(frames, valid, grid)
-        frames, valid = leave_out_spikes(frames, valid, grid, aperture, stacklevel=4)
+        frames, valid = leave_out_unmarked(frames, valid, grid, aperture, stacklevel=4)
         errors = None if errors is None else check_errors(errors, frames, valid)
         variance = expected_variance(frames, grid, aperture, readout_noise, valid, errors)
         slope = min(1.0, variance / float(frames[valid].mean()))
@@ -202,22 +204,3 @@ def _what_light_is_taken_for(free: Background) -> str:
         "much of the light is even or at the border, and what is even is taken for a sky: give its level [electrons "
         "per pixel] if you know it, or tell that there is none (Background.NONE) if the object extends beyond the field"
     )
-
-
-def copies_among(frames: Tensor) -> list[int]:
-    """Return the numbers of the frames (T, H, W) that equal an earlier one in all pixels.
-
-    Examples
-    --------
-    >>> copies_among(torch.tensor([1.0, 2.0, 1.0, 1.0])[:, None, None])
-    [2, 3]
-    """
-    first: dict[float, list[int]] = {}
-    copies = []
-    for number, light in enumerate(frames.sum((1, 2)).tolist()):
-        alike = first.setdefault(light, [])
-        if any(torch.equal(frames[number], frames[other]) for other in alike):
-            copies.append(number)
-        else:
-            alike.append(number)
-    return copies

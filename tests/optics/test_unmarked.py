@@ -1,0 +1,80 @@
+"""Saturated pixels and spikes that nobody has marked: filled in, without weight, and told."""
+
+import pytest
+import torch
+
+from torchmask.atmosphere.phase import TurbulencePhase
+from torchmask.grid import Grid
+from torchmask.optics.aperture import SparseAperture
+from torchmask.optics.detector import Detector
+from torchmask.optics.unmarked import leave_out_unmarked
+from torchmask.simulation.exposures import simulate_observation
+from torchmask.simulation.scene import make_scene
+
+GRID = Grid.nyquist(1.0, 550e-9, 48)
+MASK = SparseAperture.from_catalog("golay9", 1.0, fill_factor=0.15)
+
+
+@pytest.fixture(scope="module")
+def frames():
+    """Six frames of 1e6 electrons."""
+    generator = torch.Generator().manual_seed(0)
+    scene, turbulence = make_scene(GRID.shape, 1e6), TurbulencePhase(0.2, 20.0)
+    return simulate_observation(scene, MASK, GRID, turbulence, Detector(1.5), 6, generator=generator).frames.double()
+
+
+def leave_out(frames):
+    return leave_out_unmarked(frames, torch.ones_like(frames, dtype=torch.bool), GRID, MASK, stacklevel=1)
+
+
+def test_frames_without_any_stay_as_they_are(frames):
+    same, valid = leave_out(frames)
+    assert same is frames
+    assert bool(valid.all())
+
+
+def test_spikes_are_filled_in_and_told(frames):
+    hit = frames.clone()
+    hit[3, 30, 12] += 1e5
+    said = r"9 pixels of frames \[3\] of this stack, counted from 0, hold what no optics can make.*\(3, 30, 12\)"
+    with pytest.warns(UserWarning, match=said) as told:
+        filled, valid = leave_out(hit)
+    assert told[0].filename == __file__
+    around = {(3, y, x) for y in range(29, 32) for x in range(11, 14)}
+    assert {tuple(place) for place in (~valid).nonzero().tolist()} == around
+    torch.testing.assert_close(filled[valid], frames[valid], rtol=0, atol=0)
+    assert float(filled[3, 30, 12]) <= float(frames[3].max())
+
+
+def test_saturated_pixels_are_filled_in_and_told(frames):
+    level = float(frames.quantile(0.99, interpolation="lower"))
+    with pytest.warns(UserWarning, match="seems to cut off there") as told:
+        filled, valid = leave_out(frames.clamp(max=level))
+    assert torch.equal(valid, frames < level)
+    n, numbers = int((~valid).sum()), (~valid).any(2).any(1).nonzero()[:, 0].tolist()
+    start = f"{n} pixels of frames {numbers} of this stack, counted from 0, (0.01 of all) hold exactly {level:.5g} e"
+    assert str(told[0].message).startswith(start)
+    assert len(told) == 1
+    assert told[0].filename == __file__
+    torch.testing.assert_close(filled[valid], frames[valid], rtol=0, atol=0)
+
+
+def test_spikes_are_found_beside_saturated_pixels(frames):
+    """A hit in a dark corner that does not reach the value at which the camera cuts off."""
+    level = float(frames.quantile(0.99, interpolation="lower"))
+    hit = frames.clamp(max=level)
+    hit[4, 12, 40] = level - 1
+    with pytest.warns(UserWarning, match="this stack") as told:
+        _, valid = leave_out(hit)
+    assert ["seems to cut off" in str(one.message) for one in told] == [True, False]
+    assert not bool(valid[4, 12, 40])
+
+
+def test_a_frame_without_any_other_pixel_is_refused(frames):
+    spoilt = frames.clone()
+    spoilt[2] = float(frames.max()) + 1
+    with (
+        pytest.warns(UserWarning, match="seems to cut off"),
+        pytest.raises(ValueError, match=r"frames \[2\] of this stack.* are saturated everywhere: leave them out"),
+    ):
+        leave_out(spoilt)
