@@ -1,4 +1,4 @@
-"""Saturated pixels and spikes that nobody has marked: filled in, without weight, and told."""
+"""Saturated and dead pixels and spikes that nobody has marked: filled in, without weight, and told."""
 
 import pytest
 import torch
@@ -56,6 +56,19 @@ def test_saturated_pixels_are_filled_in_and_told(frames):
     assert str(told[0].message).startswith(start)
     assert len(told) == 1
     assert told[0].filename == __file__
+    torch.testing.assert_close(filled[valid], frames[valid], rtol=0, atol=0)
+
+
+def test_dead_pixels_are_filled_in_and_told(frames):
+    spoilt = frames.clone()
+    spoilt[:, :, 20] = 0.0
+    said = r"^48 pixels \(0.021 of all\) hold one value in all frames of this stack, as dead ones"
+    with pytest.warns(UserWarning, match=said) as told:
+        filled, valid = leave_out(spoilt)
+    assert len(told) == 1
+    assert told[0].filename == __file__
+    assert not bool(valid[:, :, 20].any())
+    assert int(valid.sum()) == 6 * 48 * 47
     torch.testing.assert_close(filled[valid], frames[valid], rtol=0, atol=0)
 
 

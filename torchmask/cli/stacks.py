@@ -44,8 +44,8 @@ class FITSOptions:
     gain: float | None = None
     """Gain [electrons per adu]; None: from the header (EGAIN, GAIN)."""
     saturation: float | None = None
-    """Value in the file, in its unit, at which pixels saturate; None: from the header (SATURATE, FULLWELL), or where pixels
-    pile up."""
+    """Value in the file, in its unit, at which pixels saturate; None: from the header (SATURATE, FULLWELL), or where
+    pixels pile up."""
     dark: Path | None = None
     """FITS image to subtract, in the units of the files."""
     flat: Path | None = None

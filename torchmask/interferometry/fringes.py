@@ -50,8 +50,8 @@ def frame_observables(observation: Observation) -> Observables:
 
     Notes
     -----
-    Saturated pixels get no weight, nor do cosmic rays and hot pixels that stand out beyond the cut-off, and a warning
-    tells of them (`find_saturated`, `find_spikes`).
+    Saturated and dead pixels get no weight, nor do cosmic rays and hot pixels that stand out beyond the cut-off, and
+    warnings tell of them (`find_saturated`, `find_dead`, `find_spikes`).
     The variances of light and fringes are subtracted from their squares, and the mean contribution of the pixels' noise
     from triple products (Wirnitzer 1985, J. Opt. Soc. Am. A 2, 14, for photon noise), so that means are unbiased even
     for few photons. All frames share the centre of their mean. Light at an angle s from it is attenuated by the overlap

@@ -1,4 +1,4 @@
-"""Pixels of frames that tell nothing true and that nobody has marked: saturated ones and spikes."""
+"""Pixels of frames that tell nothing true and that nobody has marked: saturated ones, dead ones and spikes."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from torch import Tensor
 from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.bad_pixels import fill_bad_pixels
+from torchmask.optics.dead import find_dead
 from torchmask.optics.saturation import find_saturated
 from torchmask.optics.spikes import find_spikes
 
@@ -20,7 +21,7 @@ _NO_WEIGHT = "They get no weight, as if they were marked in `valid`"
 def leave_out_unmarked(
     frames: Tensor, valid: Tensor, grid: Grid, aperture: Aperture, stacklevel: int
 ) -> tuple[Tensor, Tensor]:
-    """Return frames (T, H, W) with saturated pixels and spikes filled in, and `valid` (T, H, W) without them.
+    """Return frames (T, H, W) with saturated and dead pixels and spikes filled in, and `valid` (T, H, W) without them.
 
     If there are any, a warning says so, as if it were raised `stacklevel` calls above. Raises ValueError if no pixel of
     a frame is left.
@@ -29,6 +30,10 @@ def leave_out_unmarked(
     if bool(saturated.any()):
         warnings.warn(_what_is_cut_off(frames, saturated, int(valid.sum())), stacklevel=stacklevel + 1)
         frames, valid = _fill(frames, valid & ~saturated)
+    dead = find_dead(frames, valid)
+    if bool(dead.any()):
+        warnings.warn(_what_is_dead(dead), stacklevel=stacklevel + 1)
+        frames, valid = _fill(frames, valid & ~dead)
     spikes = find_spikes(frames, valid, grid, aperture)
     if bool(spikes.any()):
         warnings.warn(_what_stands_out(frames, spikes), stacklevel=stacklevel + 1)
@@ -48,6 +53,13 @@ def _what_is_cut_off(frames: Tensor, saturated: Tensor, n_valid: int) -> str:
         f"{_count(saturated)} ({int(saturated.sum()) / n_valid:.2g} of all) hold exactly "
         f"{float(frames[saturated][0]):.5g} electrons, the largest value of all, so the camera seems to cut off there. "
         f"{_NO_WEIGHT}"
+    )
+
+
+def _what_is_dead(dead: Tensor) -> str:
+    return (
+        f"{int(dead[0].sum())} pixels ({float(dead[0].double().mean()):.2g} of all) hold one value in all frames of "
+        f"this stack, as dead ones or a border that was filled up. {_NO_WEIGHT}"
     )
 
 

@@ -77,8 +77,8 @@ class FrameStack:
 
         `grid` is that of the shortest wavelength; `readout_noise` [electrons rms] may be None. Raises ValueError as
         `check_frames`, `leave_out_unmarked`, `check_errors` and `expected_variance` do. Warns of frames that repeat
-        others, of saturated pixels, cosmic rays and hot pixels, which get no weight, and if the object seems to extend
-        beyond the field.
+        others, of saturated, dead and hot pixels and cosmic rays, which get no weight, and if the object seems to
+        extend beyond the field.
         """
         frames, valid = check_frames(frames, valid, grid)
         frames, valid = leave_out_unmarked(frames, valid, grid, aperture, stacklevel=4)
