@@ -130,7 +130,7 @@ def test_errors_are_in_electrons_and_bad_pixels_are_not_valid(write_fits, mask, 
 def test_saturated_pixels_carry_no_weight_and_are_counted(write_fits, mask, cube, cards, given):
     """The star's pixel alone is above 1e5 adu, of 2 electrons; the dark that is taken off does not hide it."""
     path = write_fits("a.fits", cube, BUNIT="adu", GAIN=2.0, **cards)
-    with pytest.warns(UserWarning, match=r"a\.fits: 3 pixels in 3 frames are saturated \(1e\+05 or more\)"):
+    with pytest.warns(UserWarning, match=r"a\.fits: 3 pixels in 3 frames are saturated \(100000 or more\)"):
         seen = read_observation(path, mask, dark=np.full((16, 20), 90.0), **given)
     assert (~seen.valid).nonzero().tolist() == [[0, 9, 12], [1, 9, 12], [2, 9, 12]]
 
@@ -144,11 +144,25 @@ def test_a_camera_that_cuts_off_at_a_value_that_no_header_tells_is_noticed_befor
     path = write_fits("a.fits", counts.astype(np.int16), BUNIT="adu", GAIN=2.0)
     flat = generator.uniform(0.9, 1.1, (32, 32))
     n = int((counts == 4095).sum())
-    with pytest.warns(
-        UserWarning, match=rf"a\.fits: {n} pixels in 4 frames are saturated \(4095 at which they pile up"
-    ):
+    said = rf"a\.fits: {n} pixels in 4 frames are saturated \(4095 at which they pile up\) and ignored"
+    with pytest.warns(UserWarning, match=said):
         seen = read_observation(path, mask, flat=flat)
     assert np.array_equal(~seen.valid.numpy(), counts == 4095)
+    # hot pixels that a map marks may hold more
+    bad = np.zeros((32, 32), dtype=int)
+    bad[3, 4] = 1
+    counts[:, 3, 4] = 30000
+    hot = write_fits("b.fits", counts.astype(np.int16), BUNIT="adu", GAIN=2.0)
+    with pytest.warns(UserWarning, match="saturated"):
+        seen = read_observation(hot, mask, flat=flat, bad_pixels=bad)
+    assert np.array_equal(~seen.valid.numpy(), counts >= 4095)
+    # a few pixels in each of several files pile up, too
+    some = np.minimum(generator.poisson(4200 * light / 6000, (6, 32, 32)), 4095)
+    assert (some == 4095).sum((1, 2)).max() < 9
+    files = [write_fits(f"{k}.fits", one.astype(np.int16), BUNIT="adu", GAIN=2.0) for k, one in enumerate(some)]
+    with pytest.warns(UserWarning, match="saturated"):
+        seen = read_observation(files, mask, flat=flat)
+    assert np.array_equal(~seen.valid.numpy(), some == 4095)
 
 
 def test_darks_among_the_files_are_left_out_and_alone_are_refused(write_fits, mask, cube):

@@ -49,9 +49,11 @@ def test_counts_that_are_cut_off_are_found_whatever_their_unit(log_photons, shar
 def test_light_with_noise_of_no_step_needs_few_pixels_and_has_no_equal_ones_by_itself():
     frames = counts(1e6) + torch.randn(5, 40, 40, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     assert not bool(find_saturated(frames, everywhere(frames)).any())
-    for n in (ALIKE, ALIKE + 1):
-        cut_off = frames.clamp(max=float(frames.flatten().topk(n).values[-1]))
-        assert int(find_saturated(cut_off, everywhere(cut_off)).sum()) == (n if n > ALIKE else 0)
+    for more in (ALIKE, ALIKE + 1):  # of the third frame, which has one of its own
+        cut_off = frames.clone()
+        cut_off[2] = frames[2].clamp(max=float(frames[2].flatten().topk(more + 1).values[-1]))
+        cut_off[2] += 1e4  # brighter than the others
+        assert int(find_saturated(cut_off, everywhere(cut_off)).sum()) == (more + 1 if more > ALIKE else 0)
 
 
 def tail(n, of, chance):
@@ -66,13 +68,13 @@ def test_as_many_pixels_are_saturated_as_chance_does_not_explain(top, near):
     there, but for one, that is largest by definition: exact tails of binomials say how many are too many."""
     below = max(1, int(0.03 * top))
     one = Fraction(1, below + 1)
-    least = next(n for n in range(ALIKE + 1, 1000) if tail(n - 1, n - 1 + near, one) < CHANCE)
+    least = next(n for n in range(ALIKE + 2, 1000) if tail(n - 1, n - 1 + near, one) < CHANCE)
     ranks = torch.arange(near) % below
     others = torch.arange(1200) % (top - below)  # all values further down, so that the step is 1
     for n in (least - 1, least):
         values = torch.cat([torch.full((n,), top), top - 1 - ranks, others]).double()
         frames = torch.cat([values, torch.zeros(-len(values) % 20)]).reshape(1, -1, 20)
-        assert int(find_saturated(frames, everywhere(frames)).sum()) == (n if n == least and n > ALIKE else 0)
+        assert int(find_saturated(frames, everywhere(frames)).sum()) == (n if n == least else 0)
 
 
 def test_frames_that_repeat_others_do_not_count():
@@ -82,12 +84,26 @@ def test_frames_that_repeat_others_do_not_count():
     assert not bool(find_saturated(again, everywhere(again)).any())
 
 
-def test_one_pixel_that_is_cut_off_in_many_frames_is_found_in_all_and_once_more_in_a_copy():
-    frames = counts(1e4, n_frames=12)
-    frames[:, 20, 20] = 4095
-    frames = torch.cat([frames, frames[:1]])
+def test_frames_scaled_by_their_own_largest_value_or_mean_have_no_saturation():
+    """Whatever they hold: one pixel of each frame is at 1; counts of a frame keep steps of their own."""
+    for n_photons in (300, 1e5):
+        frames = counts(n_photons, n_frames=40)
+        for scale in (frames.amax((1, 2)), frames.mean((1, 2)), 2.0 + 0.1 * (torch.arange(40) % 2)):
+            scaled = frames / scale[:, None, None]
+            assert not bool(find_saturated(scaled, everywhere(scaled)).any())
+    single = (counts(100, 40.0, 12) > 0).double()
+    for frames in (single / single.mean((1, 2), keepdim=True), single - single.mean((1, 2), keepdim=True)):
+        assert not bool(find_saturated(frames, everywhere(frames)).any())
+
+
+def test_whole_numbers_of_any_type_and_frames_that_are_cut_off_everywhere():
+    frames = counts(1e6).clamp(max=1000)
+    for dtype in (torch.int16, torch.int64, torch.float32):
+        assert torch.equal(find_saturated(frames.to(dtype), everywhere(frames)), frames == 1000)
+    frames = counts(1e6, n_frames=6)
+    frames[2] = frames.max() + 1
     found = find_saturated(frames, everywhere(frames))
-    assert found.nonzero().tolist() == [[number, 20, 20] for number in range(13)]
+    assert found.all(2).all(1).tolist() == [number == 2 for number in range(6)]
 
 
 def test_pixels_that_are_not_valid_neither_hide_nor_make_saturation():
@@ -95,8 +111,11 @@ def test_pixels_that_are_not_valid_neither_hide_nor_make_saturation():
     valid = everywhere(frames)
     valid[:, 0, :] = False
     spoilt = frames.clone()
-    spoilt[:, 0, 0], spoilt[:, 0, 1] = math.inf, math.nan
+    spoilt[:, 0, 0], spoilt[:, 0, 1], spoilt[:, 0, 2] = math.inf, math.nan, 1000.0
     assert torch.equal(find_saturated(spoilt, valid), frames == 1000.0)
+    again = counts(1e5, n_frames=1).repeat(50, 1, 1)
+    again[:, 0, 1] = math.nan
+    assert not bool(find_saturated(again, valid[:1].expand_as(again)).any())
     spoilt = counts(1e6)
     spoilt[:, 0, :] = 1e6
     assert not bool(find_saturated(spoilt, valid).any())

@@ -51,12 +51,31 @@ def test_saturated_pixels_are_filled_in_and_told(frames):
     with pytest.warns(UserWarning, match="seems to cut off there") as told:
         filled, valid = leave_out(frames.clamp(max=level))
     assert torch.equal(valid, frames < level)
-    n, numbers = int((~valid).sum()), (~valid).any(2).any(1).nonzero()[:, 0].tolist()
-    start = f"{n} pixels of frames {numbers} of this stack, counted from 0, (0.01 of all) hold exactly {level:.5g} e"
+    n, n_frames = int((~valid).sum()), int((~valid).any(2).any(1).sum())
+    start = f"{n} pixels (0.01 of all) in {n_frames} of 6 frames hold {level:.10g}, the largest value of all"
     assert str(told[0].message).startswith(start)
     assert len(told) == 1
     assert told[0].filename == __file__
     torch.testing.assert_close(filled[valid], frames[valid], rtol=0, atol=0)
+
+
+def test_what_is_marked_already_counts_neither_as_dead_nor_as_saturated(frames):
+    """A border that is marked, of zeros or above all, is no news; shares are of the pixels that were valid."""
+    marked = torch.ones_like(frames, dtype=torch.bool)
+    marked[:, :24] = False
+    for value in (0.0, 1e9):
+        spoilt = torch.where(marked, frames, value)
+        same, valid = leave_out_unmarked(spoilt, marked, GRID, MASK, stacklevel=1)
+        assert same is spoilt
+        assert torch.equal(valid, marked)
+    spoilt = torch.where(marked, frames, 0.0)
+    spoilt[:, 24:, 40] = 5.0
+    with pytest.warns(UserWarning, match=r"^24 pixels \(0.021 of all\) hold one value"):
+        leave_out_unmarked(spoilt, marked, GRID, MASK, stacklevel=1)
+    level = float(frames[marked].quantile(0.9, interpolation="lower"))
+    cut_off = torch.where(marked, frames.clamp(max=level), 0.0)
+    with pytest.warns(UserWarning, match=r"^\d+ pixels \(0.1 of all\) in 6 of 6 frames"):
+        leave_out_unmarked(cut_off, marked, GRID, MASK, stacklevel=1)
 
 
 def test_dead_pixels_are_filled_in_and_told(frames):
@@ -77,7 +96,7 @@ def test_spikes_are_found_beside_saturated_pixels(frames):
     level = float(frames.quantile(0.99, interpolation="lower"))
     hit = frames.clamp(max=level)
     hit[4, 12, 40] = level - 1
-    with pytest.warns(UserWarning, match="this stack") as told:
+    with pytest.warns(UserWarning, match="They get no weight") as told:
         _, valid = leave_out(hit)
     assert ["seems to cut off" in str(one.message) for one in told] == [True, False]
     assert not bool(valid[4, 12, 40])

@@ -162,10 +162,11 @@ def read_observation(
     ]
 
     blur = max(1.0, lengths[0] / aperture.extent / scales[0] / 2)
+    full = [keywords.saturation(f.header, f.path, factor, saturation) for f, factor in zip(files, factors, strict=True)]
+    piled = _piled_up(files, images[2]) if None in full else None
     stacks, headers = [], []
-    for file, factor in zip(files, factors, strict=True):
-        full = keywords.saturation(file.header, file.path, factor, saturation)
-        stack, header = _stack(_mark_saturated(file, full), factor, images, crop, target, blur)
+    for file, factor, level in zip(files, factors, full, strict=True):
+        stack, header = _stack(_mark_saturated(file, level, piled), factor, images, crop, target, blur)
         stacks.append(stack)
         headers.append(header)
     frames = np.concatenate([stack[0] for stack in stacks])
@@ -192,22 +193,22 @@ def read_observation(
     ).take(kept)
 
 
-def _mark_saturated(file: FITSImages, full: float | None) -> FITSImages:
-    """Mark pixels of the value `full` or more, in the unit of the file, as not valid, with a warning.
+def _piled_up(files: Sequence[FITSImages], bad_pixels: np.ndarray | None) -> float | None:
+    """Return the value in the files, all together, at which good pixels pile up, or None if there is none."""
+    values, valid = (np.concatenate(part) for part in ([f.values for f in files], [f.valid for f in files]))
+    good = torch.from_numpy(valid if bad_pixels is None else valid & (bad_pixels == 0))
+    piled = find_saturated(torch.from_numpy(values), good).numpy()
+    return float(values[piled][0]) if piled.any() else None
 
-    If it is None, as it often is, it is the value at which pixels pile up, if there is one.
-    """
-    why = "or more"
-    if full is None:
-        piled = find_saturated(torch.from_numpy(file.values), torch.from_numpy(file.valid)).numpy()
-        if not piled.any():
-            return file
-        full, why = file.values[piled].min(), "at which they pile up"
-    spoilt = file.valid & (file.values >= full)
+
+def _mark_saturated(file: FITSImages, full: float | None, piled: float | None) -> FITSImages:
+    """Mark pixels of the value `full`, or of `piled` if it is not known, or more as not valid, with a warning."""
+    level, why = (piled, "at which they pile up") if full is None else (full, "or more")
+    spoilt = np.zeros_like(file.valid) if level is None else file.valid & (file.values >= level)
     if not spoilt.any():
         return file
     warnings.warn(
-        f"{file.path}: {spoilt.sum()} pixels in {spoilt.any((1, 2)).sum()} frames are saturated ({full:.5g} {why}) "
+        f"{file.path}: {spoilt.sum()} pixels in {spoilt.any((1, 2)).sum()} frames are saturated ({level:.10g} {why}) "
         "and ignored",
         stacklevel=3,
     )

@@ -23,12 +23,13 @@ _MOST = 0.5  # of all pixels: if there are more, as in frames of zeros and ones,
 def find_saturated(frames: Tensor, valid: Tensor) -> Tensor:
     """Return which valid pixels of `frames` (T, H, W) hold a value at which a camera has cut them off, (T, H, W) bool.
 
-    That is the largest value of all, if more than eight pixels share it to the last digit, and more than chance
-    explains: no value that pixels can take within 3 % below it should be rarer. How many such values there are follows
-    from the smallest difference of two pixels, which is 1 for counts. Frames that repeat earlier ones do not count.
+    That is the largest value of all, if pixels share it to the last digit, but for one in each frame more than eight
+    and more than chance explains: no value that pixels can take within 3 % below it should be rarer. How many such
+    values there are follows from the smallest difference of two pixels of a frame, which is 1 for counts. Frames that
+    repeat earlier ones do not count.
 
-    Pixels that have become unequal since they were cut off, as by a dark or a flat of their own, are not found. Nor are
-    there any if more than half of all pixels share the largest value.
+    Pixels that have become unequal since they were cut off, as by a dark or a flat of their own, are not found, nor are
+    those below a larger value. Nor are there any if more than half of all pixels share the largest value.
 
     Examples
     --------
@@ -37,16 +38,18 @@ def find_saturated(frames: Tensor, valid: Tensor) -> Tensor:
     >>> int(find_saturated(light, everywhere).sum()), int(find_saturated(light.clamp(max=4095), everywhere).sum())
     (0, 73)
     """
-    top = frames.masked_fill(~valid, -math.inf).max()
-    saturated = valid & (frames == top)
+    light = torch.where(valid, frames, 0).double()
+    top = float(light.masked_fill(~valid, -math.inf).max())
+    saturated = valid & (light == top)
     counted = valid.clone()
-    counted[copies_among(frames)] = False
-    n_saturated = int((saturated & counted).sum())
-    if not _ALIKE < n_saturated <= _MOST * int(counted.sum()):
+    counted[copies_among(light)] = False
+    shared = (saturated & counted).sum((1, 2))
+    more = int((shared - 1).clamp(min=0).sum())  # each frame has a largest value, which may have been scaled
+    if more <= _ALIKE or int(shared.sum()) > _MOST * int(counted.sum()):
         return torch.zeros_like(valid)
-    step = float(frames[counted].unique().diff().min())
-    n_below = int(max(1.0, _BELOW * float(top) / step))  # values that pixels could take
-    near = int((counted & ~saturated & (frames > top - (n_below + 0.5) * step)).sum())
-    # one pixel is at the largest value by its definition: of the others, each may be at any
-    chance = binom.sf(n_saturated - 2, n_saturated - 1 + near, 1 / (n_below + 1))
+    steps = [frame[own].unique().diff() for frame, own in zip(light, counted, strict=True)]
+    step = max(float(each.min()) for each in steps if each.numel())
+    n_below = int(max(1.0, _BELOW * top / step))  # values that pixels could take
+    near = int((counted & ~saturated & (light > top - (n_below + 0.5) * step)).sum())
+    chance = binom.sf(more - 1, more + near, 1 / (n_below + 1))
     return saturated if chance < _CHANCE else torch.zeros_like(valid)

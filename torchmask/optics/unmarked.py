@@ -32,7 +32,7 @@ def leave_out_unmarked(
         frames, valid = _fill(frames, valid & ~saturated)
     dead = find_dead(frames, valid)
     if bool(dead.any()):
-        warnings.warn(_what_is_dead(dead), stacklevel=stacklevel + 1)
+        warnings.warn(_what_is_dead(dead, int(valid.sum())), stacklevel=stacklevel + 1)
         frames, valid = _fill(frames, valid & ~dead)
     spikes = find_spikes(frames, valid, grid, aperture)
     if bool(spikes.any()):
@@ -49,29 +49,27 @@ def _fill(frames: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _what_is_cut_off(frames: Tensor, saturated: Tensor, n_valid: int) -> str:
+    n_saturated = int(saturated.sum())
     return (
-        f"{_count(saturated)} ({int(saturated.sum()) / n_valid:.2g} of all) hold exactly "
-        f"{float(frames[saturated][0]):.5g} electrons, the largest value of all, so the camera seems to cut off there. "
-        f"{_NO_WEIGHT}"
+        f"{n_saturated} pixels ({n_saturated / n_valid:.2g} of all) in {int(saturated.any(2).any(1).sum())} of "
+        f"{len(frames)} frames hold {float(frames[saturated][0]):.10g}, the largest value of all, so the camera seems "
+        f"to cut off there. {_NO_WEIGHT}"
     )
 
 
-def _what_is_dead(dead: Tensor) -> str:
+def _what_is_dead(dead: Tensor, n_valid: int) -> str:
     return (
-        f"{int(dead[0].sum())} pixels ({float(dead[0].double().mean()):.2g} of all) hold one value in all frames of "
-        f"this stack, as dead ones or a border that was filled up. {_NO_WEIGHT}"
+        f"{int(dead[0].sum())} pixels ({int(dead.sum()) / n_valid:.2g} of all) hold one value in all frames of this "
+        f"stack, as dead ones or a border that was filled up. {_NO_WEIGHT}"
     )
 
 
 def _what_stands_out(frames: Tensor, spikes: Tensor) -> str:
     where = torch.where(spikes, frames, -math.inf).argmax()
     place = tuple(int(one) for one in torch.unravel_index(where, frames.shape))
+    numbers = spikes.any(2).any(1).nonzero()[:, 0].tolist()
     return (
-        f"{_count(spikes)} hold what no optics can make, such as cosmic rays, hot and dead pixels, or lie beside it; "
-        f"the brightest has {float(frames[place]):.3g} electrons at (frame, row, column) {place}. {_NO_WEIGHT}"
+        f"{int(spikes.sum())} pixels of frames {numbers} of this stack, counted from 0, hold what no optics can make, "
+        f"such as cosmic rays, hot and dead pixels, or lie beside it; the brightest has {float(frames[place]):.3g} "
+        f"electrons at (frame, row, column) {place}. {_NO_WEIGHT}"
     )
-
-
-def _count(chosen: Tensor) -> str:
-    numbers = chosen.any(2).any(1).nonzero()[:, 0].tolist()
-    return f"{int(chosen.sum())} pixels of frames {numbers} of this stack, counted from 0,"
