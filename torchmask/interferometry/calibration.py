@@ -147,7 +147,7 @@ def calibrate_mask(
     grid : Grid
         Grid of the frames. An error of the pixel scale appears as magnification, and is harmless.
     valid : (H, W) or (T, H, W) boolean tensor or array, optional
-        False where a pixel is dead or saturated.
+        False where a pixel is dead or saturated. Those that stand out (`leave_out_unmarked`) are left out as well.
     readout_noise : float
         Read-out noise [electrons rms per pixel].
     pixel : PixelResponse, optional
