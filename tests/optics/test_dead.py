@@ -52,6 +52,9 @@ def test_a_value_that_other_pixels_have_too_may_be_light():
     still = (frames == frames[0]).all(0)
     assert bool(still.any())
     assert not bool(find_dead(frames, everywhere(frames)).any())
+    frames = exposures(peak=30.0, n_frames=20).clamp(min=0)
+    frames[:, :, 7] = 0.0
+    assert not bool(find_dead(frames, everywhere(frames)).any())
 
 
 @given(st.floats(1.0, 7.0), st.integers(3, 60), st.sampled_from([0.0, 0.2, 0.3, 0.5]), st.integers(0, 2**31))
@@ -98,6 +101,10 @@ def test_a_column_is_found_though_a_hit_and_a_rare_value_look_like_it():
     assert torch.equal(find_dead(frames, everywhere(frames)), dead.expand_as(frames))
     few = frames[28:34]  # in which the pixel that is hit repeats itself less often, and is one of those that change
     assert torch.equal(find_dead(few, everywhere(few)), dead.expand_as(few))
+    wide = frames.clone()
+    wide[:, :, 18:21] = 0.0
+    wide[30, 10:14, 19] = 900.0  # four of 144, which hold more zeros than are rare among the others
+    assert int(find_dead(wide, everywhere(wide))[0].sum()) == 140
     frames[31, 12, 20] = 900.0  # two of 48 are more than 3 %
     assert not bool(find_dead(frames, everywhere(frames)).any())
 
@@ -121,6 +128,8 @@ def test_pixels_that_are_not_valid_in_all_frames_are_left_to_their_marks():
     expected = torch.zeros(32, 32, dtype=torch.bool)
     expected[10:, 7] = True
     assert torch.equal(find_dead(frames, valid), expected.expand_as(frames))
+    again = frames[:1].repeat(4, 1, 1)  # one frame, though no NaN equals another
+    assert not bool(find_dead(again, valid[:1].expand_as(again)).any())
 
 
 @pytest.mark.parametrize("value", [0.0, 5.0])

@@ -77,11 +77,37 @@ def test_as_many_pixels_are_saturated_as_chance_does_not_explain(top, near):
         assert int(find_saturated(frames, everywhere(frames)).sum()) == (n if n == least else 0)
 
 
+def test_few_values_take_more_pixels():
+    """Of 20 levels of light cut-off ones are told by being more than those at 19."""
+    frames = counts(3e4).clamp(max=20)
+    n, below = int((frames == 20).sum()), int((frames == 19).sum())
+    assert n > 5 * below
+    assert torch.equal(find_saturated(frames, everywhere(frames)), frames == 20)
+
+
 def test_frames_that_repeat_others_do_not_count():
-    frame = counts(1e5, n_frames=1)
-    again = frame.repeat(50, 1, 1)
-    assert int((again == again.max()).sum()) >= 50
+    """Neither pixels at the largest value, of which there are four in each, nor those near it."""
+    frame = torch.arange(400.0, dtype=torch.float64).remainder(39)
+    frame[::100] = 40
+    again = frame.reshape(1, 20, 20).repeat(50, 1, 1)
     assert not bool(find_saturated(again, everywhere(again)).any())
+    frame[:60:2] = 39  # as 100 pixels at the largest value would not be among 30 at the next, but among 330
+    cut_off = torch.arange(400.0, dtype=torch.float64).remainder(38).flip(0)
+    cut_off[:100] = 40
+    frame[::100] = 38
+    both = torch.stack([cut_off, *[frame] * 11]).reshape(12, 20, 20)
+    assert int(find_saturated(both, everywhere(both)).sum()) == 100
+
+
+def test_of_more_than_half_of_the_valid_pixels_the_largest_value_is_no_exception():
+    light = torch.arange(800, dtype=torch.float64).reshape(2, 20, 20)
+    light[1] = light[0] + 0.5
+    half = everywhere(light)
+    half[:, 10:] = False
+    for valid in (everywhere(light), half):
+        for share, found in ((0.45, True), (0.55, False)):
+            level = float(light[valid].quantile(1 - share, interpolation="lower"))
+            assert bool(find_saturated(light.clamp(max=level), valid).any()) == found
 
 
 def test_frames_scaled_by_their_own_largest_value_or_mean_have_no_saturation():

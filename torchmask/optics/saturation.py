@@ -6,8 +6,6 @@ brighter piles up at one value.
 
 from __future__ import annotations
 
-import math
-
 import torch
 from scipy.stats import binom
 from torch import Tensor
@@ -39,7 +37,7 @@ def find_saturated(frames: Tensor, valid: Tensor) -> Tensor:
     (0, 73)
     """
     light = torch.where(valid, frames, 0).double()
-    top = float(light.masked_fill(~valid, -math.inf).max())
+    top = float(light.max())
     saturated = valid & (light == top)
     counted = valid.clone()
     counted[copies_among(light)] = False
