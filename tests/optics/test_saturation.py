@@ -152,5 +152,7 @@ def test_pixels_that_are_not_valid_neither_hide_nor_make_saturation():
 def test_even_frames_and_frames_of_zeros_and_ones_have_none(value):
     even = torch.full((3, 20, 20), value)
     assert not bool(find_saturated(even, everywhere(even)).any())
+    unlike = even + torch.arange(3.0)[:, None, None]
+    assert not bool(find_saturated(unlike, everywhere(unlike)).any())
     ones = (torch.arange(1200) % 3 > 0).double().reshape(3, 20, 20)
     assert not bool(find_saturated(ones, everywhere(ones)).any())

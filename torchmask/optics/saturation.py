@@ -7,7 +7,7 @@ brighter piles up at one value.
 from __future__ import annotations
 
 import torch
-from scipy.stats import binom
+from scipy.special import bdtrc
 from torch import Tensor
 
 from torchmask.optics.copies import copies_among
@@ -46,8 +46,10 @@ def find_saturated(frames: Tensor, valid: Tensor) -> Tensor:
     if more <= _ALIKE or int(shared.sum()) > _MOST * int(counted.sum()):
         return torch.zeros_like(valid)
     steps = [frame[own].unique().diff() for frame, own in zip(light, counted, strict=True)]
-    step = max(float(each.min()) for each in steps if each.numel())
+    step = max((float(each.min()) for each in steps if each.numel()), default=0.0)
+    if step == 0.0:  # each frame is even
+        return torch.zeros_like(valid)
     n_below = int(max(1.0, _BELOW * top / step))  # values that pixels could take
     near = int((counted & ~saturated & (light > top - (n_below + 0.5) * step)).sum())
-    chance = binom.sf(more - 1, more + near, 1 / (n_below + 1))
+    chance = bdtrc(more - 1, more + near, 1 / (n_below + 1))  # of so many or more
     return saturated if chance < _CHANCE else torch.zeros_like(valid)
