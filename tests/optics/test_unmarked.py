@@ -81,7 +81,7 @@ def test_what_is_marked_already_counts_neither_as_dead_nor_as_saturated(frames):
 def test_dead_pixels_are_filled_in_and_told(frames):
     spoilt = frames.clone()
     spoilt[:, :, 20] = 0.0
-    said = r"^48 pixels \(0.021 of all\) hold one value in all frames of this stack, as dead ones"
+    said = r"^48 pixels \(0.021 of all\) hold one value in all 6 frames of this stack, as dead ones"
     with pytest.warns(UserWarning, match=said) as told:
         filled, valid = leave_out(spoilt)
     assert len(told) == 1
@@ -107,6 +107,6 @@ def test_a_frame_without_any_other_pixel_is_refused(frames):
     spoilt[2] = float(frames.max()) + 1
     with (
         pytest.warns(UserWarning, match="seems to cut off"),
-        pytest.raises(ValueError, match=r"frames \[2\] of this stack.* are saturated everywhere: leave them out"),
+        pytest.raises(ValueError, match=r"frames \[2\] of this stack.* have no other valid pixel: leave them out"),
     ):
         leave_out(spoilt)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -15,8 +16,6 @@ from torchmask.optics.dead import find_dead
 from torchmask.optics.saturation import find_saturated
 from torchmask.optics.spikes import find_spikes
 
-_NO_WEIGHT = "They get no weight, as if they were marked in `valid`"
-
 
 def leave_out_unmarked(
     frames: Tensor, valid: Tensor, grid: Grid, aperture: Aperture, stacklevel: int
@@ -26,50 +25,49 @@ def leave_out_unmarked(
     If there are any, a warning says so, as if it were raised `stacklevel` calls above. Raises ValueError if no pixel of
     a frame is left.
     """
-    saturated = find_saturated(frames, valid)
-    if bool(saturated.any()):
-        warnings.warn(_what_is_cut_off(frames, saturated, int(valid.sum())), stacklevel=stacklevel + 1)
-        frames, valid = _fill(frames, valid & ~saturated)
-    dead = find_dead(frames, valid)
-    if bool(dead.any()):
-        warnings.warn(_what_is_dead(dead, int(valid.sum())), stacklevel=stacklevel + 1)
-        frames, valid = _fill(frames, valid & ~dead)
-    spikes = find_spikes(frames, valid, grid, aperture)
-    if bool(spikes.any()):
-        warnings.warn(_what_stands_out(frames, spikes), stacklevel=stacklevel + 1)
-        frames, valid = _fill(frames, valid & ~spikes)
+    kinds = (
+        (find_saturated, _what_is_cut_off),
+        (find_dead, _what_is_dead),
+        (partial(find_spikes, grid=grid, aperture=aperture), _what_stands_out),
+    )
+    for find, describe in kinds:
+        found = find(frames, valid)
+        if bool(found.any()):
+            share = f"{int(found.sum()) / int(valid.sum()):.2g} of all"
+            said = f"{describe(frames, found, share)}. They get no weight, as if they were marked in `valid`"
+            warnings.warn(said, stacklevel=stacklevel + 1)
+            valid = valid & ~found
+            frames = _fill(frames, valid)
     return frames, valid
 
 
-def _fill(frames: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+def _fill(frames: Tensor, valid: Tensor) -> Tensor:
     unseen = (~valid.any(2).any(1)).nonzero()[:, 0].tolist()
     if unseen:
-        raise ValueError(f"frames {unseen} of this stack, counted from 0, are saturated everywhere: leave them out")
-    return fill_bad_pixels(frames, valid), valid
+        raise ValueError(f"frames {unseen} of this stack, counted from 0, have no other valid pixel: leave them out")
+    return fill_bad_pixels(frames, valid)
 
 
-def _what_is_cut_off(frames: Tensor, saturated: Tensor, n_valid: int) -> str:
-    n_saturated = int(saturated.sum())
+def _what_is_cut_off(frames: Tensor, saturated: Tensor, share: str) -> str:
     return (
-        f"{n_saturated} pixels ({n_saturated / n_valid:.2g} of all) in {int(saturated.any(2).any(1).sum())} of "
-        f"{len(frames)} frames hold {float(frames[saturated][0]):.10g}, the largest value of all, so the camera seems "
-        f"to cut off there. {_NO_WEIGHT}"
+        f"{int(saturated.sum())} pixels ({share}) in {int(saturated.any(2).any(1).sum())} of {len(frames)} frames hold "
+        f"{float(frames[saturated][0]):.10g}, the largest value of all, so the camera seems to cut off there"
     )
 
 
-def _what_is_dead(dead: Tensor, n_valid: int) -> str:
+def _what_is_dead(frames: Tensor, dead: Tensor, share: str) -> str:
     return (
-        f"{int(dead[0].sum())} pixels ({int(dead.sum()) / n_valid:.2g} of all) hold one value in all frames of this "
-        f"stack, as dead ones or a border that was filled up. {_NO_WEIGHT}"
+        f"{int(dead[0].sum())} pixels ({share}) hold one value in all {len(frames)} frames of this stack, as dead ones "
+        "or a border that was filled up"
     )
 
 
-def _what_stands_out(frames: Tensor, spikes: Tensor) -> str:
+def _what_stands_out(frames: Tensor, spikes: Tensor, share: str) -> str:
     where = torch.where(spikes, frames, -math.inf).argmax()
     place = tuple(int(one) for one in torch.unravel_index(where, frames.shape))
     numbers = spikes.any(2).any(1).nonzero()[:, 0].tolist()
     return (
         f"{int(spikes.sum())} pixels of frames {numbers} of this stack, counted from 0, hold what no optics can make, "
-        f"such as cosmic rays, hot and dead pixels, or lie beside it; the brightest has {float(frames[place]):.3g} "
-        f"electrons at (frame, row, column) {place}. {_NO_WEIGHT}"
+        f"such as cosmic rays, hot and dead pixels, or lie beside it ({share}); the brightest has "
+        f"{float(frames[place]):.3g} electrons at (frame, row, column) {place}"
     )
