@@ -121,6 +121,21 @@ def test_places_of_stars_count_from_the_middle_pixel_of_odd_sides_too(shape):
     assert star.pixels[:, 3, 3].tolist() == [1.0, 1.0]
 
 
+def test_the_light_of_a_star_is_that_inside_the_frame_filled_in_or_not():
+    frames = torch.full((1, 9, 9), 2.0, dtype=torch.float64)
+    frames[0, 1, 1], frames[0, 1, 2] = 50.0, 30.0
+    valid = torch.ones_like(frames, dtype=torch.bool)
+    valid[0, 1, 2] = False
+    star = StarFrames.around(frames, valid, 3)
+    assert star.middles.tolist() == [[-3.0, -3.0]]
+    expected = torch.zeros(7, 7, dtype=torch.float64)
+    expected[3, 3], expected[3, 4] = 48.0, 28.0
+    torch.testing.assert_close(star.light[0], expected, rtol=0, atol=0)
+    assert star.inside[0, :, 1].tolist() == [False] * 7
+    assert star.inside[0, 2:, 2:].all()
+    assert int((star.inside & ~star.counted).sum()) == 1
+
+
 def test_the_scatter_of_frames_is_that_of_their_mean():
     """Each tells one number with a variance of 1 / 2: the mean of them all has their sample variance over n."""
     numbers = torch.tensor([1.0, -2.0, 0.5, 3.0, -2.5], dtype=torch.float64)

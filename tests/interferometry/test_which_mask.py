@@ -14,6 +14,7 @@ from torchmask.interferometry.calibration import calibrate_mask
 from torchmask.interferometry.fringe_power import FringePower, fringe_wavelengths
 from torchmask.interferometry.which_mask import ORIENTATIONS, MaskLook, look_at_mask
 from torchmask.optics.aperture import FullAperture, SparseAperture
+from torchmask.optics.bad_pixels import fill_bad_pixels
 from torchmask.optics.band import Band
 from torchmask.optics.detector import Detector
 from torchmask.optics.geometry import MaskGeometry
@@ -27,6 +28,7 @@ GRID = Grid.nyquist(1.0, 550e-9, 64)
 FINER = Grid.nyquist(1.0, 550e-9, 64, oversampling=1.7)  # for bands
 MASK = SparseAperture.from_catalog("golay9", 1.0, 0.12)
 UNKNOWN = SparseAperture.random(9, 1.0, 0.12, torch.Generator().manual_seed(4))  # to the catalogue
+EIGHT = SparseAperture.random(8, 1.0, 0.15, torch.Generator().manual_seed(1))
 
 
 def exposures(mask, scene=None, n_frames=10):
@@ -155,6 +157,52 @@ def test_a_restoration_warns_once_and_its_verdict_says_why(frames):
     assert set(MaskLook._fields) <= set(get_type_hints(Verdict))
 
 
+def without_the_brightest(frames, share):
+    """Frames whose brightest pixels are filled in, and which are left."""
+    valid = frames < frames.quantile(1 - share)
+    return fill_bad_pixels(frames, valid), valid
+
+
+def test_pixels_that_were_filled_in_accuse_no_mask(frames):
+    """They hide fringes: what is left of the right mask's looks like those of none."""
+    filled, valid = without_the_brightest(frames.double(), 0.08)
+    assert float((filled * ~valid).sum() / filled.sum()) > 0.05
+    assert "in any of its eight orientations" in look_at_mask(filled, MASK, GRID).contradiction
+    assert look_at_mask(filled, MASK, GRID, valid=valid) == MaskLook()
+    everywhere = torch.ones_like(valid)
+    assert look_at_mask(filled, MASK, GRID, valid=everywhere) == look_at_mask(filled, MASK, GRID)
+
+
+def test_a_better_orientation_is_named_although_pixels_were_filled_in(frames):
+    filled, valid = without_the_brightest(frames.double(), 0.012)
+    assert float((filled * ~valid).sum() / filled.sum()) > 0.05
+    mirrored = ORIENTATIONS["with x reversed"].apply(MASK)
+    assert "better with x reversed than as given" in look_at_mask(filled, mirrored, GRID, valid=valid).contradiction
+
+
+@pytest.mark.parametrize(("share", "contradicted"), [(0.049, True), (0.051, False)])
+def test_a_twentieth_of_the_light_may_be_filled_in(share, contradicted, frames_of_unknown):
+    """Of a mask that is not the one told, which no orientation fits."""
+    light = frames_of_unknown.double()
+    fraction = (light.flatten().sort().values.cumsum(0) / light.sum()).reshape(-1)
+    valid = (fraction < 1 - share)[light.flatten().argsort().argsort()].reshape(light.shape)
+    assert bool(look_at_mask(light, MASK, GRID, valid=valid).contradiction) == contradicted
+
+
+@pytest.mark.parametrize(("mask", "share"), [(UNKNOWN, 0.02), (EIGHT, 0.05)])
+def test_a_star_whose_brightest_pixels_are_cut_off_is_calibrated_without_them(mask, share):
+    """The angle is found within four of its errors; the mask that was told is not refused."""
+    star = torch.zeros(64, 64, dtype=torch.float64)
+    star[32, 32] = 1e6
+    whole = exposures(mask, star, n_frames=4).double().round()
+    told = MaskGeometry(rotation=-0.01).apply(mask)
+    with pytest.warns(UserWarning, match="the camera seems to cut off there"):
+        found = calibrate_mask(whole.clamp(max=float(whole.quantile(1 - share).round())), told, GRID)
+    assert found.verdict is not None
+    assert found.verdict.explained
+    assert found.geometry.rotation == pytest.approx(0.01, abs=4 * float(found.geometry_errors[0]))
+
+
 def test_a_restoration_compares_the_fringes_of_its_band(frames, monkeypatch):
     told = []
 
@@ -168,7 +216,9 @@ def test_a_restoration_compares_the_fringes_of_its_band(frames, monkeypatch):
     method = MyopicDeconvolution(MASK, finer, 3, wavelengths=band.wavelengths, weights=band.shares, max_iterations=1)
     with pytest.warns(UserWarning, match="another mask"):
         method.restore(frames)
-    assert told == [(MASK, finer, band)]
+    ((*light, valid),) = told
+    assert light == [MASK, finer, band]
+    assert torch.equal(valid, torch.ones_like(frames, dtype=torch.bool))
 
 
 def test_a_calibration_names_the_mask_too():

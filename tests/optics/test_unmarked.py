@@ -59,6 +59,21 @@ def test_saturated_pixels_are_filled_in_and_told(frames):
     torch.testing.assert_close(filled[valid], frames[valid], rtol=0, atol=0)
 
 
+def test_pixels_that_were_cut_off_before_a_flat_are_filled_in_and_told(frames):
+    level = float(frames.quantile(0.97, interpolation="lower"))
+    flat = 1 + 0.01 * torch.randn(GRID.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    calibrated = frames.clamp(max=level) / flat
+    with pytest.warns(UserWarning, match="cut them off before they were calibrated. They get no weight") as told:
+        filled, valid = leave_out(calibrated)
+    assert not bool((valid & (frames >= level)).any())
+    assert int((~valid).sum()) < 1.5 * int((frames >= level).sum())
+    n, lowest = int((~valid).sum()), float(calibrated[~valid].min())
+    start = f"{n} pixels ({n / valid.numel():.2g} of all) in 6 of 6 frames hold {lowest:.4g} or more"
+    assert str(told[0].message).startswith(start)
+    assert len(told) == 1
+    torch.testing.assert_close(filled[valid], calibrated[valid], rtol=0, atol=0)
+
+
 def test_what_is_marked_already_counts_neither_as_dead_nor_as_saturated(frames):
     """A border that is marked, of zeros or above all, is no news; shares are of the pixels that were valid."""
     marked = torch.ones_like(frames, dtype=torch.bool)

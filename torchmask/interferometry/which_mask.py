@@ -28,6 +28,7 @@ _RIGHT = 0.6  # least share of the right mask, with two standard errors added, s
 _RIGHT_IN_SECTORS = 0.7  # the same within sectors, which an object makes less uneven than rings
 _FOUND = 4.0  # standard errors by which one of some hundred candidates must show
 _SCALES = 0.7, 1.4  # range of magnifications that are tried
+_FILLED_IN = 0.05  # of the light: with more in pixels that were filled in, the right mask may not show
 _ALIKE = 0.95  # correlation of two patterns above which frames do not tell them apart
 
 
@@ -54,12 +55,15 @@ class _Comparison(NamedTuple):
     better: tuple[str, Match] | None
 
 
-def look_at_mask(frames: Tensor, aperture: Aperture, grid: Grid, band: Band | None = None) -> MaskLook:
+def look_at_mask(
+    frames: Tensor, aperture: Aperture, grid: Grid, band: Band | None = None, valid: Tensor | None = None
+) -> MaskLook:
     """Compare the fringes of frames (T, H, W) with the mask as given, and with others if it does not fit.
 
     Others are its mirrored and turned orientations first, then the masks of the catalogue, and the given mask at any
     angle or at another scale. Nothing is said of a full pupil, of two holes, or where frames do not tell. Without a
-    band the light has the wavelength of the grid.
+    band the light has the wavelength of the grid. `valid` (T, H, W) bool is False where pixels were filled in: where
+    these hold much of the light, which hides fringes, only an orientation that fits better contradicts the mask.
     """
     if not isinstance(aperture, SparseAperture) or aperture.n_subapertures < 3:
         return MaskLook()
@@ -76,14 +80,20 @@ def look_at_mask(frames: Tensor, aperture: Aperture, grid: Grid, band: Band | No
         if comparison.better is None and _may_be(comparison.told, least):
             return MaskLook(unseen=unseen)
         comparisons.append(comparison)
+    fits_none = all(comparison.better is None for comparison in comparisons)
+    if fits_none and valid is not None and _is_filled_in(frames, valid):
+        return MaskLook(unseen=unseen)
     return MaskLook(_contradiction(power, aperture, comparisons), unseen)
 
 
-def require_mask(frames: Tensor, aperture: SparseAperture, grid: Grid) -> None:
+def require_mask(frames: Tensor, valid: Tensor, aperture: SparseAperture, grid: Grid) -> None:
     """Raise ValueError if the fringes in frames (T, H, W) of a star are not those of the mask.
 
-    The message names the mask of the catalogue that they fit, if one fits clearly.
+    The message names the mask of the catalogue that they fit, if one fits clearly. Nothing is said where pixels that
+    were filled in, False in `valid` (T, H, W), hold much of the light.
     """
+    if _is_filled_in(frames, valid):
+        return
     power = FringePower.of(frames, aperture, grid)
     if power is None or _may_be(told := _match(power, aperture)):
         return
@@ -92,6 +102,11 @@ def require_mask(frames: Tensor, aperture: SparseAperture, grid: Grid) -> None:
         f"the fringes of the frames are not those of this mask at any angle ({_shown(told)} of its pattern): "
         + (f"they fit {found[0]} ({_shown(found[1])})" if found else "no mask of the catalogue fits clearly either")
     )
+
+
+def _is_filled_in(frames: Tensor, valid: Tensor) -> bool:
+    """Return whether pixels that were filled in hold so much light that the right mask may not show."""
+    return float((frames * ~valid).sum()) > _FILLED_IN * float(frames.sum())
 
 
 def _match(power: FringePower, aperture: SparseAperture) -> Match:

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.bad_pixels import fill_bad_pixels
+from torchmask.optics.ceilings import find_ceilings
 from torchmask.optics.dead import find_dead
 from torchmask.optics.saturation import find_saturated
 from torchmask.optics.spikes import find_spikes
@@ -27,6 +28,7 @@ def leave_out_unmarked(
     """
     kinds = (
         (find_saturated, _what_is_cut_off),
+        (find_ceilings, _what_has_ceilings),
         (find_dead, _what_is_dead),
         (partial(find_spikes, grid=grid, aperture=aperture), _what_stands_out),
     )
@@ -52,6 +54,14 @@ def _what_is_cut_off(frames: Tensor, saturated: Tensor, share: str) -> str:
     return (
         f"{int(saturated.sum())} pixels ({share}) in {int(saturated.any(2).any(1).sum())} of {len(frames)} frames hold "
         f"{float(frames[saturated][0]):.10g}, the largest value of all, so the camera seems to cut off there"
+    )
+
+
+def _what_has_ceilings(frames: Tensor, cut_off: Tensor, share: str) -> str:
+    return (
+        f"{int(cut_off.sum())} pixels ({share}) in {int(cut_off.any(2).any(1).sum())} of {len(frames)} frames hold "
+        f"{float(frames[cut_off].min()):.4g} or more, and pixels that reach so much come back to their own largest "
+        "value again and again, so the camera seems to have cut them off before they were calibrated"
     )
 
 

@@ -256,7 +256,7 @@ class MyopicDeconvolution:
         started, n_samples = time.perf_counter(), number_of_samples(n_samples)
         keep_freed_memory()
         told, stack = self.recipe, self._stack(frames, valid, errors)
-        (look := look_at_mask(stack.frames, told.aperture, told.grid, told.band)).warn(stacklevel=2)
+        (look := look_at_mask(stack.frames, told.aperture, told.grid, told.band, stack.valid)).warn(stacklevel=2)
         known, stack = Known.of(coefficients, covariance, known_object), stack.to(self._model.dtype, self._model.device)
         faint = stack.change.each < self.schedule.faint
         recipe = told.for_frames(blind=known.nothing and start is None, faint=faint, fills_field=stack.fills_field)
