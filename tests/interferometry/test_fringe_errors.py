@@ -52,14 +52,30 @@ def test_squares_of_fringes_that_are_all_noise_have_the_variance_of_noise():
 
 
 def test_the_scatter_of_a_few_frames_is_that_of_their_sum():
-    """Where noise tells less: n times the sample variance, and the frames' own correlation as far as they count."""
+    """n times the sample variance, besides what all have as ten frames, and the frames' own correlation as they count.
+
+    The noise, far below the scatter, says how the variances of all compare: as 1 to 3.
+    """
     rest = torch.tensor([[1.0, 3.0], [-2.0, 0.5], [0.5, -4.0], [0.5, 0.5]], dtype=torch.float64)
     assert not rest.sum(0).any()
-    found = _covariance(rest, 1e-6 * torch.eye(2, dtype=torch.float64))
-    torch.testing.assert_close(found.diagonal(), 4 * rest.var(0), rtol=1e-12, atol=0)
+    found = _covariance(rest, 1e-6 * torch.tensor([1.0, 3.0], dtype=torch.float64).diag())
+    scatter = 4 * rest.var(0)
+    prior = scatter.sum() * torch.tensor([0.25, 0.75], dtype=torch.float64)
+    torch.testing.assert_close(found.diagonal(), (10 * prior + 4 * scatter) / 14, rtol=1e-12, atol=0)
     correlation = float(torch.corrcoef(rest.T)[0, 1]) * 4 / (2 + 4)  # four frames and two quantities
     assert float(found[0, 1] / found.diagonal().prod().sqrt()) == pytest.approx(correlation, rel=1e-12)
     assert torch.equal(_covariance(rest[:1], torch.eye(2, dtype=torch.float64)), torch.eye(2, dtype=torch.float64))
+
+
+def test_no_variance_is_below_that_of_the_noise():
+    """Where frames scatter less than it says, and where one quantity does: the other has the mean of both."""
+    rest = torch.tensor([[1.0, 0.1], [-1.0, -0.1]], dtype=torch.float64)
+    noise = torch.tensor([8.0, 2.0], dtype=torch.float64)
+    torch.testing.assert_close(_covariance(rest, noise.diag()).diagonal(), noise, rtol=1e-12, atol=0)
+    quiet = _covariance(rest, torch.tensor([1.0, 2.0], dtype=torch.float64).diag()).diagonal()
+    more = (4.0 + 0.04) / 3  # scatter is twice the sample variance, 2 and 0.02
+    torch.testing.assert_close(quiet[0], torch.tensor((10 * more + 2 * 4.0) / 12, dtype=torch.float64))
+    assert float(quiet[1]) == pytest.approx(max(2.0, (10 * more * 2 + 2 * 0.04) / 12))
 
 
 def test_the_error_of_a_mean_visibility_is_that_of_either_part_of_it():

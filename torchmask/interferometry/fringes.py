@@ -19,6 +19,9 @@ from torchmask.optics.noise import noise_variance
 from torchmask.optics.phasor import phasor
 from torchmask.optics.unmarked import leave_out_unmarked
 
+_PRIOR = 10  # frames whose weight the noise has in variances
+_TINY = torch.finfo(torch.float64).tiny
+
 
 def frame_observables(observation: Observation) -> Observables:
     """Measure visibilities and closure phases directly on the frames, without a restoration.
@@ -38,9 +41,11 @@ def frame_observables(observation: Observation) -> Observables:
     -------
     Observables
         Raw values, not calibrated for effects that lower the contrast of a point source (band width, motion within an
-        exposure, aberrations within a hole); `Observables.calibrate` divides by a star. Variances are the larger of
-        the scatter over the frames and the noise (`errors`, or photon and read-out noise) propagated through the fit;
-        correlations are the mean of both, in which the noise has the weight of as many frames as there are observables.
+        exposure, aberrations within a hole); `Observables.calibrate` divides by a star. Variances are those of
+        the noise (`errors`, or photon and read-out noise) propagated through the fit or, where they are larger, the
+        mean of the scatter over the frames and of that noise, scaled to the scatter of all, which has the weight of ten
+        frames; correlations are the mean of both, in which the noise has the weight of as many frames as there are
+        observables.
 
     Raises
     ------
@@ -183,23 +188,24 @@ def _triple_noise(
 
 
 def _covariance(rest: Tensor, noise: Tensor) -> Tensor:
-    """Return the covariance (M, M) of sums over frames, from their scatter `rest` (T, M), or `noise` (M, M) if larger.
+    """Return the covariance (M, M) of sums over frames, from their scatter `rest` (T, M) and their noise (M, M).
 
-    The sample covariance of few frames is singular and noisy, so the correlations of the noise enter as a prior with
-    the weight of M frames.
+    The sample covariance of few frames is singular and noisy. So the noise enters its variances as a prior, scaled to
+    the scatter of all where that is larger, with the weight of ten frames, and its correlations with that of M.
     """
     n, size = rest.shape
     variance = noise.diagonal()
     if n > 1:
         scatter = rest.T @ rest * (n / (n - 1))
-        variance = torch.maximum(variance, scatter.diagonal())
+        found, more = scatter.diagonal(), (scatter.trace() / noise.trace().clamp(min=_TINY)).clamp(min=1)
+        variance = torch.maximum(variance, (_PRIOR * more * variance + n * found) / (_PRIOR + n))
         noise = (size * _correlation(noise) + n * _correlation(scatter)) / (size + n)
     deviation = variance.clamp(min=0).sqrt()
     return _correlation(noise) * deviation[:, None] * deviation
 
 
 def _correlation(covariance: Tensor) -> Tensor:
-    scale = covariance.diagonal().clamp(min=torch.finfo(covariance.dtype).tiny).rsqrt()
+    scale = covariance.diagonal().clamp(min=_TINY).rsqrt()
     return covariance * scale[:, None] * scale
 
 

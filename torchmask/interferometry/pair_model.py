@@ -12,6 +12,7 @@ import math
 import torch
 from torch import Tensor
 
+from torchmask.interferometry.closures import closure_combinations
 from torchmask.interferometry.measurements import Measurements
 from torchmask.optics.phasor import phasor
 
@@ -51,8 +52,10 @@ class PairResiduals:
         self._seen = measured
         self._frequencies, self._sides = measured.frequencies, measured.triangle_frequencies.flatten(0, 1)
         self.unit = torch.tensor([1.0, measured.finest, measured.finest], dtype=torch.float64)
-        self._vis2 = _whitening(measured.vis2_errors, measured.vis2_correlation)
-        self._closures = _whitening(measured.closure_errors, measured.closure_correlation)
+        every = torch.eye(len(measured.vis2), dtype=torch.float64)
+        self._vis2 = _whitening(measured.vis2_errors, measured.vis2_correlation, every)
+        closing = closure_combinations(measured)
+        self._closures = _whitening(measured.closure_errors, measured.closure_correlation, closing)
         self.size = self._vis2.shape[1] + self._closures.shape[1]
         if self.size < PARAMETERS:
             raise ValueError(
@@ -136,10 +139,15 @@ def square(residual: Tensor) -> float:
     return float(residual.square().sum())
 
 
-def _whitening(errors: Tensor, correlation: Tensor | None) -> Tensor:
-    """Return the matrix (M, K), K <= M, that turns residuals (..., M) into independent ones of unit variance."""
+def _whitening(errors: Tensor, correlation: Tensor | None, combinations: Tensor) -> Tensor:
+    """Return the matrix (M, K) that turns residuals (..., M) into independent ones of unit variance.
+
+    They are those of `combinations` (M, L), K <= L <= M.
+    """
     if correlation is None:
         return (1 / errors).diag()
-    values, vectors = torch.linalg.eigh(correlation)
+    covariance = combinations.T @ (correlation * errors[:, None] * errors) @ combinations
+    scale = covariance.diagonal().rsqrt()
+    values, vectors = torch.linalg.eigh(covariance * scale[:, None] * scale)
     kept = values > _LEAST_EIGENVALUE * values[-1]
-    return vectors[:, kept] * values[kept].rsqrt() / errors[:, None]
+    return combinations @ (scale[:, None] * vectors[:, kept] * values[kept].rsqrt())
