@@ -100,12 +100,21 @@ def test_more_light_is_asked_for_where_it_is_scarce():
     assert f"explained: {more}; chi-square" in str(verdict_on(1.0, 1.0, **scarce))
     assert f"not explained: no frame is explained; {more}, and then the mask" in str(verdict_on(8.0, 8.0, **scarce))
     lost = str(verdict_on(*[1.0] * 19, 8.0, **scarce))
-    assert f"frame 19 is not explained; {more}, and then those frames for clouds" in lost
+    assert f"explained as a whole, but frame 19 is not: {more}, and then those frames for clouds" in lost
     stopped = str(verdict_on(8.0, 8.0, at_rest=False, **scarce))
     assert f"{more}, and then again after more iterations, since this search was stopped early, and then the" in stopped
     assert f"{more}, and then the mask" in str(verdict_on(8.0, **scarce))  # a single frame
     assert verdict_on(1.0, 1.0, contrast=1.0, blind=True).check.startswith("the pointing")
     assert "light" not in str(verdict_on(8.0, 8.0, blind=True))
+
+
+def test_a_search_that_was_stopped_early_says_so_whatever_it_has_found():
+    again = "check again after more iterations, since this search was stopped early"
+    assert str(verdict_on(1.0, 1.0, at_rest=False)).startswith(f"explained: {again}; chi-square")
+    lost = str(verdict_on(*[1.0] * 19, 8.0, at_rest=False))
+    assert lost.startswith(f"explained as a whole, but frame 19 is not: {again}, and then those frames for clouds")
+    assert f"not explained: no frame is explained; {again}, and then the mask" in str(verdict_on(8.0, 8.0, at_rest=False))
+    assert "stopped" not in str(verdict_on(1.0, 1.0)) + str(verdict_on(8.0, 8.0))
 
 
 def test_noise_that_was_measured_may_have_been_raised_by_what_is_none():
@@ -125,7 +134,7 @@ def test_single_frames_may_be_lost():
     verdict = verdict_on(*[1.0] * 19, 8.0)
     assert verdict.explained
     assert verdict.frames == (19,)
-    assert "frame 19 is not explained; check those frames for clouds" in str(verdict)
+    assert str(verdict).startswith("explained as a whole, but frame 19 is not: check those frames for clouds")
     verdict = verdict_on(1.0, 8.0, 8.0, 1.0)
     assert not verdict.explained
     assert verdict.frames == (1, 2)

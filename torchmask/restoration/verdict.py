@@ -98,10 +98,13 @@ class Verdict:
             numbers += f"; up to {self.limit:.4g} counts as explained"
             if self.phase_error:
                 numbers += f", since modes left out ({self.phase_error:.2g} rad rms) add about {self.model_error:.2g}"
-        parts = [f"{_listed(self.frames, self.n_frames)} explained"] if self.frames else []
-        parts += [f"check {self.check}"] if self.check else []
+        head, parts = self.finding.value, [f"check {self.check}"] if self.check else []
+        if self.frames and self.explained:
+            head += f" as a whole, but {_listed(self.frames, self.n_frames)}"
+        elif self.frames:
+            parts.insert(0, f"{_listed(self.frames, self.n_frames)} explained")
         parts += [self.contradiction] if self.contradiction and not self.explained else []
-        return f"{self.finding.value}: {'; '.join([*parts, numbers])}"
+        return f"{head}: {'; '.join([*parts, numbers])}"
 
     def to_json(self) -> dict[str, Any]:
         """Return the verdict as plain values, with the string of `str` as "text"."""
@@ -209,12 +212,13 @@ def _what_to_check(finding: Finding, n_lost: int, n_frames: int, *, at_rest: boo
     if scarce:
         steps.append("again with more light or more frames, as these show too little of the object to tell it")
     few = 0 < n_lost <= n_frames / 2
+    stopped = [] if at_rest else ["again after more iterations, since this search was stopped early"]
     if finding is Finding.EXPLAINED:
-        steps += ["those frames for clouds and tracking errors"] if n_lost else []
+        steps += [*stopped, *(["those frames for clouds and tracking errors"] if n_lost else [])]
     elif few and at_rest:
         steps.append("those frames for clouds and tracking errors, or leave them out")
     else:
-        steps += [] if at_rest else ["again after more iterations, since this search was stopped early"]
+        steps += stopped
         steps.append(
             "the mask (which one, how it lies), wavelength and pixel scale, gain and read-out noise, dead and hot "
             "pixels, and that all frames show one object"
