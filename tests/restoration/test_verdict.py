@@ -113,7 +113,9 @@ def test_a_search_that_was_stopped_early_says_so_whatever_it_has_found():
     assert str(verdict_on(1.0, 1.0, at_rest=False)).startswith(f"explained: {again}; chi-square")
     lost = str(verdict_on(*[1.0] * 19, 8.0, at_rest=False))
     assert lost.startswith(f"explained as a whole, but frame 19 is not: {again}, and then those frames for clouds")
-    assert f"not explained: no frame is explained; {again}, and then the mask" in str(verdict_on(8.0, 8.0, at_rest=False))
+    assert f"not explained: no frame is explained; {again}, and then the mask" in str(
+        verdict_on(8.0, 8.0, at_rest=False)
+    )
     assert "stopped" not in str(verdict_on(1.0, 1.0)) + str(verdict_on(8.0, 8.0))
 
 
