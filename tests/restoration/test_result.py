@@ -49,6 +49,7 @@ def test_a_summary_tells_the_change_of_pistons_against_their_mean_and_what_is_kn
     told = dataclasses.replace(told, geometry_std=torch.tensor([0.002, 0.003])).summary()
     assert "pistons change by 0.32 rad rms while a frame lasts" in told
     assert "turned by 0.573 +- 0.115 deg from x to y and magnified by 1.02000 +- 0.00300" in told
+    assert "the errors are those of noise, besides which frames of an object are off by some 0.1 deg and 0.3%" in told
 
 
 def result_of_version_0_1(n_frames=2):
