@@ -80,6 +80,40 @@ def test_rows_on_record_are_never_dropped(tmp_path, capsys):
     assert (tmp_path / "again/table.csv").read_bytes() == (folder / "table.csv").read_bytes()
 
 
+def test_the_folder_of_anything_else_is_refused_and_left_as_it_is(tmp_path, capsys):
+    design = tmp_path / "design"
+    searched = ["--n-subapertures", "4", "--budget", "20", "--n-frequencies", "32"]
+    assert main(["design", *searched, "--out", str(design)]) == 0
+    (design / "instrument.json").write_text("{}")
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "instrument.json").write_text("{}")
+    before = {path: path.read_bytes() for folder in (design, mine) for path in folder.rglob("*") if path.is_file()}
+    capsys.readouterr()
+    for folder, said in (
+        (design, "a run of `torchmask design`"),
+        (mine, "files that are not of a table (instrument.json)"),
+    ):
+        assert main(["table", str(folder), *TINY]) == 1
+        told = f"{folder} holds {said}, and nothing is overwritten: name a new folder, such as {folder}-2, or that"
+        assert told in capsys.readouterr().err
+    after = {path: path.read_bytes() for folder in (design, mine) for path in folder.rglob("*") if path.is_file()}
+    assert after == before
+
+
+def test_an_empty_folder_and_that_of_an_interrupted_table_are_taken(tmp_path):
+    table.require_table_folder(tmp_path / "new")
+    table.require_table_folder(tmp_path)
+    (tmp_path / "tasks").mkdir()
+    table.require_table_folder(tmp_path)
+    (tmp_path / "config.yaml").write_text("command: table\n")
+    (tmp_path / "notes.txt").touch()
+    table.require_table_folder(tmp_path)
+    (tmp_path / "config.yaml").write_text("command: [")  # cannot be read, so it is nobody's
+    with pytest.raises(ValueError, match=r"files that are not of a table \(config\.yaml, notes\.txt, tasks\)"):
+        table.require_table_folder(tmp_path)
+
+
 def test_a_table_states_its_conditions():
     space = DesignSpace(wavelength=700e-9, mask_diameter=1.2, readout_noise=2.5, n_pixels=24, min_gap=0.02)
     rows = tuple(space.designs())

@@ -21,12 +21,15 @@ _COMMAND = "command"  # key for the command that a config file belongs to
 _NOT_STORED = ("out", "config", "resume", "debug", "sweep", "workers", "backend")
 
 
-def save_config(path: str | Path, command: str, options: Any) -> None:
-    """Write the options that a result depends on to a new file for `load_config`; existing paths become absolute."""
+def save_config(path: str | Path, command: str, options: Any, *, replace: bool = False) -> None:
+    """Write the options that a result depends on for `load_config`; existing paths become absolute.
+
+    The file is a new one, or, with `replace`, in place of one that exists.
+    """
     import yaml
 
     values = {_COMMAND: command} | to_json(stored(options))
-    with atomic_write(path) as file:
+    with atomic_write(path, replace=replace) as file:
         file.write(yaml.safe_dump(values, sort_keys=False, allow_unicode=True).encode())
 
 
@@ -61,6 +64,19 @@ def load_config(path: str | Path, options: type[T], command: str) -> T:
         return from_json(options, values, leave_out=_NOT_STORED)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
+
+
+def config_command(path: Path) -> str | None:
+    """Return the command that a config file belongs to; None if there is no such file, or it names none."""
+    import yaml
+
+    if not path.is_file():
+        return None
+    try:
+        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError):
+        return None
+    return values.get(_COMMAND) if isinstance(values, dict) else None
 
 
 def stored(options: Any) -> dict[str, Any]:

@@ -11,17 +11,20 @@ from typing import Any, ClassVar
 
 import tyro
 
-from torchmask.cli.config import CONFIG, save_config
+from torchmask.cli.config import CONFIG, config_command, save_config
 from torchmask.cli.criterion_options import ExposureOptions, exposure_options
 from torchmask.cli.instrument_used import INSTRUMENT, instrument_used
 from torchmask.cli.options import ConfigOptions, WorkerOptions, pixel_angle
 from torchmask.design.conditions import ExposureConditions
 from torchmask.design.space import AXES, DesignSpace
 from torchmask.design.table import design_table
+from torchmask.folders import free_name
 from torchmask.grid import ARCSEC
 from torchmask.instrument.instrument import Instrument
 from torchmask.io import read_json, to_json
 from torchmask.progress import Progress
+
+_UNFINISHED = {"tasks", "table.json", "table.csv", "table.md"}  # all that a table has before its config.yaml
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +67,7 @@ class Options(ExposureOptions, DesignSpace, WorkerOptions, ConfigOptions):
 
 def run(options: Options) -> None:
     """Fill the table, or go on with it."""
+    require_table_folder(options.folder)
     space = space_of(options)
     area = math.pi / 4 * space.reference_fill_factor * space.mask_diameter**2
     conditions = options.conditions(space.grid.wavelength, area)
@@ -75,8 +79,7 @@ def run(options: Options) -> None:
     except KeyboardInterrupt:
         print(f"\ncall again with {options.folder} to go on", file=sys.stderr)
         raise
-    (options.folder / CONFIG).unlink(missing_ok=True)  # that of a table with fewer rows
-    save_config(options.folder / CONFIG, "table", options)
+    save_config(options.folder / CONFIG, "table", options, replace=True)  # that of a table with fewer rows
     if used is not None:
         used.save(options.folder / INSTRUMENT, replace=True)
     print(table, f"\nwritten to {options.folder}", sep="\n")
@@ -91,6 +94,20 @@ def space_of(options: Options) -> DesignSpace:
     values: dict[str, Any] = {item.name: getattr(options, item.name) for item in dataclasses.fields(DesignSpace)}
     values |= {"wavelength": wavelength, "pixel_scale": pixel_angle(options.pixel_scale_arcsec)}
     return DesignSpace(**values)
+
+
+def require_table_folder(folder: Path) -> None:
+    """Raise ValueError if a folder holds anything but a table, whose files would be mixed up with it or replaced."""
+    held = {path.name for path in folder.iterdir()} if folder.is_dir() else set[str]()
+    command = config_command(folder / CONFIG)
+    if command == "table" or held <= _UNFINISHED:
+        return
+    found = ", ".join(sorted(held)[:3]) + (", ..." if len(held) > 3 else "")
+    what = f"a run of `torchmask {command}`" if command else f"files that are not of a table ({found})"
+    raise ValueError(
+        f"{folder} holds {what}, and nothing is overwritten: name a new folder, such as {free_name(folder)}, or that "
+        "of a table"
+    )
 
 
 def require_rows_kept(folder: Path, space: DesignSpace, conditions: ExposureConditions | None) -> None:
