@@ -88,6 +88,7 @@ def test_errors_that_are_told_unequally_make_no_residual_large(seed, unequal):
     assert unequal**-2 * (1 - 1e-9) <= ratio <= 1 + 1e-9
 
 
+@pytest.mark.filterwarnings("ignore:.*of the star is known to fewer")  # in three frames
 @pytest.mark.parametrize(("n_frames", "r0"), [(3, 0.2), (20, None)])
 def test_a_single_star_has_no_companion(n_frames, r0):
     """Beside another star as a calibrator, by chance in fewer than one of a hundred: none of four."""

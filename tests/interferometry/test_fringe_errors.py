@@ -51,6 +51,20 @@ def test_squares_of_fringes_that_are_all_noise_have_the_variance_of_noise():
     assert float(found.abs().max()) < 4 * math.sqrt(expected)
 
 
+@pytest.mark.parametrize("measured", [0.0, 0.3, 1.0])
+def test_a_square_that_comes_out_small_has_the_error_of_noise_at_least(measured):
+    """That of n^2 (x^2 + y^2 - 2 s^2), whatever x and y are: 4 n^4 s^4, and 4 n^4 s^2 x^2 besides once x is large."""
+    rms, light, n_holes = 2.0, 500.0, 3
+    values = torch.zeros(1, 7, dtype=torch.float64)
+    values[:, 0], values[:, 1:4] = light, measured * rms
+    covariance = (rms**2 * torch.eye(7, dtype=torch.float64))[None]
+    covariance[:, 0, 0] = 1e-9  # of the light
+    _, told = _squares(FringeFit(values, covariance, torch.zeros(1, 2, dtype=torch.complex128)), n_holes)
+    variance = 4 * rms**2 * (measured * rms) ** 2 - 4 * rms**4  # unbiased, but negative here
+    expected = n_holes**4 * max(variance, 4 * rms**4) / light**4
+    torch.testing.assert_close(told.diagonal(), torch.full((3,), expected, dtype=torch.float64), rtol=1e-4, atol=0)
+
+
 def test_the_scatter_of_a_few_frames_is_that_of_their_sum():
     """n times the sample variance, besides what all have as ten frames, and the frames' own correlation as they count.
 

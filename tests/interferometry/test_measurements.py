@@ -1,6 +1,7 @@
 """Lists of measurements: calibration against the observables' own, joining, and what cannot be."""
 
 import dataclasses
+import warnings
 
 import pytest
 import torch
@@ -31,6 +32,22 @@ def test_calibration_is_that_of_the_observables(observe):
     other = seen.measurements(GRID.wavelength).calibrate(star.measurements(GRID.wavelength))
     for field in dataclasses.fields(one):
         torch.testing.assert_close(getattr(other, field.name), getattr(one, field.name), msg=field.name)
+
+
+@pytest.mark.parametrize(("share", "warns"), [(0.2499, False), (0.2501, True)])
+def test_a_star_that_is_known_to_fewer_than_four_errors_is_warned_of(share, warns, observe):
+    """On one of six baselines, whose other errors may be anything; before it divides observables or measurements."""
+    star = observe(1)
+    covariance = star.vis2_covariance.clone()
+    covariance[2, 2] = (share * star.vis2[2]) ** 2
+    star = dataclasses.replace(star, vis2_covariance=covariance)
+    for one, other in ((star, star), (star.measurements(GRID.wavelength), star.measurements(GRID.wavelength))):
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            one.calibrate(other)
+        said = "is known to fewer than 4 of its errors on 1 of 6 baselines"
+        assert [said in str(entry.message) for entry in told] == [True] * warns
+        assert all(entry.filename == __file__ for entry in told)
 
 
 def test_those_of_different_nights_are_independent(observe):

@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import pytest
 import torch
 from torch.autograd import gradcheck
 from torch.autograd.functional import jacobian
@@ -39,6 +40,15 @@ def test_residuals_of_noise_are_independent_and_of_variance_one(measure_pair):
     # variances scatter by sqrt(2/n), covariances by 1/sqrt(n); 25 and 300 of them stay below 4.5 of it
     assert away.diagonal().max() < 4.5 * math.sqrt(2 / n)
     assert (away - away.diagonal().diag()).max() < 4.5 / math.sqrt(n)
+
+
+def test_a_contrast_is_fitted_up_to_the_brightest_and_the_place_besides(measure_pair):
+    """Of two stars as bright as each other one has 0.999 of the other, as at 1 data do not tell which is brighter."""
+    truth = torch.tensor([1.0, 4.4e-7, -2.4e-7], dtype=torch.float64)
+    problem = PairResiduals(measure_pair(truth))
+    found, _ = problem.descend(truth * torch.tensor([0.8, 1.03, 0.97], dtype=torch.float64), 40)
+    assert float(found[0]) == pytest.approx(0.999)
+    assert float((found[1:] - truth[1:]).norm()) < 0.01 * float(problem.unit[1])  # of the finest fringe
 
 
 def test_a_contrast_is_never_fitted_below_the_faintest(measure_pair):

@@ -127,11 +127,14 @@ def _squares(fit: FringeFit, n_holes: int) -> tuple[Tensor, Tensor]:
     # rest_b = sum over the parameters of weights_b (x^2 - variance), a quadratic form of Gaussian variables
     each = n_holes**2 * torch.eye(len(ratio), dtype=ratio.dtype)
     weights = torch.cat([-ratio[:, None], each, each], 1)
-    noise = torch.zeros_like(each)
+    noise, without_light = torch.zeros_like(each), torch.zeros_like(each)
     for values, covariance in zip(fit.values, fit.covariance, strict=True):
         slopes = weights * values
-        # the noise of the slopes adds 4 tr(M C M C), of which only 2 tr(M C M C) are part of the variance
-        noise += 4 * slopes @ covariance @ slopes.T - 2 * weights @ covariance**2 @ weights.T
+        noise += 4 * slopes @ covariance @ slopes.T
+        without_light += 2 * weights @ covariance**2 @ weights.T
+    # the noise of the slopes adds 4 tr(M C M C), of which only 2 tr(M C M C) are part of the variance
+    noise -= without_light
+    noise += (without_light - noise).diagonal().clamp(min=0).diag()  # it is more with any light, whatever was measured
     return ratio, _covariance(power - ratio * light, noise) / light.sum() ** 2
 
 

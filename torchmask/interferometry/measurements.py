@@ -5,6 +5,7 @@ Signs are those of `torchmask.interferometry.observables`.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from torchmask.record import Brief
 
+_CERTAIN = 4.0  # errors to which a divisor is known, so that first order holds
 SAME = 1e-3  # relative tolerance for equal baselines and wavelengths, as an array's projection differs between stars
 
 
@@ -117,7 +119,7 @@ class Measurements(Brief):
         |V|^2 is divided by the star's, and its closure phases are subtracted. Baselines are those of the object.
 
         Raises ValueError if the star was not seen on the same baselines and at the same wavelengths in the same order,
-        or shows no fringes on one of them.
+        or shows no fringes on one of them. Warns as `warn_of_faint_star` does.
         """
         _require_same(self, star)
         dark = int((star.vis2 <= 0).sum())
@@ -126,6 +128,7 @@ class Measurements(Brief):
                 f"the star shows no fringes on {dark} of {len(star.vis2)} baselines: use a brighter star, or more "
                 "frames of it"
             )
+        warn_of_faint_star(star.vis2, star.vis2_errors, stacklevel=2)
         ratio = self.vis2 / star.vis2
         own, its = (_covariance(each.vis2_errors, each.vis2_correlation) for each in (self, star))
         vis2 = (own + ratio[:, None] * ratio * its) / (star.vis2[:, None] * star.vis2)
@@ -155,6 +158,22 @@ def join(measurements: Sequence[Measurements]) -> Measurements:
         vis2_correlation=_blocks([(len(each.vis2), each.vis2_correlation) for each in measurements]),
         closure_correlation=_blocks([(len(each.closure_phases), each.closure_correlation) for each in measurements]),
     )
+
+
+def warn_of_faint_star(vis2: Tensor, errors: Tensor, stacklevel: int) -> None:
+    """Warn if |V|^2 (B,) of a star, by which others are divided, is known to less than four of its errors somewhere.
+
+    The error of a quotient is that to first order, which no longer holds. The warning is issued as if `stacklevel`
+    calls above.
+    """
+    faint = int((vis2 < _CERTAIN * errors).sum())
+    if faint:
+        warnings.warn(
+            f"|V|^2 of the star is known to fewer than {_CERTAIN:g} of its errors on {faint} of {len(vis2)} baselines: "
+            "what is divided by it has errors that are too small, and may show companions that are not there, so use "
+            "a brighter star, more frames of it, or closure phases alone",
+            stacklevel=stacklevel + 1,
+        )
 
 
 def correlation(covariance: Tensor) -> Tensor | None:

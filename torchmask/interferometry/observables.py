@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchmask.interferometry.measurements import SAME, Measurements, correlation
+from torchmask.interferometry.measurements import SAME, Measurements, correlation, warn_of_faint_star
 from torchmask.record import Brief
 
 
@@ -116,6 +116,11 @@ class Observables(Brief):
         ValueError
             If the star was observed with another mask, or has no fringes on some baseline.
 
+        Warns
+        -----
+        UserWarning
+            If |V|^2 of the star is known to less than four of its errors on some baseline (`warn_of_faint_star`).
+
         Examples
         --------
         >>> stations = torch.tensor([[0.0, 0.4], [-0.35, -0.2]], dtype=torch.float64)
@@ -133,6 +138,7 @@ class Observables(Brief):
         if dark:
             names = ", ".join("-".join(map(str, self.pairs[index].tolist())) for index in dark)
             raise ValueError(f"the star shows no fringes of holes {names}: use a brighter star, or more frames of it")
+        warn_of_faint_star(star.vis2, star.vis2_errors, stacklevel=2)
         vis2, vis2_covariance = _divide(self.vis2, self.vis2_covariance, star.vis2, star.vis2_covariance)
         triple, triple_covariance = _divide(
             self.triple_amplitudes, self.triple_covariance, star.triple_amplitudes, star.triple_covariance

@@ -18,6 +18,7 @@ from torchmask.optics.phasor import phasor
 
 PARAMETERS = 3  # of a companion: contrast, east and north
 _FAINTEST, _BRIGHTEST = -0.5, 0.98  # range of contrasts of a map; at 1 the derivatives in the contrast vanish
+_EQUAL = 0.999  # the brightest of a fit
 _STEPS = 12  # number of Gauss-Newton steps for the contrast at each position
 _HALVINGS = 20  # maximum number of halvings of a step that makes a fit worse
 _TINY = torch.finfo(torch.float64).tiny  # curvature where fringes repeat exactly, and any contrast fits
@@ -86,8 +87,12 @@ class PairResiduals:
         for _ in range(steps):
             slopes = self.slopes(found) * self.unit
             change = self.unit * torch.linalg.lstsq(slopes, residual[:, None]).solution[:, 0]
+            if found[0] >= _EQUAL and change[0] > 0:  # only the place can be better
+                place = torch.linalg.lstsq(slopes[:, 1:], residual[:, None]).solution[:, 0]
+                change = self.unit * torch.cat([place.new_zeros(1), place])
             for _ in range(_HALVINGS):
                 moved = found + change
+                moved[0] = moved[0].clamp(max=_EQUAL)
                 after = self.residuals(moved)
                 if moved[0] >= _FAINTEST and square(after) < square(residual):
                     break
