@@ -17,6 +17,8 @@ from torchmask.optics.pixel import PixelResponse
 _FIELD = 4  # width of the field for the fringes' envelope, relative to the frames, to avoid wrap-around
 _WORST_CONDITION = 1e6  # maximum condition number of the normal equations of the fringes
 _DARKEST = 1e-3  # minimum noise variance of a pixel, relative to the largest
+_LEAST_SEEN = 1e-6  # minimum power of an envelope in valid pixels, relative to the largest, above rounding
+_PLACES, _SETTLED = 50, 1e-3  # maximum number of steps to the centre, and length of the last [pixel]
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,20 +98,45 @@ class FringeModel:
         wide = torch.fft.ifft2(torch.fft.fft2(image, s=self._wide.shape) * self._transfer).real
         return wide[:height, :width]
 
-    def centre(self, image: Tensor) -> tuple[float, float]:
-        """Return the peak (x, y) of an image blurred by one hole, relative to [H // 2, W // 2] [pixel].
+    def centre(self, frames: Tensor, valid: Tensor) -> tuple[float, float]:
+        """Return the place (x, y) of the light in frames (T, H, W), relative to [H // 2, W // 2] [pixel].
 
-        A parabola gives it to a fraction of a pixel.
+        It is where the diffraction pattern of one hole, of any brightness, explains most of the `valid` pixels
+        (T, H, W). There may be none on one side, so the fringes, which average out over whole frames, are fitted around
+        each place and taken off before the next.
         """
-        blurred = self.blur(image)
-        row, column = divmod(int(blurred.argmax()), self.grid.shape[1])
+        light, counted = torch.where(valid, frames, 0.0).sum(0), valid.double().sum(0)
+        points = FringeModel(self.aperture, self.grid)  # the blur by pixels does not move light
+        place = self._likeliest(light, counted)
+        for _ in range(_PLACES):
+            columns = points.columns(*place)
+            normal, seen = (columns * counted.flatten()) @ columns.T, columns @ light.flatten()
+            values = torch.linalg.lstsq(normal, seen[:, None], driver="gelsd").solution[1:, 0]
+            fringes = counted * (values @ columns[1:]).view_as(counted)
+            before, place = place, self._likeliest(light - fringes, counted)
+            if math.dist(before, place) < _SETTLED:
+                break
+        return place
+
+    def _likeliest(self, light: Tensor, counted: Tensor) -> tuple[float, float]:
+        """Return the place (x, y) where the envelope explains most of `light` (H, W), a sum over `counted` frames.
+
+        Envelope e of the best brightness explains (e . light)^2 / (e^2 . counted). A parabola through the root of that
+        gives its peak to a fraction of a pixel; it may lie up to one pixel outside the field.
+        """
+        squared = torch.fft.fft2(torch.fft.ifft2(self._transfer).real ** 2)
+        along, norm = (
+            torch.fft.ifft2(torch.fft.fft2(image, s=self._wide.shape) * transfer).real
+            for image, transfer in ((light, self._transfer), (counted, squared))
+        )
+        share = along / norm.clamp(min=_LEAST_SEEN * float(norm.max())).sqrt()
+        height, width = self.grid.shape
+        row, column = divmod(int(share[:height, :width].argmax()), width)
         offsets = []
-        for place, line in ((column, blurred[row]), (row, blurred[:, column])):
-            offset = 0.0
-            if 0 < place < len(line) - 1:
-                before, here, after = line[place - 1 : place + 2].tolist()
-                offset = (before - after) / (2 * (before - 2 * here + after)) if before + after < 2 * here else 0.0
-            offsets.append(place + offset - len(line) // 2)
+        for at, line, n in ((column, share[row], width), (row, share[:, column], height)):
+            before, here, after = (float(line[at + step]) for step in (-1, 0, 1))
+            offset = (before - after) / (2 * (before - 2 * here + after)) if before + after < 2 * here else 0.0
+            offsets.append(at + min(max(offset, -1.0), 1.0) - n // 2)
         return offsets[0], offsets[1]
 
     def columns(self, x: float, y: float) -> Tensor:
@@ -161,7 +188,7 @@ def fit_fringes(frames: Tensor, valid: Tensor, noise: PixelNoise, model: FringeM
 
     Raises ValueError if two baselines are too similar to be separated.
     """
-    columns = model.columns(*model.centre(frames.mean(0)))
+    columns = model.columns(*model.centre(frames, valid))
     weights = _weights(noise.variance, valid, model)
     values = frames.new_empty(len(frames), len(columns))
     covariance = frames.new_empty(len(frames), len(columns), len(columns))
