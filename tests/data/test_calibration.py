@@ -74,6 +74,12 @@ def test_the_largest_crop_is_the_largest(rows, columns, data):
     assert fits_in(largest + 1) == largest
 
 
+@pytest.mark.parametrize("target", [(100, 10), (-1, 10), (10, 20), (16, 0)])
+def test_a_target_outside_the_image_is_told_where_the_image_ends(target):
+    with pytest.raises(ValueError, match=rf"target is \({target[0]}, {target[1]}\).*rows are 0 to 15.*columns 0 to 19"):
+        crop_corner((16, 20), target, 8)
+
+
 def test_hot_pixels_are_no_target():
     y, x = np.mgrid[:32, :32]
     frames = (1e3 * np.exp(-((y - 20) ** 2 + (x - 11) ** 2) / 8))[None]

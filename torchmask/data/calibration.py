@@ -82,8 +82,14 @@ def find_target(frames: np.ndarray, valid: np.ndarray, blur: float) -> tuple[int
 def crop_corner(shape: tuple[int, int], target: tuple[int, int], size: int) -> tuple[int, int]:
     """Return the first (row, column) of a `size` x `size` field with `target` on its pixel [size // 2, size // 2].
 
-    Raises ValueError if the field reaches beyond the image; the message gives the largest size that fits.
+    Raises ValueError if the target lies outside the image, or the field reaches beyond it; the message gives the
+    rows and columns that there are, or the largest size that fits.
     """
+    if not (0 <= target[0] < shape[0] and 0 <= target[1] < shape[1]):
+        raise ValueError(
+            f"target is {tuple(target)}, which lies outside the image: its rows are 0 to {shape[0] - 1}, its columns 0 "
+            f"to {shape[1] - 1}"
+        )
     corner = (target[0] - size // 2, target[1] - size // 2)
     if min(corner) < 0 or corner[0] + size > shape[0] or corner[1] + size > shape[1]:
         # Number of pixels before the target, and from the target on, in the tighter direction.
