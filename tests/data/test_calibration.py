@@ -52,6 +52,8 @@ def test_what_does_not_fit_the_frames_is_refused():
     for name in ("dark", "flat", "bad_pixels"):
         with pytest.raises(ValueError, match=rf"{name} has shape \(16, 16\): it must be.*\(16, 20\)"):
             calibrate(raw, everywhere(raw), **{name: np.zeros((16, 16))})
+    with pytest.raises(ValueError, match="bad_pixels marks every pixel as bad"):
+        calibrate(raw, everywhere(raw), bad_pixels=np.ones((16, 20)))
     with pytest.raises(ValueError, match="flat is positive on no good pixel"):
         calibrate(raw, everywhere(raw), flat=np.zeros((16, 20)))
 

@@ -14,6 +14,7 @@ import torch
 
 from torchmask.cli.agreement import complete, planned_scale, require_time
 from torchmask.cli.config import CONFIG
+from torchmask.cli.cubes import require_one_map
 from torchmask.cli.options import (
     InstrumentOptions,
     MaskOptions,
@@ -267,6 +268,7 @@ def _usable(observation: Observation, path: Path, options: StackOptions) -> Obse
 def _from_fits(files: Sequence[Path], options: StackOptions, known: Instrument | None) -> Observation:
     """Read FITS files. Raises ValueError as `read_observation`, but asks for a missing pixel scale in arcsec."""
     aperture = load_aperture(options, None if known is None else known.telescope)
+    require_one_map(options.bad_pixels)
     scale = pixel_angle(options.pixel_scale_arcsec)
     given = {item.name: getattr(options, item.name) for item in dataclasses.fields(FITSOptions)}
     given |= {"wavelength": options.wavelength, "readout_noise": options.readout_noise}

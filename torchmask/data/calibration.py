@@ -50,12 +50,15 @@ def calibrate(
     Raises
     ------
     ValueError
-        If a shape differs from that of the images, or the flat is positive on no good pixel.
+        If a shape differs from that of the images, the bad-pixel map marks every pixel, or the flat is positive on no
+        good pixel.
     """
     for name, image in (("dark", dark), ("flat", flat), ("bad_pixels", bad_pixels)):
         if image is not None and image.shape != values.shape[1:]:
             raise ValueError(f"{name} has shape {image.shape}: it must be that of the images, {values.shape[1:]}")
     good = np.ones(values.shape[1:], dtype=bool) if bad_pixels is None else bad_pixels == 0
+    if not good.any():
+        raise ValueError("bad_pixels marks every pixel as bad: give a map that is 0 on good pixels, perhaps inverted")
     sensitivity = np.ones(values.shape[1:])
     if dark is not None:
         good &= np.isfinite(dark)
