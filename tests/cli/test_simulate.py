@@ -83,6 +83,7 @@ def test_options_are_the_turbulence_that_they_name():
         (["--pixel-scale-arcsec", "0.5"], r"--pixel-scale-arcsec 0\.5 arcsec undersamples .* at most 0\.06\d+ arcsec"),
         (["--scene.path", "none.png"], "none.png"),
         (["--pixel-fill", "1.5"], r"--pixel-fill is 1\.5"),
+        (["--pixel-fill", "2"], r"--pixel-fill is 2\.0"),  # as is --n-frames
         (["--mask-diameter", "8200"], r"--mask-diameter is 8200\.0: .* in m, so 8\.2 m are 8\.2"),
         (["--jitter", "-1"], r"--jitter is -1\.0"),
         (["--jitter", "9"], r"--jitter is 9\.0: .* at most 8 pixels, half the field"),

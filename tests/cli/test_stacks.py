@@ -67,7 +67,7 @@ def test_frames_of_a_stack_are_skipped_and_those_without_light_left_out(tmp_path
     whole.save(tmp_path / "square.npz")
     found = [read_stack([tmp_path / "square.npz"], StackOptions(pixel_fill=fill)).pixel for fill in (None, 0.0, 1.0)]
     assert found == [SquarePixel(0.9), None, SquarePixel(1.0)]
-    with pytest.raises(ValueError, match="fill_factor is 2"):
+    with pytest.raises(ValueError, match="pixel_fill is 2"):
         read_stack([tmp_path / "none.npz"], StackOptions(pixel_fill=2.0))
     with pytest.raises(ValueError, match="skip names frame 6, but the stack has 6 frames, with numbers from 0 to 5"):
         read_stack([tmp_path / "a.npz"], StackOptions(skip=(6,)))

@@ -139,15 +139,19 @@ class JitteredPixel:
         return blur if self.pixel is None else blur * self.pixel.transfer(nu_y, nu_x)
 
 
-def square_pixel(fill_factor: float) -> SquarePixel | None:
+def square_pixel(pixel_fill: float) -> SquarePixel | None:
     """Return square pixels, or None, which means points, for a fill factor of 0. Raises ValueError above 1 or below 0.
+
+    The error names the number by its name in instruments and options, where a fill factor is that of a mask.
 
     Examples
     --------
     >>> square_pixel(0.8), square_pixel(0.0)
     (SquarePixel(fill_factor=0.8), None)
     """
-    return SquarePixel(fill_factor) if fill_factor else None
+    if not 0 <= pixel_fill <= 1:
+        raise ValueError(f"pixel_fill is {pixel_fill}: it must be a fraction, from 0 for points to 1 without gaps")
+    return SquarePixel(pixel_fill) if pixel_fill else None
 
 
 def jittered(pixel: PixelResponse | None, rms: float) -> PixelResponse | None:
