@@ -100,6 +100,12 @@ def test_what_cannot_be_is_one_line_and_leaves_nothing(tmp_path, capsys, options
     assert not list(tmp_path.iterdir())
 
 
+def test_vanes_without_a_width_are_told_which_option_is_missing(tmp_path, capsys):
+    full = ["simulate", "--mask", "full", "--mask-diameter", "1", "--wavelength", "550e-9", *SMALL]
+    assert main([*full, "--vane-angles", "0", "90", "--out", str(tmp_path / "run")]) == 1
+    assert "--vane-width is 0 m and --vane-angles are [0.0, 90.0] degrees" in capsys.readouterr().err
+
+
 def test_the_defaults_are_what_they_were(tmp_path):
     assert main([*MASK, *SMALL, "--seed", "3", "--out", str(tmp_path / "run")]) == 0
     stack = Observation.load(tmp_path / "run/stack.npz")

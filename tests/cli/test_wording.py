@@ -45,6 +45,12 @@ class Options:
             "--fill-factor is 2.0: it must be a fraction",
         ),
         ("fill_factor is 2.0: no", {"fill_factor": 0.1, "pixel_fill": 2.0}, "--pixel-fill is 2.0: no"),
+        (
+            "fill_factor is 0 m and weights are [0.0, 9.0]: both are needed",
+            {"weights": (0.0, 9.0)},
+            "--fill-factor is 0 m and weights are [0.0, 9.0]: both are needed",
+        ),
+        ("telescope.gain is 0 m and no", {"weights": (0.0, 9.0)}, "--gain is 0 m and no"),
         ("n_pixels is -1: it must be 2", {"n_frequencies": -1}, "--n-frequencies is -1: it must be 2"),
         ("n_pixels is -1: it must be 2", {"n_pixels": -1}, "--n-pixels is -1: it must be 2"),
         ("gap is nan: no", {"min_gap": math.nan}, "--min-gap is nan: no"),

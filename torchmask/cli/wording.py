@@ -92,11 +92,18 @@ def in_options(message: str, options: Any) -> str:
 
 
 def _by_value(name: str, numbers: list[float], known: list[Option]) -> str | None:
-    """Return the option of a parameter with these numbers: one of its name, or else the only one given with them."""
+    """Return the option of a parameter with these numbers: one of its name, or else the only one given with them.
+
+    One of its name without a number may have been filled in: it comes before one with the number among others.
+    """
     same = [option for option in known if numbers and _holds(option.numbers, numbers)]
-    named = [option for option in same if name in (option.name, option.flag[2:].replace("-", "_"))]
+    called = [option for option in known if name in (option.name, option.flag[2:].replace("-", "_"))]
+    called = called or [option for option in known if option.name == name.rpartition(".")[2]]
+    named = [option for option in called if option in same]
     given = [option for option in same if option.is_given]
-    for chosen in (named, given, [option for option in given if name in option.name]):
+    alone = [option for option in given if option.numbers == numbers]
+    unset = [option for option in called if not option.numbers and not alone]
+    for chosen in (named, unset, given, [option for option in given if name in option.name]):
         if len(chosen) == 1:
             return chosen[0].flag
     return None
