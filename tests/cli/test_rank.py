@@ -166,3 +166,14 @@ def test_impossible_requests_are_refused(given, said, tmp_path, capsys):
     assert main(["rank", *given, *TINY, "--out", str(tmp_path / "new" / "run")]) == 1
     assert said in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_what_is_said_of_a_missing_wavelength_is_accepted(tmp_path, capsys):
+    argv = ["rank", "golay6", *TINY, "--r0", "0.2", "--fill-factor", "0.1", "--out", str(tmp_path / "run")]
+    assert main(argv) == 1
+    assert "--instrument tells it too, and --filter with --criterion turbulent" in capsys.readouterr().err
+    assert main([*argv, "--filter", "bessell-V"]) == 1
+    assert "error: --filter needs --criterion turbulent: the asymptotic" in capsys.readouterr().err
+    assert main([*argv, "--wavelength", "5e-7", "--wavelengths", "5e-7", "6e-7"]) == 1
+    assert "error: --wavelengths needs --criterion turbulent: the asymptotic" in capsys.readouterr().err
+    assert main([*argv, "--filter", "bessell-V", "--n-wavelengths", "3", "--criterion", "turbulent"]) == 0

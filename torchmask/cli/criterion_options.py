@@ -49,7 +49,7 @@ class ExposureOptions(BandOptions, InstrumentOptions):
         if told is None and needing:
             raise ValueError(
                 f"--wavelength is missing: give it in m, such as 550e-9, as {needing[0]} holds at a wavelength only; "
-                "--filter and --instrument tell it too"
+                "--instrument tells it too, and --filter with --criterion turbulent"
             )
         return told
 
@@ -64,7 +64,7 @@ class ExposureOptions(BandOptions, InstrumentOptions):
         band = self.band(wavelength)
         if self.criterion == "asymptotic":
             if self.instrument is None:
-                self._require_turbulence(band["wavelengths"] is not None)
+                self._require_turbulence()
             return None
         if self.filter is not None:
             warn_of_few_wavelengths(Passband.find(self.filter), self.n_wavelengths, self.temperature)
@@ -81,11 +81,12 @@ class ExposureOptions(BandOptions, InstrumentOptions):
             sky=sky,
         )
 
-    def _require_turbulence(self, broad: bool) -> None:
+    def _require_turbulence(self) -> None:
         given = {
             "--exposure-time": self.exposure_time != 0,
             "--wind": bool(self.wind),
-            "--filter or --wavelengths": broad,
+            "--filter": self.filter is not None,
+            "--wavelengths": bool(self.wavelengths),
             "--pixel-fill": self.pixel_fill != 0,
             "--sky": self.sky is not None,
         }
@@ -169,7 +170,8 @@ class ObservationOptions(CriterionOptions):
     """Diameter of the pupil and of a mask that covers it, D [m]."""
     wavelength: float | None = None
     """Wavelength of the observation [m], needed with --r0, --wavelengths and --pixel-scale-arcsec; None: the mean of
-    the filter, or, as errors with pixels of wavelength / (2 D) depend on no wavelength, none."""
+    the filter, which needs --criterion turbulent, or none, as errors with pixels of wavelength / (2 D) depend on no
+    wavelength."""
     n_photons: float | None = None
     """Electrons per frame through holes of --fill-factor; None: from --instrument, or else 1e7."""
     n_frames: int = 20
