@@ -217,3 +217,16 @@ sys.exit(run_script("program", run, Options, None))
     )
     assert done.stdout == "0\n"
     assert done.stderr == ""
+
+
+def test_a_seed_that_no_generator_takes_is_refused_before_any_work(capsys):
+    @dataclass(frozen=True)
+    class Seeds:
+        seed: tuple[int, ...] = (0,)
+
+    def work(_):
+        raise AssertionError
+
+    assert run_script("program", work, Seeds, "", ["--seed", "1", str(10**20)]) == 1
+    assert f"--seed is {10**20}: it must be a whole number from 0 to {2**63 - 1}" in capsys.readouterr().err
+    assert run_script("program", lambda _: 0, Seeds, "", ["--seed", str(2**63 - 1)]) == 0

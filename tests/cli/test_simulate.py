@@ -84,6 +84,10 @@ def test_options_are_the_turbulence_that_they_name():
         (["--scene.path", "none.png"], "none.png"),
         (["--pixel-fill", "1.5"], r"--pixel-fill is 1\.5"),
         (["--pixel-fill", "2"], r"--pixel-fill is 2\.0"),  # as is --n-frames
+        (["--seed", str(2**63)], f"--seed is {2**63}: it must be a whole number from 0 to {2**63 - 1}"),
+        (["--seed", str(-(10**20))], "--seed is -1"),
+        (["--n-photons", "1e30"], r"--n-photons is 1e\+30: .* at most 1e\+15 electrons per frame"),
+        (["--n-photons", "-1"], r"--n-photons is -1\.0: it must be finite and positive"),
         (["--mask-diameter", "8200"], r"--mask-diameter is 8200\.0: .* in m, so 8\.2 m are 8\.2"),
         (["--jitter", "-1"], r"--jitter is -1\.0"),
         (["--jitter", "9"], r"--jitter is 9\.0: .* at most 8 pixels, half the field"),
@@ -104,6 +108,12 @@ def test_vanes_without_a_width_are_told_which_option_is_missing(tmp_path, capsys
     full = ["simulate", "--mask", "full", "--mask-diameter", "1", "--wavelength", "550e-9", *SMALL]
     assert main([*full, "--vane-angles", "0", "90", "--out", str(tmp_path / "run")]) == 1
     assert "--vane-width is 0 m and --vane-angles are [0.0, 90.0] degrees" in capsys.readouterr().err
+
+
+def test_the_largest_seed_and_the_most_photons_are_simulated(tmp_path):
+    most = ["--seed", str(2**63 - 1), "--n-photons", "1e15"]
+    assert main([*MASK, *SMALL, *most, "--out", str(tmp_path / "run")]) == 0
+    assert float(Observation.load(tmp_path / "run/stack.npz").frames.min()) >= 0
 
 
 def test_the_defaults_are_what_they_were(tmp_path):

@@ -28,6 +28,7 @@ from torchmask.instrument.instrument import Instrument
 T = TypeVar("T")
 
 NOT_EXPLAINED = 3  # exit status
+_LARGEST_SEED = 2**63 - 1  # signed integers of 64 bits, as which generators take seeds
 _NO_MEMORY = re.compile("allocate memory|out of memory", re.IGNORECASE)  # PyTorch raises RuntimeError
 
 # What programs need beyond a plain install, by the name of the module.
@@ -74,9 +75,18 @@ def run_script(
 def carry_out(run: Callable[[T], int | None], options: T) -> int | None:
     """Run a program with its options. Raises ValueError as `run` does, but in the words of the command line."""
     try:
+        _require_seeds(options)
         return run(options)
     except ValueError as error:
         raise ValueError(in_options(str(error), options)) from error
+
+
+def _require_seeds(options: Any) -> None:
+    """Raise ValueError for a seed of more bits than generators of random numbers take, of which they say little."""
+    given = getattr(options, "seed", ())
+    for seed in given if isinstance(given, tuple) else (given,):
+        if isinstance(seed, int) and abs(seed) > _LARGEST_SEED:
+            raise ValueError(f"seed is {seed}: it must be a whole number from 0 to {_LARGEST_SEED} (2**63 - 1)")
 
 
 def exit_status(program: str, work: Callable[[], int | None], debug: bool) -> int:

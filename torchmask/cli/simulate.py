@@ -42,6 +42,7 @@ from torchmask.simulation.scene import SceneOptions, make_scene
 from torchmask.simulation.wavefronts import Turbulence
 
 _DEFAULT_R0 = 0.15  # [m]
+_MOST_PHOTONS = 1e15  # electrons per frame; the photon noise of more in a pixel is lost in the rounding of float64
 
 
 @dataclass(frozen=True)
@@ -261,6 +262,7 @@ def run(options: Options) -> None:
     options.require_its_wavelength(wavelength)
     photons, sky = (DEFAULT_PHOTONS, 0.0) if known is None else (known.photons(told.area), known.sky(told.area))
     n_photons = photons if options.n_photons is None else options.n_photons
+    require("--n-photons", options.n_photons, " electrons per frame", most=_MOST_PHOTONS)
     conditions = options.conditions.make(options.turbulence.exposure_time, wavelength, sky)
     turbulence = options.turbulence.make(options.r0, wavelength, options.outer_scale)
     pixel_scale = pixel_angle(options.pixel_scale_arcsec)
