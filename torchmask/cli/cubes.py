@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from torchmask.data.fits import read_fits
+from torchmask.observation import Observation
 
 
 def require_one_map(path: Path | None) -> None:
@@ -17,3 +18,19 @@ def require_one_map(path: Path | None) -> None:
             f"--bad-pixels {path} is a cube of {count} images of {rows} x {columns} pixels: give one image, which is "
             "not 0 where a pixel is bad"
         )
+
+
+def require_wide_frames(observation: Observation, path: Path) -> None:
+    """Raise ValueError if frames are too narrow for the mask, perhaps because their axes are in another order.
+
+    The message says what was read. Frames that are too narrow otherwise are refused later, by what they are used for.
+    """
+    try:
+        observation.aperture.samples(observation.grid)
+    except ValueError as error:
+        count, rows, columns = read_fits(path).values.shape
+        if columns < rows / 2 or count > min(rows, columns):
+            raise ValueError(
+                f"{path}: {error}; the file was read as {count} frames of {rows} x {columns} pixels: if another axis "
+                "counts frames, make it the third one of the file (NAXIS3), which NumPy has first"
+            ) from error

@@ -14,7 +14,7 @@ import torch
 
 from torchmask.cli.agreement import complete, planned_scale, require_time
 from torchmask.cli.config import CONFIG
-from torchmask.cli.cubes import require_one_map
+from torchmask.cli.cubes import require_one_map, require_wide_frames
 from torchmask.cli.options import (
     InstrumentOptions,
     MaskOptions,
@@ -276,6 +276,8 @@ def _from_fits(files: Sequence[Path], options: StackOptions, known: Instrument |
     given["design_wavelength"] = mask_file_wavelength(options) if known is None else known.mean_wavelength
     given["design_pixel_scale"] = None if known is None else planned_scale(known)
     try:
-        return read_observation(files, aperture, pixel_scale=scale, **given)
+        observation = read_observation(files, aperture, pixel_scale=scale, **given)
     except ValueError as error:
         raise ValueError(str(error).replace("give pixel_scale [rad]", "give --pixel-scale-arcsec [arcsec]")) from error
+    require_wide_frames(observation, files[0])
+    return observation
