@@ -230,3 +230,15 @@ def test_a_seed_that_no_generator_takes_is_refused_before_any_work(capsys):
     assert run_script("program", work, Seeds, "", ["--seed", "1", str(10**20)]) == 1
     assert f"--seed is {10**20}: it must be a whole number from 0 to {2**63 - 1}" in capsys.readouterr().err
     assert run_script("program", lambda _: 0, Seeds, "", ["--seed", str(2**63 - 1)]) == 0
+
+
+def test_a_run_to_go_on_with_that_is_not_there_is_named_as_a_folder(tmp_path, capsys):
+    @dataclass(frozen=True)
+    class Resumable:
+        resume: Path | None = None
+
+    def work(_):
+        raise AssertionError
+
+    assert run_script("program", work, Resumable, "", ["--resume", str(tmp_path / "rs")]) == 1
+    assert f"program: error: there is no folder {tmp_path / 'rs'}: --resume goes on" in capsys.readouterr().err

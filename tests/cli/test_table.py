@@ -53,6 +53,8 @@ def test_rows_are_written_and_not_computed_twice(tmp_path, capsys):
     other = ["table", str(tmp_path / "other"), *argv[2:]]
     assert main([*other, "--diameter-over-r0", "30"]) == 1
     assert "no combination can be built" in capsys.readouterr().err
+    assert main([*argv, "--n-subapertures"]) == 1
+    assert "--n-subapertures is (): it must hold at least one value" in capsys.readouterr().err
     assert main([*argv, "--exponent", "-3"]) == 1
     assert capsys.readouterr().err == "torchmask table: error: --exponent is -3.0: it must be finite and not negative\n"
 

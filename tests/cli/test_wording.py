@@ -51,6 +51,7 @@ class Options:
             "--fill-factor is 0 m and weights are [0.0, 9.0]: both are needed",
         ),
         ("telescope.gain is 0 m and no", {"weights": (0.0, 9.0)}, "--gain is 0 m and no"),
+        ("weights is (): it must hold one", {}, "--weights is (): it must hold one"),
         ("n_pixels is -1: it must be 2", {"n_frequencies": -1}, "--n-frequencies is -1: it must be 2"),
         ("n_pixels is -1: it must be 2", {"n_pixels": -1}, "--n-pixels is -1: it must be 2"),
         ("gap is nan: no", {"min_gap": math.nan}, "--min-gap is nan: no"),

@@ -154,6 +154,8 @@ def parse(options: type[T], command: str, argv: Sequence[str], *, prog: str, des
     given = vars(early.parse_known_args(argv)[0])
     path, resumed = given.get("config"), given.get("resume")
     if path is None and resumed is not None:
+        if not resumed.is_dir():
+            raise ValueError(f"there is no folder {resumed}: --resume goes on with a run, so give the folder of one")
         path = resumed / CONFIG
     instrument = given.get("instrument")
     if instrument is not None and path is not None:

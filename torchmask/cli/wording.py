@@ -87,7 +87,8 @@ def in_options(message: str, options: Any) -> str:
         return _advise(message, known)
     name, rest = head["name"], message[head.end("name") :]
     valued = [option for option in known if not option.is_switch]  # a switch cannot be wrong
-    flag = _by_name(name, valued) if told is None else _by_value(name, _numbers(told["value"]), known)
+    numbers = [] if told is None else _numbers(told["value"])  # none of a list that is empty
+    flag = _by_value(name, numbers, known) if numbers else _by_name(name, valued)
     return message[: head.start()] + (flag or name) + _advise(rest, known)
 
 
