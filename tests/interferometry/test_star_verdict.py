@@ -1,6 +1,7 @@
 """Whether what was in the beam was a single star, from what the fit of one leaves."""
 
 import math
+import warnings
 
 import pytest
 import torch
@@ -80,6 +81,28 @@ def test_a_frame_that_a_satellite_has_crossed_is_named():
     assert verdict.explained
     assert verdict.lost == (3,)
     assert "but for frames 3, counted from 0" in str(verdict)
+
+
+@pytest.mark.parametrize(("companion", "explained"), [(0.1, False), (0.0, True)])
+def test_frames_under_clouds_excuse_no_double_star(companion, explained):
+    """Four frames and two of noise: the verdict on all is that on the four alone, and the two are named."""
+    frames = exposures(companion=companion, n_frames=4)
+    noise = torch.randn(2, *GRID.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    noise = 1.5 * noise - (1.5 * noise).mean((1, 2), keepdim=True) + 0.05
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the double star
+        clear = calibrate_mask(frames, MASK, GRID, readout_noise=1.5).verdict
+        with pytest.warns(
+            UserWarning, match=r"frames \[4, 5\] of this stack, .* show no star behind this mask"
+        ) as caught:
+            found = calibrate_mask(torch.cat([frames, noise]), MASK, GRID, readout_noise=1.5).verdict
+    assert caught[0].filename == __file__
+    assert clear is not None
+    assert found is not None
+    assert found.explained == clear.explained == explained
+    assert found.limit == pytest.approx(clear.limit, rel=0.1)
+    assert found.chi_square == pytest.approx(clear.chi_square, rel=0.1)
+    assert set(found.lost) == {*clear.lost, 4, 5}
 
 
 def test_frames_too_small_for_more_modes_are_not_judged():

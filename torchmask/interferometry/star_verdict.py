@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import warnings
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,6 +21,7 @@ from torchmask.optics.pixel import PixelResponse
 from torchmask.optics.zernike import noll
 
 _LEAST_EXPLAINED = 0.5  # of the variance of a frame: a fit that explains less is not of a star behind this mask
+_NO_STAR = 0.5  # of what the fit explains of the median frame: a frame of which it explains less shows no star
 _ORDERS = 5  # radial orders of turbulence beyond the modes of a fit: light scattered by higher ones falls elsewhere
 _DRAWN = 8  # number of frames for which they are drawn, spread over all
 _OUTER_SCALE = 20.0  # [m] of that turbulence, whose higher modes hardly depend on it
@@ -105,8 +108,13 @@ def judge_star(
     """Return whether a fit of the `model` leaves no more than noise and the modes that it lacks.
 
     The noise is that of photons and of read-out, told or measured beyond the cut-off of the mask, whichever is more.
+    Frames that show no star, as under clouds, are lost, and a warning names them: noise alone is fitted by huge modes,
+    which would excuse whatever the other frames leave.
     """
     data, counted = star.pixels.flatten(1), star.counted.flatten(1).double()
+    shows = _show_star(data, counted, fit)
+    data, counted, fit = data[shows], counted[shows], replace(fit, own=fit.own[shows], images=fit.images[shows])
+    information = replace(information, own_covariances=information.own_covariances[shows])  # the rest is not used here
     left, light, n = counted * (data - fit.images), counted * fit.images.clamp(min=0), counted.sum(1)
     cutoff = _CUT_OFF * grid.cutoff(aperture.extent)
     photons = light.sum(1) / n
@@ -124,8 +132,23 @@ def judge_star(
     chances = [math.hypot(own * each, math.sqrt(2 / n_beyond / len(data))) for each in (1.0, len(data) ** -0.5)]
     allowed = 1 + max(_MODEL_ERRORS * error, _MISSED * float(variance.median()))
     single, limit = (allowed + _CHANCE * _OF_MEDIAN * chance for chance in chances)
-    lost = tuple((chi_square > single).nonzero().flatten().tolist())
+    shows[shows.clone()] = chi_square <= single
+    lost = tuple((~shows).nonzero().flatten().tolist())
     return StarVerdict(float(chi_square.quantile(0.5)), round(float(free.median())), error, limit, lost)
+
+
+def _show_star(data: Tensor, counted: Tensor, fit: StarFit) -> Tensor:
+    """Return which frames (T,) show the star, and warn of those that do not."""
+    explained = explained_variance(data, counted, fit.images)
+    shows = explained >= _NO_STAR * explained.median()
+    if not bool(shows.all()):
+        warnings.warn(
+            f"frames {(~shows).nonzero().flatten().tolist()} of this stack, counted from 0, show no star behind this "
+            f"mask: it explains {100 * max(float(explained[~shows].max()), 0.0):.0f} % of their variance or less, and "
+            f"{100 * float(explained.median()):.0f} % of that of a median frame; leave them out",
+            stacklevel=4,
+        )
+    return shows
 
 
 def _beyond(side: int, cutoff: float) -> Tensor:
