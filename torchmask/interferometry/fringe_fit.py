@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -186,8 +186,9 @@ def fit_fringes(frames: Tensor, valid: Tensor, noise: PixelNoise, model: FringeM
     one over the variance of the mean frame, blurred by one hole: weights correlated with the noise of a pixel would
     favour low values and bias the fit.
 
-    Raises ValueError if two baselines are too similar to be separated.
+    Raises ValueError if two baselines are too similar to be separated, or a valid pixel has no error that can be.
     """
+    noise = replace(noise, variance=_variance_of_valid(noise, valid))
     columns = model.columns(*model.centre(frames, valid))
     weights = _weights(noise.variance, valid, model)
     values = frames.new_empty(len(frames), len(columns))
@@ -220,6 +221,23 @@ def complex_covariances(covariance: Tensor, first: Tensor, second: Tensor) -> tu
     rr, ii = covariance[:, real, real][:, first, second], covariance[:, imaginary, imaginary][:, first, second]
     ri, ir = covariance[:, real, imaginary][:, first, second], covariance[:, imaginary, real][:, first, second]
     return torch.complex(rr - ii, ri + ir), torch.complex(rr + ii, ir - ri)
+
+
+def _variance_of_valid(noise: PixelNoise, valid: Tensor) -> Tensor:
+    """Return the variance (T, H, W) with 0 where pixels are not valid, whose errors may be anything.
+
+    Raises ValueError unless told errors of valid pixels are finite and positive.
+    """
+    variance = noise.variance
+    wrong = (valid & ~(torch.isfinite(variance) & (variance > 0))).nonzero()
+    if len(wrong) and not noise.is_own:
+        place = tuple(wrong[0].tolist())
+        raise ValueError(
+            f"errors are not finite and positive at {len(wrong)} valid pixels, the first is at (frame, row, column) "
+            f"{place}, with the square {float(variance[place]):.3g}: standard deviations in electrons are needed, or "
+            "False in `valid`"
+        )
+    return torch.where(valid, variance, 0.0)
 
 
 def _weights(variance: Tensor, valid: Tensor, model: FringeModel) -> Tensor:
