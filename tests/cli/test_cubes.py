@@ -1,8 +1,12 @@
 """FITS files of another shape than is needed are named, with the shape that they have."""
 
+from pathlib import Path
+
 import numpy as np
+import pytest
 
 from torchmask.cli.main import main
+from torchmask.cli.stacks import StackOptions, read_stack
 
 FULL = ["--mask", "full", "--mask-diameter", "1"]
 
@@ -26,11 +30,20 @@ def test_axes_in_another_order_are_told_where_frames_are_too_narrow(write_fits, 
     frames[:, 20:28, 20:28] += 1000
     golay = ["--mask", "golay6", "--mask-diameter", "1", "--fill-factor", "0.15"]
     swapped = write_fits("swapped.fits", np.moveaxis(frames, 0, -1).copy(), PIXELSCL=0.05)
-    told = "the file was read as 48 frames of 48 x 5 pixels: if another axis counts frames, make it the third one"
+    told = f"{swapped} was read as 48 frames of 48 x 5 pixels, which are too narrow for this mask: take a wider image"
     for command in ("restore", "calibrate"):
         said = error_of([command, str(swapped), *golay], capsys)
-        assert "take an image at least" in said
         assert told in said
-        assert "(NAXIS3)" in said
+        assert "if another axis counts frames, make it the third one of the file (NAXIS3)" in said
     narrow = write_fits("narrow.fits", frames[:, 20:28, 20:28].copy(), PIXELSCL=0.05)
     assert "NAXIS3" not in error_of(["restore", str(narrow), *golay], capsys)
+
+
+def test_many_frames_that_padding_makes_wide_enough_are_read(write_fits):
+    frames = np.random.default_rng(0).uniform(90, 110, (30, 22, 22))
+    frames[:, 8:14, 8:14] += 1000
+    options = StackOptions(mask=Path("golay6"), mask_diameter=1.0, fill_factor=0.15)
+    seen = read_stack([write_fits("long.fits", frames, PIXELSCL=0.05)], options)
+    assert len(seen.frames) == 30
+    with pytest.raises(ValueError, match="at least 2 are needed"):  # as they are
+        seen.aperture.samples(seen.grid)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from torchmask.data.fits import read_fits
 from torchmask.observation import Observation
+from torchmask.optics.pupil import sample_holes
 
 
 def require_one_map(path: Path | None) -> None:
@@ -21,16 +22,19 @@ def require_one_map(path: Path | None) -> None:
 
 
 def require_wide_frames(observation: Observation, path: Path) -> None:
-    """Raise ValueError if frames are too narrow for the mask, perhaps because their axes are in another order.
+    """Raise ValueError if frames are far too narrow for the mask, perhaps because their axes are in another order.
 
-    The message says what was read. Frames that are too narrow otherwise are refused later, by what they are used for.
+    The message says what was read. Whatever else makes frames too narrow is refused later, by what they are used for;
+    as a restoration pads them, those that would do in a field twice as wide pass here.
     """
+    aperture = observation.aperture
     try:
-        observation.aperture.samples(observation.grid)
+        sample_holes(aperture.centers, aperture.shape, aperture.subaperture_diameter, observation.grid, 2)
     except ValueError as error:
         count, rows, columns = read_fits(path).values.shape
         if columns < rows / 2 or count > min(rows, columns):
             raise ValueError(
-                f"{path}: {error}; the file was read as {count} frames of {rows} x {columns} pixels: if another axis "
-                "counts frames, make it the third one of the file (NAXIS3), which NumPy has first"
+                f"{path} was read as {count} frames of {rows} x {columns} pixels, which are too narrow for this mask: "
+                "take a wider image, or, if another axis counts frames, make it the third one of the file (NAXIS3), "
+                "which NumPy has first"
             ) from error
