@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from torchmask.grid import Grid
 from torchmask.io import as_tensor, load_npz, save_npz
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.bad_pixels import fill_bad_pixels
+from torchmask.optics.copies import copies_among
 from torchmask.optics.pixel import PixelResponse, pixel_record, read_pixel
 from torchmask.optics.records import aperture_record, read_aperture
 from torchmask.optics.sky import pixel_matrix
@@ -271,6 +273,16 @@ def check_frames(
             "subtract less sky and dark"
         )
     return frames, valid
+
+
+def warn_of_copies(frames: Tensor, stacklevel: int) -> None:
+    """Warn of frames (T, H, W) that repeat earlier ones, as if it were raised `stacklevel` calls above."""
+    if copies := copies_among(frames):
+        warnings.warn(
+            f"frames {copies} of this stack, counted from 0, repeat earlier ones pixel by pixel, as a file that is "
+            "read twice does: they tell nothing new, but count as much, so leave them out",
+            stacklevel=stacklevel + 1,
+        )
 
 
 def _read_aperture(stored: Mapping[str, Any], prefix: str) -> Aperture:

@@ -30,7 +30,7 @@ from torchmask.interferometry.star_frames import StarFrames
 from torchmask.interferometry.star_model import MAP, PLACE, Shared, StarModel
 from torchmask.interferometry.star_verdict import StarVerdict, judge_star, require_star
 from torchmask.interferometry.which_mask import require_mask
-from torchmask.observation import check_frames
+from torchmask.observation import check_frames, warn_of_copies
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.geometry import MaskGeometry, turn_and_stretch
 from torchmask.optics.pixel import PixelResponse, SquarePixel
@@ -202,6 +202,7 @@ def calibrate_mask(
         raise ValueError(f"pixel is {pixel}, which is known, and estimate_pixel is true: leave one of them out")
     frames, valid = (values.cpu() for values in check_frames(frames, valid, grid))
     frames, valid = leave_out_unmarked(frames, valid, grid, aperture, stacklevel=2)
+    warn_of_copies(frames, stacklevel=2)
     reach = min(math.ceil(_REACH * grid.period / aperture.subaperture_diameter), (min(grid.shape) - 1) // 2)
     star = StarFrames.around(frames, valid, reach)
     centers = aperture.centers.detach().double().cpu()
