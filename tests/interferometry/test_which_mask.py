@@ -12,7 +12,9 @@ from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.grid import Grid
 from torchmask.interferometry.calibration import calibrate_mask
 from torchmask.interferometry.fringe_power import FringePower, fringe_wavelengths
+from torchmask.interferometry.fringes import frame_observables
 from torchmask.interferometry.which_mask import ORIENTATIONS, MaskLook, look_at_mask
+from torchmask.observation import Observation
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.bad_pixels import fill_bad_pixels
 from torchmask.optics.band import Band
@@ -155,6 +157,13 @@ def test_a_restoration_warns_once_and_its_verdict_says_why(frames):
         result = MyopicDeconvolution(symmetric, GRID, n_modes=3, max_iterations=1).restore(frames)
     assert "the mask with x reversed makes the same fringes" in result.summary()
     assert set(MaskLook._fields) <= set(get_type_hints(Verdict))
+
+
+def test_observables_of_frames_through_another_mask_than_told_are_warned_of(frames):
+    mirrored = ORIENTATIONS["with x reversed"].apply(MASK)
+    with pytest.warns(UserWarning, match="fit the mask better with x reversed than as given") as caught:
+        frame_observables(Observation(frames, mirrored, GRID, 1.5))
+    assert caught[0].filename == __file__
 
 
 def without_the_brightest(frames, share):

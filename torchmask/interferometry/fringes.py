@@ -14,6 +14,7 @@ from torchmask.interferometry.fringe_fit import (
 )
 from torchmask.interferometry.observables import Observables
 from torchmask.interferometry.visibilities import sky_stations, triangle_sides
+from torchmask.interferometry.which_mask import look_at_mask
 from torchmask.observation import Observation, check_frames
 from torchmask.optics.noise import noise_variance
 from torchmask.optics.phasor import phasor
@@ -56,7 +57,8 @@ def frame_observables(observation: Observation) -> Observables:
     Notes
     -----
     Saturated and dead pixels get no weight, nor do cosmic rays and hot pixels that stand out beyond the cut-off, and
-    warnings tell of them (`find_saturated`, `find_dead`, `find_spikes`).
+    warnings tell of them (`find_saturated`, `find_ceilings`, `find_dead`, `find_spikes`). Another warning says where the
+    fringes are not those of the mask (`look_at_mask`).
     The variances of light and fringes are subtracted from their squares, and the mean contribution of the pixels' noise
     from triple products (Wirnitzer 1985, J. Opt. Soc. Am. A 2, 14, for photon noise), so that means are unbiased even
     for few photons. All frames share the centre of their mean. Light at an angle s from it is attenuated by the overlap
@@ -80,6 +82,7 @@ def frame_observables(observation: Observation) -> Observables:
     model = FringeModel(aperture, grid, observation.pixel)
     frames, valid = (values.cpu() for values in check_frames(observation.frames, observation.valid, grid))
     frames, valid = leave_out_unmarked(frames, valid, grid, aperture, stacklevel=2)
+    look_at_mask(frames, aperture, grid, valid=valid).warn(stacklevel=2)
     fit = fit_fringes(frames, valid, _pixel_noise(observation, frames, valid), model)
     n = aperture.n_subapertures
     values, noise = fit.fringes * n, fit.fringe_noise * n**2
