@@ -473,7 +473,7 @@ def test_an_interrupted_restoration_goes_on_to_the_same_result(runs, tmp_path, m
     refused(["restore", "--resume", runs / "simulate"], tmp_path, capsys, "it is for simulate, not for restore")
     (tmp_path / "rest/resume.npz").unlink()
     refused(["restore", "--resume", tmp_path / "rest"], tmp_path, capsys, "no .*resume.npz to resume from")
-    refused(["restore", "--resume", tmp_path / "none"], tmp_path, capsys, "there is no config file .*none/config.yaml")
+    refused(["restore", "--resume", tmp_path / "none"], tmp_path, capsys, "there is no folder .*none: --resume goes on")
 
 
 def test_a_resumed_restoration_is_one(runs, tmp_path, capsys):

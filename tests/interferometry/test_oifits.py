@@ -83,7 +83,8 @@ def test_the_file_says_what_was_observed(tmp_path, mask, grid, expose_points, sk
     about = {"TARGNAME": "AB Dor", "TARG_RA": 82.18, "TARG_DEC": -65.45, "TELESCOP": "JWST", "INSTRUME": "NIRISS"}
     about |= {"FILTER": "F480M", "DATE-OBS": "2022-06-05", "TIME-OBS": "12:00:00", "XPOSURE": 20.0}
     header = sky_cards(0.3, grid.pixel_scale) | about
-    observation = Observation(expose_points(mask, grid, n_frames=3, pistons=False), mask, grid, 0.0, header=header)
+    frames = torch.poisson(expose_points(mask, grid, n_frames=3, pistons=False), torch.Generator().manual_seed(0))
+    observation = Observation(frames, mask, grid, 0.0, header=header)
     save_oifits(tmp_path / "a.oifits", frame_observables(observation), observation)
     with fits.open(tmp_path / "a.oifits", checksum=True) as hdus:
         names = [hdu.name for hdu in hdus[1:]]

@@ -36,7 +36,7 @@ def test_errors_of_pixels_that_are_not_valid_do_not_matter(value):
         assert torch.equal(getattr(found, name), getattr(good, name))
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, 0.0])
+@pytest.mark.parametrize("value", [math.nan, math.inf, 0.0, -1.0])
 def test_errors_of_valid_pixels_must_be_finite_and_positive(value):
     frames = exposures()
     errors = torch.full_like(frames, 3.0)

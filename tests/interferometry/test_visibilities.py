@@ -78,6 +78,7 @@ def test_a_restored_object_has_exactly_the_visibilities_of_its_pixels(mask, grid
     np.testing.assert_allclose(wrapped(phases), 0, atol=1e-12)
 
 
+@pytest.mark.filterwarnings("ignore:frames .* repeat earlier ones")  # without noise
 @pytest.mark.parametrize("pixel", [None, SquarePixel()])
 def test_errors_of_a_restored_object_are_those_of_frames_with_its_noise(pixel, expose_points):
     # White noise, no aberrations, patches that do not overlap: two ways to the same error.

@@ -6,17 +6,18 @@ import torch
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
-from torchmask.interferometry.measurements import SAME, Measurements
+from torchmask.interferometry.measurements import Measurements
 
+_EQUAL = 1e-6  # of the length of a baseline: sides of two triangles that differ by less are of the same holes
 _RANK = 1e-9  # of the largest singular value: what is smaller is rounding
 
 
 def closure_combinations(measured: Measurements) -> Tensor:
     """Return orthonormal combinations (C, K) of closure phases that sums of the baselines' phases can take, K <= C.
 
-    Closure phases whose errors are correlated share baselines: those of equal length and direction, up to `SAME`. What
-    the phases of baselines cannot explain, such as a triangle that disagrees with the three around a fourth hole, is
-    noise of higher order, whose covariance a few frames do not tell. Without correlations all C count.
+    Closure phases whose errors are correlated share baselines: those of equal length and direction, to a millionth.
+    What the phases of baselines cannot explain, such as a triangle that disagrees with the three around a fourth hole,
+    is noise of higher order, whose covariance a few frames do not tell. Without correlations all C count.
     """
     n = len(measured.closure_phases)
     if measured.closure_correlation is None or n == 0:
@@ -38,7 +39,7 @@ def _incidence(sides: Tensor) -> Tensor:
     every = sides.flatten(0, 1)
     lengths = torch.linalg.vector_norm(every, dim=1)
     same, opposite = (torch.linalg.vector_norm(every[:, None] - sign * every, dim=2) for sign in (1, -1))
-    first = (torch.minimum(same, opposite) <= SAME * lengths[:, None]).double().argmax(1)
+    first = (torch.minimum(same, opposite) <= _EQUAL * lengths[:, None]).double().argmax(1)
     signs = torch.where(same[range(len(every)), first] <= opposite[range(len(every)), first], 1.0, -1.0)
     baselines, column = first.unique(return_inverse=True)
     matrix = torch.zeros(len(sides), len(baselines), dtype=torch.float64)

@@ -15,7 +15,7 @@ from torchmask.interferometry.fringe_fit import (
 from torchmask.interferometry.observables import Observables
 from torchmask.interferometry.visibilities import sky_stations, triangle_sides
 from torchmask.interferometry.which_mask import look_at_mask
-from torchmask.observation import Observation, check_frames
+from torchmask.observation import Observation, check_frames, warn_of_copies
 from torchmask.optics.noise import noise_variance
 from torchmask.optics.phasor import phasor
 from torchmask.optics.unmarked import leave_out_unmarked
@@ -52,13 +52,14 @@ def frame_observables(observation: Observation) -> Observables:
     ------
     ValueError
         If the aperture has fewer than two sub-apertures, two baselines are too similar to be separated with this field
-        and band, `check_frames` rejects a frame, or the read-out noise is neither known nor measurable.
+        and band, `check_frames` rejects a frame, the read-out noise is neither known nor measurable, or one of the
+        `errors` of a valid pixel is not finite and positive.
 
     Notes
     -----
     Saturated and dead pixels get no weight, nor do cosmic rays and hot pixels that stand out beyond the cut-off, and
-    warnings tell of them (`find_saturated`, `find_ceilings`, `find_dead`, `find_spikes`). Another warning says where the
-    fringes are not those of the mask (`look_at_mask`).
+    warnings tell of them (`find_saturated`, `find_ceilings`, `find_dead`, `find_spikes`). Others tell of frames that
+    repeat earlier ones, and of fringes that are not those of the mask (`look_at_mask`).
     The variances of light and fringes are subtracted from their squares, and the mean contribution of the pixels' noise
     from triple products (Wirnitzer 1985, J. Opt. Soc. Am. A 2, 14, for photon noise), so that means are unbiased even
     for few photons. All frames share the centre of their mean. Light at an angle s from it is attenuated by the overlap
@@ -82,6 +83,7 @@ def frame_observables(observation: Observation) -> Observables:
     model = FringeModel(aperture, grid, observation.pixel)
     frames, valid = (values.cpu() for values in check_frames(observation.frames, observation.valid, grid))
     frames, valid = leave_out_unmarked(frames, valid, grid, aperture, stacklevel=2)
+    warn_of_copies(frames, stacklevel=2)
     look_at_mask(frames, aperture, grid, valid=valid).warn(stacklevel=2)
     fit = fit_fringes(frames, valid, _pixel_noise(observation, frames, valid), model)
     n = aperture.n_subapertures
@@ -107,7 +109,8 @@ def frame_observables(observation: Observation) -> Observables:
 def _pixel_noise(observation: Observation, frames: Tensor, valid: Tensor) -> PixelNoise:
     """Return the noise of frames (T, H, W), unbiased if it is estimated from the frames themselves."""
     if observation.errors is not None:
-        return PixelNoise(observation.errors.double().cpu() ** 2, is_own=False, light=frames)
+        errors = observation.errors.double().cpu()
+        return PixelNoise(errors * errors.abs(), is_own=False, light=frames)  # negative ones stay so, and are refused
     readout = observation.readout_noise
     if readout is None:
         measured = noise_variance(frames, observation.grid, observation.aperture, valid)

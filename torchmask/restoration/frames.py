@@ -11,9 +11,8 @@ import torch
 from torch import Tensor
 
 from torchmask.grid import Grid
-from torchmask.observation import check_frames
+from torchmask.observation import check_frames, warn_of_copies
 from torchmask.optics.aperture import Aperture
-from torchmask.optics.copies import copies_among
 from torchmask.optics.unmarked import leave_out_unmarked
 from torchmask.restoration.background import Background, check_known_level, fills_field
 from torchmask.restoration.change import Change
@@ -101,12 +100,7 @@ class FrameStack:
             raise ValueError("the frames hold only background, no object to restore: check background and the target")
         if border_brightness(light, valid) > _BRIGHT_BORDER or float(guess.mean()) > _EVEN_LIGHT * float(frames.mean()):
             warnings.warn(_what_light_is_taken_for(free), stacklevel=4)
-        if copies := copies_among(frames):
-            warnings.warn(
-                f"frames {copies} of this stack, counted from 0, repeat earlier ones pixel by pixel, as a file that is "
-                "read twice does: they tell nothing new, but count as much, so leave them out",
-                stacklevel=4,
-            )
+        warn_of_copies(frames, stacklevel=4)
         return cls(frames / unit, valid, unit, variance, known, free, errors, slope, fills, excess)
 
     def __len__(self) -> int:
