@@ -165,7 +165,7 @@ def test_a_tiny_run_writes_numbers_table_picture_and_log(name, tmp_path, monkeyp
             ["--exposures", "1", "1"],
             "--exposures is (1.0, 1.0): it must hold at least one value, and none tw",
         ),
-        ("exposure", ["--instruments", "slit"], "instruments is ('slit',): known ones are mask, full"),
+        ("exposure", ["--instruments", "slit"], "--instruments is ('slit',): known ones are mask, full"),
         ("band", ["--widths", "1.5"], "--widths is (1.5,): a filter must be narrower"),
         ("band", ["--n-photons", "0"], "--n-photons is 0.0: it must be positive"),
     ],

@@ -210,7 +210,7 @@ def test_the_scripts_share_their_searches(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--frames"], "frames is ()"),
+        (["--frames"], "--frames is ()"),
         (["--frames", "5", "0"], "--frames is (5, 0)"),
         (["--d-over-r0", "0"], "--d-over-r0 is 0.0"),
         (["--outer-scale", "0"], "--outer-scale is 0.0"),
