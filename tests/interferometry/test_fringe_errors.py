@@ -90,6 +90,10 @@ def test_no_variance_is_below_that_of_the_noise():
     more = (4.0 + 0.04) / 3  # scatter is twice the sample variance, 2 and 0.02
     torch.testing.assert_close(quiet[0], torch.tensor((10 * more + 2 * 4.0) / 12, dtype=torch.float64))
     assert float(quiet[1]) == pytest.approx(max(2.0, (10 * more * 2 + 2 * 0.04) / 12))
+    one = torch.tensor([100.0, 2.0], dtype=torch.float64)  # all scatter less, but one of them more than its noise
+    found = _covariance(torch.tensor([[0.0, 2.0], [0.0, -2.0]], dtype=torch.float64), one.diag()).diagonal()
+    expected = torch.tensor([100.0, (10 * 2.0 + 2 * 16.0) / 12], dtype=torch.float64)
+    torch.testing.assert_close(found, expected, rtol=1e-12, atol=0)
 
 
 def test_the_error_of_a_mean_visibility_is_that_of_either_part_of_it():

@@ -87,9 +87,6 @@ class PairResiduals:
         for _ in range(steps):
             slopes = self.slopes(found) * self.unit
             change = self.unit * torch.linalg.lstsq(slopes, residual[:, None]).solution[:, 0]
-            if found[0] >= _EQUAL and change[0] > 0:  # only the place can be better
-                place = torch.linalg.lstsq(slopes[:, 1:], residual[:, None]).solution[:, 0]
-                change = self.unit * torch.cat([place.new_zeros(1), place])
             for _ in range(_HALVINGS):
                 moved = found + change
                 moved[0] = moved[0].clamp(max=_EQUAL)
