@@ -38,7 +38,7 @@ def _incidence(sides: Tensor) -> Tensor:
     """Return by which sign (C, B) the phase of each of B baselines enters closure phases, from `sides` (C, 3, 2)."""
     every = sides.flatten(0, 1)
     lengths = torch.linalg.vector_norm(every, dim=1)
-    same, opposite = (torch.linalg.vector_norm(every[:, None] - sign * every, dim=2) for sign in (1, -1))
+    same, opposite = (torch.cdist(every, sign * every, compute_mode="donot_use_mm_for_euclid_dist") for sign in (1, -1))
     first = (torch.minimum(same, opposite) <= _EQUAL * lengths[:, None]).double().argmax(1)
     signs = torch.where(same[range(len(every)), first] <= opposite[range(len(every)), first], 1.0, -1.0)
     baselines, column = first.unique(return_inverse=True)

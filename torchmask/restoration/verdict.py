@@ -43,7 +43,7 @@ class Verdict:
     phase_error : rms of the modes left out, over a sub-aperture [rad]
     frames : numbers of the frames that are not explained individually
     n_frames : number of frames in the stack
-    check : what may be wrong; empty if everything is explained
+    check : what may be wrong, or was stopped early; empty if nothing is
     contradiction : what the fringes say against the mask as given, and which fits better; empty if nothing
     unseen : other orientations of the mask that would make the same fringes; empty if there are none
     least : chi-square below which no fit comes; 0 if that cannot be told
