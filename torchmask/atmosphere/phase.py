@@ -18,6 +18,8 @@ from torchmask.atmosphere.von_karman import require_turbulence
 from torchmask.numbers import whole_number
 from torchmask.optics.pupil import PupilSamples
 
+_BORDER = 2  # samples beyond the middle half of a raster that the cells at the border of a pupil may lie in
+
 
 class TurbulencePhase(nn.Module):
     """Random phase of von Karman turbulence on the samples of a pupil.
@@ -43,7 +45,9 @@ class TurbulencePhase(nn.Module):
     Notes
     -----
     `forward(samples, n_frames, generator)` returns (..., n_frames, N, P) [rad] with the dtype and device of the samples
-    (..., N, P). All masks of a population see the same screens. Frames are snapshots: nothing moves during an exposure.
+    (..., N, P). With the same generator, all masks and pupils on one raster see the same screens, alone or in a
+    population, as long as they lie within its middle half, as those do that a grid samples well. Frames are snapshots:
+    nothing moves during an exposure.
 
     Examples
     --------
@@ -116,8 +120,8 @@ class LayeredPhase(nn.Module):
     the samples (..., N, P). `direction` (..., 2), (x, y) [rad], is the position of the star from the middle of the
     field, where it is by default; the star's image lies direction / pixel_scale pixels from there. The leading axes of
     `direction` come before all others. A ray to the point x of the pupil crosses a layer of height h at
-    x + h direction. All directions and all masks of a population see the same screens. Frames are snapshots; for the
-    phase within an exposure, see `draws`.
+    x + h direction. All directions see the same screens, and so do all masks, as in `TurbulencePhase`. Frames are
+    snapshots; for the phase within an exposure, see `draws`.
 
     Examples
     --------
@@ -158,6 +162,9 @@ class LayeredPhase(nn.Module):
         stars = torch.as_tensor(direction, dtype=torch.float64, device="cpu")
         if stars.shape[-1:] != (2,):
             raise ValueError(f"direction has shape {tuple(stars.shape)}: its last axis must be (x, y), in rad")
+        if stars.numel() == 0:
+            shape = samples.index.shape
+            return samples.weights.new_zeros(*stars.shape[:-1], *shape[:-2], n_frames, *shape[-2:])
         frames = itertools.islice(self.draws(samples, generator), n_frames)
         phases = [[frame.phase(direction=(x, y)) for x, y in stars.view(-1, 2).tolist()] for frame in frames]
         together = torch.stack([torch.stack(phase) for phase in phases], dim=-3)  # (direction, ..., frame, N, P)
@@ -214,14 +221,27 @@ def _require_interval(frame_interval: float | None) -> None:
 
 
 def _window(samples: PupilSamples) -> tuple[Tensor, tuple[int, int]]:
-    """Return the indices of a pupil's samples in the smallest rectangle around it, and that rectangle's shape.
+    """Return the indices of a pupil's samples in the window of the screens, and that window's shape.
 
-    The pupil may lie across the border of the raster. Raises TypeError for anything but the samples of a pupil.
+    The window is the middle half of the raster, which holds every centred aperture that a grid samples well. As it does
+    not depend on the pupil, all pupils on one raster see the same screens, and nothing jumps as a hole moves. A pupil
+    that reaches further, or lies across the border of the raster, has the smallest rectangle around it for a window.
+    Raises TypeError for anything but the samples of a pupil.
     """
     if not isinstance(samples, PupilSamples):
         raise TypeError(f"samples are of type {type(samples).__name__}: give those of a pupil, aperture.samples(grid)")
-    coordinates, shape = [], []
     places = (samples.index // samples.raster[1], samples.index % samples.raster[1])
+    reach = [size // 4 + _BORDER for size in samples.raster]
+    coordinates = [(place + most) % size for place, most, size in zip(places, reach, samples.raster, strict=True)]
+    shape = [min(2 * most + 1, size) for most, size in zip(reach, samples.raster, strict=True)]
+    if not all(bool((local < side).all()) for local, side in zip(coordinates, shape, strict=True)):
+        coordinates, shape = _smallest_rectangle(samples, places)
+    return coordinates[0] * shape[1] + coordinates[1], (shape[0], shape[1])
+
+
+def _smallest_rectangle(samples: PupilSamples, places: tuple[Tensor, Tensor]) -> tuple[list[Tensor], list[int]]:
+    """Return the rows and columns of a pupil's samples in the smallest rectangle around it, and that one's sides."""
+    coordinates, shape = [], []
     weights = samples.weights.detach()  # holes may be trainable, but the choice of samples is not differentiable
     for place, size in zip(places, samples.raster, strict=True):
         angle = 2 * math.pi / size * place  # on a periodic raster the middle is a mean angle
@@ -229,4 +249,4 @@ def _window(samples: PupilSamples) -> tuple[Tensor, tuple[int, int]]:
         local = (place - round(float(middle) * size / (2 * math.pi)) + size // 2) % size
         coordinates.append(local - local.min())
         shape.append(int(coordinates[-1].max()) + 1)
-    return coordinates[0] * shape[1] + coordinates[1], (shape[0], shape[1])
+    return coordinates, shape
