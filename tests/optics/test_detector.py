@@ -135,6 +135,38 @@ def test_where_no_noise_is_known_the_gradient_is_that_of_the_mean(dtype):
     assert float(slope[1]) == pytest.approx(1 + float(normal) / 4, rel=1e-6)  # read-out noise is enough to know it
 
 
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("readout_noise", [0.0, 1.0])
+def test_a_bright_image_beside_a_faint_one_changes_nothing_of_it(dtype, readout_noise):
+    faint = torch.full((16, 16), 2.4, dtype=dtype)
+    bright = torch.zeros_like(faint)
+    bright[4:8, 4:8] = 1e14
+    slopes = []
+    for mate in (faint, bright):
+        light = torch.stack([faint, mate]).requires_grad_()
+        frames = Detector(readout_noise, noise="gaussian")(light, generator())
+        slopes.append(torch.autograd.grad(frames[0].sum(), light)[0][0])
+        with pytest.raises(ValueError, match="negative"):
+            Detector(readout_noise)(torch.stack([-faint, mate]))
+    assert torch.equal(*slopes)
+    assert bool((slopes[0] != 1).all())
+
+
+@pytest.mark.parametrize("noise", ["poisson", "gaussian"])
+def test_a_detector_is_mapped_over_images(noise):
+    light = torch.full((3, 50, 50), 9.0, dtype=torch.float64)
+    frames = torch.func.vmap(Detector(1.5, noise), randomness="different")(light)
+    assert frames.shape == light.shape
+    assert abs(float(frames.var()) - 11.25) < 4 * 11.25 * math.sqrt(2 / light.numel())
+    assert not torch.equal(frames[0], frames[1])
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_light_in_half_precision_is_refused(dtype):
+    with pytest.raises(TypeError, match=r"expected is .*: float32 or float64 is needed"):
+        Detector(1.0)(torch.ones(4, 4, dtype=dtype))
+
+
 def test_counts_carry_no_gradient():
     light = torch.full((4, 4), 30.0, requires_grad=True)
     assert not Detector(2.0)(light, generator()).requires_grad

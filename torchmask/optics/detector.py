@@ -9,8 +9,9 @@ import torch
 from torch import Tensor, nn
 
 from torchmask.optics.fourier import transform_images
-from torchmask.optics.inputs import require_tensor
+from torchmask.optics.inputs import require_real
 from torchmask.optics.pixel import PixelResponse, require_response
+from torchmask.optics.pupil import can_be_read
 
 NOISES = ("poisson", "gaussian")
 
@@ -143,17 +144,16 @@ class Detector(nn.Module):
 
         A `generator` on the CPU works for any device of `expected`, and gives the same noise on all of them.
 
-        Raises TypeError if `expected` is no tensor of floating point, and ValueError if a value is not finite, or is
-        negative beyond the rounding error of the FFTs that formed it.
+        Raises TypeError if `expected` is no tensor of float32 or float64, and ValueError if a value is not finite, or
+        is negative beyond the rounding error of the FFTs that formed its image (values are not checked under
+        `torch.func.vmap`).
         """
-        require_tensor("expected", expected)
-        if not expected.is_floating_point():
-            raise TypeError(f"expected is {expected.dtype}: light has fractions of electrons, give expected.double()")
-        if not bool(torch.isfinite(expected).all()):
-            raise ValueError("expected holds values that are not finite: electrons per pixel are needed")
-        rounding = 32 * torch.finfo(expected.dtype).eps * torch.linalg.vector_norm(expected.detach())
-        if bool((expected < -rounding).any()):
-            raise ValueError("expected holds negative light beyond rounding errors: clip it at 0")
+        require_real("expected", expected)
+        image = (-2, -1) if expected.ndim > 1 else None
+        norm = torch.linalg.vector_norm(expected.detach(), dim=image, keepdim=True)
+        rounding = 32 * torch.finfo(expected.dtype).eps * norm
+        if can_be_read(expected):
+            _require_light(expected, rounding)
         device = expected.device if generator is None else generator.device
         normal = torch.randn(expected.shape, generator=generator, dtype=expected.dtype, device=device)
         if self.noise == "gaussian":
@@ -165,6 +165,14 @@ class Detector(nn.Module):
     def extra_repr(self) -> str:
         pixel = "" if self.pixel is None else f", pixel={self.pixel}"
         return f"readout_noise={self.readout_noise:.6g}, noise={self.noise!r}{pixel}"
+
+
+def _require_light(expected: Tensor, rounding: Tensor) -> None:
+    """Raise ValueError unless expected light is finite and, but for rounding errors, not negative."""
+    if not bool(torch.isfinite(expected).all()):
+        raise ValueError("expected holds values that are not finite: electrons per pixel are needed")
+    if bool((expected < -rounding).any()):
+        raise ValueError("expected holds negative light beyond rounding errors: clip it at 0")
 
 
 def _root(variance: Tensor, rounding: Tensor) -> Tensor:
