@@ -2,10 +2,11 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, Subset
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture, SparseAperture
@@ -194,6 +195,23 @@ def test_the_sequence_ends():
     assert len(dataset) == len(list(iter(dataset))) == 4
     with pytest.raises(IndexError, match="there are 4"):
         dataset[4]
+
+
+def test_an_index_may_be_a_whole_number_of_torch_or_numpy():
+    dataset = stacks()
+    for index in (torch.tensor(3), torch.tensor([3]), np.int64(3)):
+        assert equal(dataset[index], dataset[3])
+    drawn = Subset(dataset, torch.tensor([2, 0]))
+    assert equal(drawn[0], dataset[2])
+    for index in (-1, torch.tensor(-1), torch.tensor(4)):
+        with pytest.raises(IndexError, match="there are 4, from 0"):
+            dataset[index]
+
+
+@pytest.mark.parametrize("index", [1.5, slice(0, 2), "1", True, None, torch.tensor([0, 1]), torch.tensor(1.0)])
+def test_what_is_no_index_is_refused(index):
+    with pytest.raises(TypeError, match=r"the index of a stack is .*: it must be one whole number"):
+        stacks()[index]
 
 
 @pytest.mark.parametrize(

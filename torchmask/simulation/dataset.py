@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, SupportsIndex
 
 import numpy as np
 import torch
@@ -208,7 +209,8 @@ class StackDataset(Dataset[dict[str, Tensor]]):
     def __len__(self) -> int:
         return self.length
 
-    def __getitem__(self, index: int) -> dict[str, Tensor]:
+    def __getitem__(self, index: SupportsIndex) -> dict[str, Tensor]:
+        index = _one_index(index)
         if not 0 <= index < self.length:
             raise IndexError(f"there is no stack {index}: there are {self.length}, from 0")
         random = np.random.default_rng([self.seed, index])
@@ -248,6 +250,19 @@ class StackDataset(Dataset[dict[str, Tensor]]):
         if not light > 0:
             raise ValueError(f"scene({index}, generator) gave an image with a sum of {light:.3g}: it must be positive")
         return image.detach().to("cpu", torch.float64), {}
+
+
+def _one_index(index: SupportsIndex) -> int:
+    """Return the index of one stack, which may be a whole number of NumPy or torch; raises TypeError otherwise."""
+    if not isinstance(index, bool):
+        try:
+            return operator.index(index)
+        except TypeError:
+            pass
+    raise TypeError(
+        f"the index of a stack is {index!r}: it must be one whole number; torch.utils.data.Subset(stacks, indices) "
+        "holds several"
+    )
 
 
 def _seeded(random: np.random.Generator) -> torch.Generator:
