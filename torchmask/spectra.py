@@ -116,7 +116,7 @@ def evaluate_psd(
     dtype: torch.dtype | None = torch.float64,
     device: torch.device | str | None = None,
 ) -> Tensor:
-    """Evaluate `psd` at the frequencies of `grid` as a new tensor (H, W).
+    """Evaluate `psd` at the frequencies of `grid` as a new tensor (H, W), differentiable in a tensor that is given.
 
     Raises
     ------
@@ -130,7 +130,7 @@ def evaluate_psd(
         given = f"{value.dtype} tensor" if isinstance(value, Tensor) else type(value).__name__
         raise TypeError(f"{name} is a {given}: it must be a real tensor (H, W), or psd(grid, dtype, device) giving one")
     try:
-        value = value.detach().to(dtype=dtype, device=device).expand(grid.shape).clone()
+        value = value.to(dtype=dtype, device=device).expand(grid.shape).clone()
     except RuntimeError:
         raise ValueError(
             f"{name} has shape {tuple(value.shape)}: it must broadcast to the grid's {grid.shape[0]} x {grid.shape[1]}"

@@ -355,6 +355,18 @@ def test_wiener_mse_is_its_formula() -> None:
     assert wiener_mse(otfs.to(torch.complex64), s_o, s_n).dtype == torch.float32
 
 
+def test_wiener_mse_differentiates_in_otfs_and_power_spectra() -> None:
+    """Also where the object has no power, or the OTFs none."""
+    otfs = torch.complex(uniform(2, 3, 4) - 0.5, uniform(2, 3, 4) - 0.5)
+    otfs[:, 1, 2] = 0
+    otfs.requires_grad_()
+    s_o, s_n = uniform(3, 4).add(0.5).requires_grad_(), torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(wiener_mse, (otfs, s_o, s_n))
+    dark = torch.zeros(3, 4, dtype=torch.float64, requires_grad=True)
+    wiener_mse(otfs, dark, s_n).backward()
+    torch.testing.assert_close(dark.grad, torch.full_like(dark, 1 / 12))  # all that is not seen is error
+
+
 def test_wiener_mse_without_noise_is_what_no_light_arrives_of() -> None:
     """Dark frequencies keep the object's power, those without an object have no error, and slopes are finite."""
     otfs = torch.ones(2, 4, 4, dtype=torch.float64)
@@ -431,6 +443,13 @@ def test_state_survives_saving_copying_and_conversion() -> None:
     same = criterion_of(grid)
     same.load_state_dict(criterion_of(grid).state_dict())
     assert torch.equal(same.on_grid(24).object_psd, PowerLawPSD(1.5, 1e4)(grid_of(24)))
+
+
+def test_buffers_take_no_gradient_of_a_power_spectrum_that_trains() -> None:
+    psd = PowerLawPSD(1.5, 1e4)(grid_of(16)).requires_grad_()
+    criterion = AsymptoticMSE(grid_of(16), psd, psd / 1e4, 20)
+    assert not any(buffer.requires_grad for buffer in criterion.buffers())
+    assert not criterion(mask_of(layouts()["random"])).requires_grad
 
 
 def test_an_ordinary_optimiser_improves_a_mask() -> None:

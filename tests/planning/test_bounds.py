@@ -96,6 +96,13 @@ def test_it_is_computed_in_float64_where_the_aperture_is():
         assert bound(image=image) == expected
 
 
+@pytest.mark.filterwarnings("error:Converting a tensor")
+def test_power_spectra_that_train_change_nothing():
+    psds = {"object_psd": OBJECT(GRID), "noise_psd": NOISE(GRID)}
+    trained = {name: psd.clone().requires_grad_() for name, psd in psds.items()}
+    assert bound(**trained) == bound(**psds)
+
+
 def test_whole_numbers_may_be_floats():
     assert bound(n_frames=4.0, n_modes=3.0) == bound(n_frames=4, n_modes=3)
 

@@ -80,6 +80,26 @@ def test_gradient():
     assert torch.autograd.gradcheck(lambda f, h: multiframe_wiener(f, h, psd, 0.1 * psd), (frames, otfs))
 
 
+def test_power_spectra_can_be_learned():
+    frames, otfs = draw(2)
+    frames, otfs = frames[:, :4, :5], otfs[:, :4, :5]
+    signal = (0.5 + torch.rand(4, 5, dtype=torch.float64)).requires_grad_()
+    noise = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda s, n: multiframe_wiener(frames, otfs, s, n), (signal, noise))
+    learned = signal.detach().float().requires_grad_()
+    multiframe_wiener(frames.float(), otfs.to(torch.complex64), learned, noise).square().sum().backward()
+    assert float(learned.grad.abs().min()) > 0
+
+
+def test_no_stacks_give_no_images():
+    frames, otfs = draw(2)
+    frames = frames.expand(3, 0, *frames.shape).requires_grad_()
+    image = multiframe_wiener(frames, otfs, torch.tensor(1.0), torch.tensor(0.1))
+    assert image.shape == (3, 0, *SHAPE)
+    image.sum().backward()
+    assert frames.grad.shape == frames.shape
+
+
 def test_the_image_has_the_dtype_of_the_frames():
     frames, otfs = draw(2)
     psd = torch.tensor(1.0)

@@ -83,8 +83,8 @@ class AsymptoticMSE(nn.Module):
         self.grid: Grid = grid
         self.n_frames: int = n_frames
         self._object_model = None if isinstance(object_psd, Tensor) else object_psd
-        self.register_buffer("object_psd", evaluate_psd(object_psd, grid, "object_psd"))
-        self.register_buffer("noise_psd", evaluate_psd(noise_psd, grid, "noise_psd"))
+        self.register_buffer("object_psd", evaluate_psd(object_psd, grid, "object_psd").detach())
+        self.register_buffer("noise_psd", evaluate_psd(noise_psd, grid, "noise_psd").detach())
         if not bool((self.noise_psd > 0).all()):
             raise ValueError("noise_psd is 0 somewhere: it must be positive, or the error would be 0 there")
         if not bool((self.object_psd > 0).any()):
@@ -230,7 +230,8 @@ def wiener_mse(otfs: Tensor, object_psd: PSD, noise_psd: PSD) -> Tensor:
     Returns
     -------
     Tensor
-        (...), the mean over nu of S_o S_n / (S_o sum_k |h_k|^2 + S_n), and of S_o where no light and no noise arrive.
+        (...), the mean over nu of S_o S_n / (S_o sum_k |h_k|^2 + S_n), and of S_o where no light and no noise arrive,
+        differentiable in all arguments that are tensors.
         Its average over random pistons is at least MSE_a; OTFs that are sampled in the pupil (`OTF`) need an
         oversampling of 4 or more for that, since what they leak beyond the baselines counts as signal.
 
@@ -254,9 +255,9 @@ def wiener_mse(otfs: Tensor, object_psd: PSD, noise_psd: PSD) -> Tensor:
     s_o = evaluate_psd(object_psd, grid, "object_psd", real, otfs.device)
     s_n = evaluate_psd(noise_psd, grid, "noise_psd", real, otfs.device)
     power = (otfs.real**2 + otfs.imag**2 if otfs.is_complex() else otfs**2).sum(-3)
-    denominator = power + torch.where(s_o > 0, s_n / s_o, torch.inf)
+    denominator = s_o * power + s_n
     is_seen = denominator > 0
-    return torch.where(is_seen, s_n / torch.where(is_seen, denominator, 1.0), s_o).mean((-2, -1))
+    return (s_o * torch.where(is_seen, s_n / torch.where(is_seen, denominator, 1.0), 1.0)).mean((-2, -1))
 
 
 def _reflect(image: Tensor) -> Tensor:

@@ -45,6 +45,7 @@ class MyopicBound:
         return self.unknown / self.known
 
 
+@torch.no_grad()  # it returns numbers, also for power spectra that train
 def myopic_bound(
     image: Tensor,
     aperture: Aperture,

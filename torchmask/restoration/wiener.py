@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchmask.grid import Grid
+from torchmask.optics.fourier import transform_images
 from torchmask.spectra import PSD, evaluate_psd
 
 _REAL, _COMPLEX = (torch.float32, torch.float64), (torch.complex64, torch.complex128)
@@ -29,7 +30,8 @@ def multiframe_wiener(frames: Tensor, otfs: Tensor, object_psd: PSD, noise_psd: 
     Returns
     -------
     Tensor
-        (..., H, W) in the unit and dtype of the frames, differentiable. Its mean squared error is `wiener_mse`.
+        (..., H, W) in the unit and dtype of the frames, differentiable in all arguments that are tensors. Its mean
+        squared error is `wiener_mse`.
 
     Raises
     ------
@@ -58,12 +60,12 @@ def multiframe_wiener(frames: Tensor, otfs: Tensor, object_psd: PSD, noise_psd: 
     grid = Grid((frames.shape[-2], frames.shape[-1]), 1.0, 1.0)  # PSDs are functions of cycles/pixel only
     signal = evaluate_psd(object_psd, grid, "object_psd", frames.dtype, frames.device)
     noise = evaluate_psd(noise_psd, grid, "noise_psd", frames.dtype, frames.device)
-    matched = (otfs.conj() * torch.fft.fft2(frames)).sum(-3)
+    matched = (otfs.conj() * transform_images(torch.fft.fft2, frames)).sum(-3)
     power = (otfs.real**2 + otfs.imag**2).sum(-3)
     denominator = signal * power + noise
     # Where signal and noise are both zero, the estimate is 0.
     gain = torch.where(denominator > 0, signal / torch.where(denominator > 0, denominator, 1), 0)
-    return torch.fft.ifft2(matched * gain).real.to(frames.dtype)
+    return transform_images(torch.fft.ifft2, matched * gain).real.to(frames.dtype)
 
 
 def _broadcast(one: Tensor, other: Tensor) -> bool:
