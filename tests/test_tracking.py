@@ -348,6 +348,37 @@ def test_a_training_loop_of_ones_own(tmp_path):
     np.testing.assert_array_equal(load_npz(tmp_path / "mine" / "checkpoints" / "fit.npz")["x"], x.detach().numpy())
 
 
+def test_an_array_called_step_is_refused_before_anything_is_written(tmp_path):
+    with RunLogger(tmp_path / "run") as log:
+        with pytest.raises(ValueError, match="an array is called 'step'"):
+            log(Record("restoration/mask", 1, 40, {"cost": 1.0}, {"step": torch.ones(2)}))
+        log(record(1, x=torch.ones(2)))
+    assert [row["step"] for row in read_metrics(tmp_path / "run")] == [1]
+    assert load_npz(tmp_path / "run/checkpoints/restoration_mask.npz")["step"] == 1
+
+
+@pytest.mark.parametrize("second", ["fit/a_b", "fit/checkpoints", "fit/config.json", "fit/..", "fit_a b"])
+def test_stages_that_would_share_files_are_refused_before_anything_is_written(tmp_path, second):
+    with RunLogger(tmp_path / "run") as log:
+        log(record(1, "fit/a b", x=torch.ones(2)))
+        with pytest.raises(ValueError, match=r"would be written to .*: rename"):
+            log(record(2, second, x=torch.zeros(2)))
+        with pytest.raises(ValueError, match="would be written to a_b, where 'a b' is"):
+            log.scalar("fit/a_b/cost", 1.0)
+        log(record(3, "fit/a b", x=torch.ones(2)))
+    assert [row["step"] for row in read_metrics(tmp_path / "run")] == [1, 3]
+    assert len(list((tmp_path / "run" / "checkpoints").iterdir())) == 1
+    assert [row.step for row in events(tmp_path / "run" / "a_b").Scalars("fit/cost")] == [1, 3]
+
+
+def test_two_figures_do_not_share_a_file(tmp_path):
+    with RunLogger(tmp_path / "run") as log:
+        for _ in range(2):  # the second replaces the first
+            log.figure("a b", Figure())
+        with pytest.raises(ValueError, match=r"'a_b' would be written to a_b\.png, where 'a b' is"):
+            log.figure("a_b", Figure())
+
+
 def test_closing_twice_is_harmless(tmp_path):
     log = RunLogger(tmp_path / "run")
     log.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 
@@ -32,3 +33,33 @@ def free_name(path: str | Path) -> Path:
         number += 1
         candidate = path.parent / f"{path.name or 'run'}-{number}"  # the present folder has no name
     return candidate
+
+
+class FileNames:
+    """File names of one folder that are made of titles, each of which has a file of its own.
+
+    Names in `reserved` are given to no title.
+
+    Examples
+    --------
+    >>> names = FileNames("config.json")
+    >>> names.of("with mask", ".png")
+    'with_mask.png'
+    >>> names.of("with_mask", ".png")
+    Traceback (most recent call last):
+    ValueError: 'with_mask' would be written to with_mask.png, where 'with mask' is: rename one of them
+    """
+
+    def __init__(self, *reserved: str) -> None:
+        self._reserved = {".", "..", *reserved}
+        self._titles: dict[str, str] = {}
+
+    def of(self, title: str, suffix: str = "") -> str:
+        """Return the file name of a title; raises ValueError if it is reserved or that of another title."""
+        name = re.sub(r"[^\w.+-]+", "_", title) + suffix
+        if name in self._reserved:
+            raise ValueError(f"{title!r} would be written to {name}, which is not free: rename it")
+        other = self._titles.setdefault(name, title)
+        if other != title:
+            raise ValueError(f"{title!r} would be written to {name}, where {other!r} is: rename one of them")
+        return name

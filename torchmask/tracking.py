@@ -18,7 +18,6 @@ import io
 import json
 import math
 import platform
-import re
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -32,7 +31,7 @@ import numpy as np
 import torch
 
 import torchmask
-from torchmask.folders import new_folder
+from torchmask.folders import FileNames, new_folder
 from torchmask.io import as_array, as_tensor, atomic_write, extra, save_npz, to_json, write_json
 from torchmask.record import Record
 from torchmask.viz.figures import stretch
@@ -62,7 +61,8 @@ class RunLogger:
     Raises
     ------
     ValueError
-        If `directory` exists (the message suggests a free name) or cannot be created, or more is logged after the end.
+        If `directory` exists (the message suggests a free name) or cannot be created, more is logged after the end, an
+        array is called "step", or a stage, variant or figure would share the file of another or of the run itself.
 
     Notes
     -----
@@ -99,12 +99,18 @@ class RunLogger:
         self._new_writer = partial(SummaryWriter, flush_secs=_FLUSH_INTERVAL)
         self.writer: Any = self._new_writer(str(self.directory))
         self._writers: dict[str, Any] = {"": self.writer}  # of stages KIND/VARIANT, by VARIANT
+        self._names = FileNames("metrics.jsonl", "config.json", "environment.json", "status.json", "checkpoints")
+        self._checkpoint_names = FileNames()
         self._metrics = open(self.directory / "metrics.jsonl", "x", encoding="utf-8", buffering=1)  # noqa: SIM115
         self._write_status("running")
         self._log_json("environment", _environment(seed))
 
     def __call__(self, record: Record) -> None:
         """Log one step of an algorithm."""
+        if record.arrays:
+            self._checkpoint_names.of(record.stage, ".npz")
+        if "step" in record.arrays:
+            raise ValueError("an array is called 'step', as is the step's number in a checkpoint: rename the array")
         self._write_scalars(record.stage, record.step, record.scalars, n_steps=record.n_steps)
         if not record.arrays:
             return
@@ -147,12 +153,13 @@ class RunLogger:
     def figure(self, name: str, figure: Figure, step: int = 0) -> None:
         """Log a figure and write it to NAME.png in the run folder, replacing an earlier one of that name."""
         writer, kind = self._place("figures")
+        path = self.directory / self._names.of(name, ".png")
         with extra("experiments"):
             import matplotlib.image
 
         picture = io.BytesIO()
         figure.savefig(picture, format="png", dpi=160)
-        with atomic_write(self.directory / f"{_file_name(name)}.png", replace=True) as file:
+        with atomic_write(path, replace=True) as file:
             file.write(picture.getvalue())
         picture.seek(0)
         pixels = matplotlib.image.imread(picture)[..., :3]
@@ -167,7 +174,8 @@ class RunLogger:
         columns = list(rows[0]) if rows else []
         if not columns or any(list(row) != columns for row in rows):
             raise ValueError(f"table {tag} needs rows that all have the same columns; the first row has {columns}")
-        lines = [columns, ["---"] * len(columns), *([_cell(value) for value in row.values()] for row in rows)]
+        cells = ([f"{value:.4g}" if isinstance(value, float) else str(value) for value in row.values()] for row in rows)
+        lines = [columns, ["---"] * len(columns), *cells]
         self.text(tag, "\n".join(f"| {' | '.join(line)} |" for line in lines), step)
 
     def conclude(self, **values: Any) -> None:
@@ -220,7 +228,7 @@ class RunLogger:
             raise ValueError(f"this RunLogger of {self.directory} has been closed: log before that, or start another")
         kind, _, variant = stage.partition("/")
         if variant not in self._writers:
-            self._writers[variant] = self._new_writer(str(self.directory / _file_name(variant)))
+            self._writers[variant] = self._new_writer(str(self.directory / self._names.of(variant)))
         return self._writers[variant], kind
 
     def _log_images(self, record: Record, every: int) -> None:
@@ -235,9 +243,9 @@ class RunLogger:
     def _checkpoint(self) -> None:
         for stage in sorted(self._unsaved):
             record = self._last[stage]
-            folder = self.directory / "checkpoints"
-            folder.mkdir(exist_ok=True)
-            save_npz(folder / f"{_file_name(stage)}.npz", {**record.arrays, "step": record.step}, replace=True)
+            (folder := self.directory / "checkpoints").mkdir(exist_ok=True)
+            path = folder / self._checkpoint_names.of(stage, ".npz")
+            save_npz(path, {**record.arrays, "step": record.step}, replace=True)
         self._unsaved.clear()
         self._last_checkpoint = time.monotonic()
 
@@ -290,11 +298,3 @@ def _flatten(value: Any, prefix: str = "") -> dict[str, float | str]:
     if isinstance(value, bool) or not isinstance(value, int | float | str):
         value = json.dumps(value)
     return {prefix.rstrip(".") or "config": value}
-
-
-def _cell(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-def _file_name(name: str) -> str:
-    return re.sub(r"[^\w.+-]+", "_", name)
