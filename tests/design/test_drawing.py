@@ -66,6 +66,26 @@ def test_a_drawing_changed_in_cad_comes_back_changed(tmp_path):
     assert load_mask(tmp_path / "moved.dxf").centers[0].tolist() == pytest.approx([0.012, -0.007], abs=1e-15)
 
 
+@pytest.mark.parametrize("name", masks())
+@pytest.mark.parametrize(("unit", "millimetres"), [("IN", 25.4), ("CM", 10.0), ("M", 1000.0), (None, 1.0)])
+def test_a_drawing_converted_to_other_units_and_moved_is_the_same_mask(tmp_path, name, unit, millimetres):
+    import ezdxf
+    import ezdxf.units
+
+    mask = masks()[name]
+    save_dxf(tmp_path / "mask.dxf", mask, scale=1.25)
+    drawing = ezdxf.readfile(tmp_path / "mask.dxf")
+    for entity in drawing.modelspace():
+        entity.scale_uniform(1 / millimetres)
+        entity.translate(0.5, -7.0, 0.0)
+    drawing.units = 0 if unit is None else getattr(ezdxf.units, unit)
+    drawing.saveas(tmp_path / "converted.dxf")
+    back = load_mask(tmp_path / "converted.dxf")
+    assert (back.centers - mask.centers).abs().max() < 1e-9
+    assert back.subaperture_diameter == pytest.approx(mask.subaperture_diameter, abs=1e-9)
+    assert back.mask_diameter == pytest.approx(mask.mask_diameter, abs=1e-9)
+
+
 def test_svg_is_in_millimetres_with_y_up(tmp_path):
     mask = masks()["discs"]
     save_svg(tmp_path / "mask.svg", mask, scale=30.0)
@@ -111,6 +131,7 @@ def test_drawings_that_are_no_mask_are_refused(tmp_path):
     refuse("bent", f"6 {unknown}", lambda _, plate: plate.add_lwpolyline(bent, dxfattribs=hole))
     refuse("open", f"5 {unknown}", lambda _, plate: plate.add_lwpolyline(corners[:5], dxfattribs=hole))
     refuse("rims", "layer OUTLINE holds 2 circles", lambda _, plate: plate.add_circle((0, 0), 1, {"layer": "OUTLINE"}))
+    refuse("sky", "the drawing is in Parsecs: set its unit", lambda drawing, _: setattr(drawing, "units", 20))
     refuse("scale", "does not give its scale", lambda drawing, _: drawing.header.custom_vars.clear())
     foreign = ezdxf.new()
     foreign.saveas(tmp_path / "foreign.dxf")

@@ -28,6 +28,8 @@ LIFE_SIZE = 1000.0  # [mm on the plate for a metre of the pupil]
 _SCALE = "torchmask mm per m"
 _BEYOND = 0.1  # of its diameter: holes of some real masks reach 0.05 beyond their nominal pupil
 _NANOMETRE = 1e-6  # [mm], tolerance for rounding
+_UNITS = {0: 1.0, 1: 25.4, 2: 304.8, 4: 1.0, 5: 10.0, 6: 1e3, 9: 0.0254, 10: 914.4, 13: 1e-3, 14: 100.0}
+"""Millimetres in the units of length of a plate, by their number in DXF ($INSUNITS); 0 is a drawing without units."""
 
 
 def save_dxf(
@@ -114,13 +116,17 @@ def save_svg(
 def load_dxf(path: Path) -> SparseAperture:
     """Read a mask, float64, from a drawing written by `save_dxf`, including changes made in a CAD program.
 
+    Such a program may have converted it to other units of length, and moved it as a whole: centres count from the
+    middle of the rim. A drawing without units is in millimetres.
+
     Raises
     ------
     ValueError
-        If the file is damaged, or does not show a mask of known, equal holes.
+        If the file is damaged, its unit is none of a plate, or it does not show a mask of known, equal holes.
     """
     with extra("design"):
         import ezdxf
+        import ezdxf.units
 
     try:
         drawing = ezdxf.readfile(path)  # pyright: ignore[reportPrivateImportUsage]
@@ -130,11 +136,17 @@ def load_dxf(path: Path) -> SparseAperture:
     if noted is None:
         raise ValueError(f"the drawing does not give its scale: set its custom property {_SCALE!r}")
     scale = require_scale(float(noted))
+    unit = _UNITS.get(drawing.units)
+    if unit is None:
+        raise ValueError(
+            f"the drawing is in {ezdxf.units.unit_name(drawing.units)}: set its unit, $INSUNITS, to one of a plate, "
+            "such as 4 for mm or 1 for inches"
+        )
     plate = drawing.modelspace()
     rims = list(plate.query('CIRCLE[layer=="OUTLINE"]'))
     if len(rims) != 1:
         raise ValueError(f"layer OUTLINE holds {len(rims)} circles: one is needed, the rim of the mask")
-    outlines = _drawn_holes(plate)
+    outlines = _drawn_holes(plate, unit)
     if not outlines:
         raise ValueError("layer HOLES is empty: a mask has at least one hole")
     holes = [outlined_shape(tuple(outline), _NANOMETRE) for _, outline in outlines]
@@ -142,15 +154,19 @@ def load_dxf(path: Path) -> SparseAperture:
     if not all(_alike(holes[0], hole) for hole in holes):
         kinds = ", ".join(sorted({str(hole[0]) for hole in holes}))
         raise ValueError(f"its holes differ by more than 1 nm or 1e-6 ({kinds}): all must be equal")
-    centers = torch.tensor(np.stack([center for center, _ in outlines])) / scale
-    return SparseAperture(centers, diameter / scale, 2 * rims[0].dxf.radius / scale, shape)
+    middle, _ = _measured(rims[0], unit)
+    centers = torch.tensor(np.stack([center - middle for center, _ in outlines])) / scale
+    return SparseAperture(centers, diameter / scale, 2 * unit * rims[0].dxf.radius / scale, shape)
 
 
-def _drawn_holes(plate: Any) -> list[tuple[Array, list[Contour]]]:
-    """Return centre [mm] and outline of each hole; contours with the same centre belong to one hole."""
+def _drawn_holes(plate: Any, unit: float) -> list[tuple[Array, list[Contour]]]:
+    """Return centre [mm] and outline of each hole, drawn in units of so many mm.
+
+    Contours with the same centre belong to one hole.
+    """
     holes: list[tuple[Array, list[Contour]]] = []
     for entity in plate.query('CIRCLE LWPOLYLINE[layer=="HOLES"]'):
-        center, contour = _measured(entity)
+        center, contour = _measured(entity, unit)
         same = [outline for other, outline in holes if np.abs(center - other).max() < _NANOMETRE]
         if same:
             same[0].append(contour)
@@ -159,11 +175,11 @@ def _drawn_holes(plate: Any) -> list[tuple[Array, list[Contour]]]:
     return holes
 
 
-def _measured(entity: Any) -> tuple[Array, Contour]:
-    """Return the centre [mm] of a drawn circle or polyline, and its contour relative to it."""
+def _measured(entity: Any, unit: float) -> tuple[Array, Contour]:
+    """Return the centre [mm] of a circle or polyline drawn in units of so many mm, and its contour relative to it."""
     if entity.dxftype() == "CIRCLE":
-        return np.array([entity.dxf.center.x, entity.dxf.center.y]), Circle(entity.dxf.radius)
-    corners = np.array([corner[:2] for corner in entity.vertices()])
+        return unit * np.array([entity.dxf.center.x, entity.dxf.center.y]), Circle(unit * entity.dxf.radius)
+    corners = unit * np.array([corner[:2] for corner in entity.vertices()])
     return corners.mean(0), Corners(corners - corners.mean(0))
 
 
