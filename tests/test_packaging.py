@@ -151,3 +151,14 @@ def test_the_public_names_are_typed(installed, tmp_path):
     report = json.loads(done.stdout)["typeCompleteness"]
     assert report["exportedSymbolCounts"]["withKnownType"] > 1000
     assert report["completenessScore"] > 0.97
+
+
+@pytest.mark.slow
+def test_a_type_checker_takes_masks_of_lists_arrays_and_tensors(installed, tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import numpy as np\nimport torch\nimport torchmask as tm\n"
+        "mask = tm.SparseAperture([[0.0, 0.4], [0.3, -0.2]], 0.1, 1.0).replace(centers=[[0.0, 0.4], [0.3, -0.2]])\n"
+        "tm.SparseAperture(np.zeros((2, 2)), 0.1, 1.0), tm.SparseAperture(torch.zeros(2, 2), 0.1, 1.0)\n"
+    )
+    run(sys.executable, "-m", "pyright", "--pythonpath", installed, script, cwd=tmp_path)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from torchmask.io import as_tensor
@@ -21,7 +22,7 @@ class SparseAperture(Aperture):
 
     Parameters
     ----------
-    centers : (..., N, 2) tensor or array
+    centers : (..., N, 2) tensor, array or sequence
         Centres (x, y) of the holes [m]; leading axes are a population of masks. A `nn.Parameter` is registered
         as that very object, so that an optimiser can move the holes; anything else becomes a buffer.
     subaperture_diameter : float
@@ -59,7 +60,7 @@ class SparseAperture(Aperture):
 
     def __init__(
         self,
-        centers: Tensor,
+        centers: Tensor | ArrayLike,
         subaperture_diameter: float,
         mask_diameter: float,
         shape: str | Shape = "disc",
@@ -186,7 +187,7 @@ class SparseAperture(Aperture):
 
     def replace(
         self,
-        centers: Tensor | None = None,
+        centers: Tensor | ArrayLike | None = None,
         subaperture_diameter: float | None = None,
         mask_diameter: float | None = None,
         shape: Shape | None = None,
