@@ -123,7 +123,7 @@ def test_a_pixel_scale_in_another_unit_is_told_before_the_holes_are_sampled():
 
 
 @pytest.mark.parametrize(
-    ("options", "blind", "first", "then"),
+    ("options", "in_steps", "first", "then"),
     [
         ({"frame_modes": 10}, True, MASK_MODES, 10),
         ({"frame_modes": 10}, False, 10, 10),  # they begin with aberrations that are known, or were found before
@@ -133,18 +133,20 @@ def test_a_pixel_scale_in_another_unit_is_told_before_the_holes_are_sampled():
         ({"frame_modes": 3}, True, 3, 3),
     ],
 )
-def test_a_faint_search_has_at_most_six_modes(options, blind, first, then):
+def test_a_search_has_at_most_six_modes(options, in_steps, first, then):
+    """Of faint frames and of others, which only differ in the modes that nobody asks for."""
     made = recipe(grid=Grid.nyquist(1.0, 550e-9, 48), **options)
-    faint = made.for_frames(blind=blind, faint=True, fills_field=False)
+    faint, other = (made.for_frames(in_steps=in_steps, faint=faint, fills_field=False) for faint in (True, False))
     assert (faint.frame_modes, faint.last_modes) == (first, then)
-    assert replace(faint, frame_modes=made.frame_modes, last_modes=made.last_modes) == made
-    assert (faint.finer_basis() is None) == (first == then)
-    assert made.for_frames(blind=blind, faint=False, fills_field=False) is made
+    assert (other.frame_modes, other.last_modes) == (first, max(then, made.last_modes))
+    for found in (faint, other):
+        assert replace(found, frame_modes=made.frame_modes, last_modes=made.last_modes) == made
+        assert (found.finer_basis() is None) == (found.last_modes == first or not made.whitened)
 
 
 def test_a_full_pupil_has_all_its_modes_however_faint():
     made = recipe(FullAperture(1.0), frame_modes=10, last_modes=15)
-    assert made.for_frames(blind=True, faint=True, fills_field=True) is made
+    assert made.for_frames(in_steps=True, faint=True, fills_field=True) is made
 
 
 @pytest.mark.parametrize(("period", "margin"), [(0.25, 0.25), (0.5, 0.5), (0.9, 0.9), (1.2, 1.0)])
@@ -156,9 +158,9 @@ def test_around_a_wide_object_is_what_a_hole_brings_in(period, margin):
     grid = Grid((64, 48), GRID.pixel_scale, GRID.wavelength)
     made = recipe(SparseAperture(apart, hole, 1.0), grid=grid, band=Band.of([550e-9, reddest]))
     for faint in (False, True):
-        wide = made.for_frames(blind=True, faint=faint, fills_field=True)
+        wide = made.for_frames(in_steps=True, faint=faint, fills_field=True)
         assert wide.margin == pytest.approx(margin, rel=1e-12)
-        assert made.for_frames(blind=True, faint=faint, fills_field=False).margin == made.margin == 0.25
+        assert made.for_frames(in_steps=True, faint=faint, fills_field=False).margin == made.margin == 0.25
     assert wide.turbulent_model().window.field.shape[1] >= (1 + margin) * 48
 
 

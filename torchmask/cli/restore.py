@@ -68,7 +68,7 @@ class Options(BandOptions, StackOptions, OIFITSOptions, WorkerOptions, RunOption
     """Outer scale of the turbulence [m]; None: 20 mask diameters."""
     n_modes: int | None = None
     """Number of Zernike modes per hole, from Noll mode 1 (piston); None: 6, or 231 for a full pupil, and more in a
-    last descent unless a mask's frames are faint. In faint frames those after the sixth are found at the end."""
+    last descent unless a mask's frames are faint. Those of a mask after the sixth are found at the end."""
     static_modes: int = 0
     """Number of Zernike modes per hole for aberrations that all frames share, such as those of the telescope."""
     sky: float | Literal["if-seen", "per-frame", "common", "none"] = "if-seen"

@@ -4,8 +4,8 @@ A descent from far away takes few modes per sub-aperture. Close to the solution,
 model leaves unexplained. So once the search has ended, the aberrations gain modes, and the object a prior that suits it
 (`ObjectPrior.choices`, `cross_validation`), and that descent goes on while it gains. Where noise leaves the aberrations
 of a mask uncertain, they are integrated out after it, or in its place if frames are faint, under a prior at the scale
-of the object; a faint search under a lighter prior, or with fewer modes than are asked for, descends under the given
-one before. Between segments of the last descent the phases of frames are retrieved that a mask's search has left in
+of the object; a faint search under a lighter prior descends under the given one before. Modes that are asked for beyond
+those of a faint search are fitted to the object that is found without them. Between segments of the last descent the phases of frames are retrieved that a mask's search has left in
 poor minima (`retrieval`). For a full pupil its segments begin with the object settled for the aberrations at hand: a
 joint descent is too slow at the frequencies that a full pupil hardly passes, in which most of the error in bright light
 would lie. The prior of a last descent is adapted to the object that is known by then; where an integration follows,
@@ -36,7 +36,7 @@ from torchmask.restoration.retrieval import retrieve_lost_frames
 from torchmask.restoration.schedule import Schedule
 from torchmask.restoration.slopes import rate_of_descent, rate_of_slopes
 from torchmask.restoration.spectrum import is_too_steep, rate_at_end, rate_in_noise, shows_gentle_slopes
-from torchmask.restoration.state import Modes, State
+from torchmask.restoration.state import State
 from torchmask.restoration.traits import End, Traits
 
 _REACH = 0.5  # width over which the structure of an object is taken [resolution elements]: 0.5 to 2.5 tried
@@ -63,7 +63,7 @@ class Finisher:
         prior = objective.prior
         if end.descends:
             objective = self._descend(objective, ended, end)
-        elif ended.state.modes is Modes.FINER or (ended.rate < 1 and prior.in_search(ended.rate) is not prior):
+        elif ended.rate < 1 and prior.in_search(ended.rate) is not prior:
             self._descend_again(objective, ended)
         if end.integrates:
             rounds = self.schedule.fine_rounds if end.descends else self.schedule.rounds
@@ -80,7 +80,7 @@ class Finisher:
             ended.state, spent = integrate_aberrations(objective, ended.state, rounds, *how, **known, astray=astray)
             ended.n_evaluations += spent
             ended.integrated = True
-        return objective
+        return objective if end.descends else self._fit_further_modes(objective, ended)
 
     def _descend(self, objective: MyopicObjective, ended: Progress, end: End) -> MyopicObjective:
         """Run the last descent, with the same effects.
@@ -152,15 +152,25 @@ class Finisher:
         return prior.adapted_to(settled.image, reach)
 
     def _descend_again(self, objective: MyopicObjective, ended: Progress) -> None:
-        """Descend under the given prior: a lighter one finds more, but bends aberrations to noise.
-
-        Modes that a search in faint frames does without have begun at zero, and find their place here.
-        """
+        """Descend under the given prior: a lighter one finds more, but bends aberrations to noise."""
         segments = self.schedule.faint_segments
         listen = ended.reporter("before integration", segments * self.schedule.segment, self.callback)
         for _ in range(segments):
             state = self._recalibrate(objective, ended.state)
             ended.state = descend(objective, state, self.schedule.segment, self.minimizer, listen)
+
+    def _fit_further_modes(self, objective: MyopicObjective, ended: Progress) -> MyopicObjective:
+        """Fit the modes that are asked for beyond those of a faint search to the object, and return their objective.
+
+        Faint frames show them too little to change the object.
+        """
+        state = self.setting.in_all_modes(ended.state)
+        if state is not ended.state:
+            objective = self.setting.objective_at(objective, state)
+            listen = ended.reporter("further modes", self.schedule.segment, self.callback)
+            known_object = objective.with_changes(free=objective.free & ~Free.OBJECT)
+            ended.state = descend(known_object, state, self.schedule.segment, self.minimizer, listen)
+        return objective
 
     def _choose_for_all(self, objective: MyopicObjective, state: State, end: End) -> ObjectPrior | None:
         """Return the prior of all segments; None if it is chosen anew before each."""

@@ -55,7 +55,7 @@ class MyopicDeconvolution:
         Grid of the frames.
     n_modes : int, optional
         Number of Zernike modes per sub-aperture, from Noll index 1. None: 231 for a full pupil, 6 for a mask; a last
-        descent then has more (`Schedule.last_modes`). A blind search in faint frames of a mask has the first 6 at most.
+        descent then has more (`Schedule.last_modes`). A mask's blind search has 6 at most, others enter after it.
     r0 : float, optional
         Fried parameter of the turbulence [m]. None: it is estimated from the restored aberrations.
     outer_scale : float, optional
@@ -78,8 +78,7 @@ class MyopicDeconvolution:
         Exposure time of a frame in units of tau0 = 0.314 r0 / wind. Piston, tip and tilt of every hole then change
         linearly during a frame; coefficients are those at mid-exposure. 0: frames are snapshots.
     refine_geometry : bool, optional
-        Whether to estimate a rotation and magnification of the mask too. None: only if the frames clearly show that it
-        is misplaced. Frames of a star give both more precisely (`calibrate_mask`).
+        Whether to estimate the mask's rotation and magnification too. None: if the frames clearly show it misplaced.
     prior : callable
         Prior on the object: a function or module that maps an image (H', W'), in units of the stack's mean pixel and on
         a field somewhat wider than the frames, to a differentiable scalar, such as `TotalVariation` (the default; it
@@ -259,7 +258,8 @@ class MyopicDeconvolution:
         (look := look_at_mask(stack.frames, told.aperture, told.grid, told.band, stack.valid)).warn(stacklevel=2)
         known, stack = Known.of(coefficients, covariance, known_object), stack.to(self._model.dtype, self._model.device)
         faint = stack.change.each < self.schedule.faint
-        recipe = told.for_frames(blind=known.nothing and start is None, faint=faint, fills_field=stack.fills_field)
+        in_steps = known.nothing and start is None and (faint or self.schedule.last_segments > 0)
+        recipe = told.for_frames(in_steps=in_steps, faint=faint, fills_field=stack.fills_field)
         model = self.model if replace(recipe, last_modes=told.last_modes) == told else recipe.turbulent_model()
         model = (model if known.covariance is None else recipe.estimated_model(known.covariance)).beside(stack.free)
         with torch.inference_mode(False), each_on_a_core(model.device) as parallel:

@@ -25,7 +25,7 @@ from torchmask.restoration.aberrations import (
 from torchmask.restoration.forward import MARGIN, ExposureModel, Window
 
 FULL_MODES = 231  # of a full pupil, as far as nobody says
-MASK_MODES = 6  # of each sub-aperture of a mask; a faint search with 10 and 15 ended 5 % worse on one of five stacks
+MASK_MODES = 6  # of each sub-aperture of a mask, in a search; more of them have lost objects
 
 
 @dataclass(frozen=True)
@@ -129,20 +129,19 @@ class ModelRecipe:
         """Grid at the shortest wavelength, which has the highest cut-off."""
         return replace(self.grid, wavelength=self.band.shortest)
 
-    def for_frames(self, *, blind: bool, faint: bool, fills_field: bool) -> ModelRecipe:
-        """Return the recipe for frames, which differs from this one if those of a mask are faint, or its object wide.
+    def for_frames(self, *, in_steps: bool, faint: bool, fills_field: bool) -> ModelRecipe:
+        """Return the recipe for frames of this kind, which differs from this one for a mask.
 
-        In faint ones a blind search has at most six modes of each sub-aperture, as more of them bend to the noise.
-        Those that are asked for beyond enter after it, and no others do. Around an object that fills the field there
-        is a margin from which a hole brings light in.
+        Where modes may enter `in_steps`, a search has at most six of each sub-aperture, as more of them lead astray:
+        they bend to noise. Those that are asked for beyond enter after it; those that nobody asks for do so unless the
+        frames are faint. Around an object that fills the field there is a margin from which a hole brings light in.
         """
         if self.aperture.n_subapertures == 1:
             return self
-        recipe = replace(self, margin=self._wide_margin()) if fills_field else self
-        if not faint:
-            return recipe
-        first = min(self.frame_modes, MASK_MODES) if blind and self.whitened else self.frame_modes
-        return replace(recipe, frame_modes=first, last_modes=self.frame_modes)
+        first = min(self.frame_modes, MASK_MODES) if in_steps and self.whitened else self.frame_modes
+        last = self.frame_modes if faint else max(self.frame_modes, self.last_modes)
+        margin = self._wide_margin() if fills_field else self.margin
+        return replace(self, frame_modes=first, last_modes=last, margin=margin)
 
     def _wide_margin(self) -> float:
         """Return the margin that holds what a hole spreads, lambda / d on either side, at most the width of frames."""

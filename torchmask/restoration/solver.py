@@ -122,9 +122,6 @@ class Solver:
         cut_short = ended.status is Status.ITERATION_LIMIT  # it may go on from its file, which the end leaves as it is
         if len(ended.explained) > 1 and ended.finer is None:
             average_starts(self.objective, ended, self.schedule, self.minimizer, self.callback)
-        if self.end is End.INTEGRATION:  # modes that are asked for, but that a search in faint frames does without
-            ended.state = self.setting.in_all_modes(ended.state)
-            self._place(ended.state)
         if self.end is not End.NONE and (ended.starts > 1 or not cut_short):
             how = (self.schedule, self.minimizer, self.callback, self.traits, save_nothing if cut_short else save)
             given = self.objective.with_changes(prior=self.given)
