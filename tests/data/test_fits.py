@@ -91,11 +91,29 @@ def test_extensions_must_agree(write_fits, fits_cube):
         read_fits(write_fits("b.fits", fits_cube, extensions=[("SCI", fits_cube)], sci=True))
 
 
-@pytest.mark.parametrize("names", [["", "", ""], ["FRAME", "FRAME"]])
-def test_one_frame_for_each_extension_is_refused_with_their_number(write_fits, fits_cube, names):
+@pytest.mark.parametrize(
+    ("names", "told"),
+    [
+        (["", "", ""], "differ: if"),
+        (["FRAME", "FRAME"], "differ: if"),
+        (["FRAME0", "FRAME1", "FRAME2"], r"differ but in their digits \(FRAME0 to FRAME2\): if"),
+        (["IM_9", "IM_10"], r"differ but in their digits \(IM_9 to IM_10\): if"),
+    ],
+)
+def test_one_frame_for_each_extension_is_refused_with_their_number(write_fits, fits_cube, names, told):
     extensions = list(zip(names, fits_cube, strict=False))
-    with pytest.raises(ValueError, match=rf"holds {len(names)} images of one shape .* as one cube \(T, H, W\)"):
+    said = rf"holds {len(names)} images of one shape without names that {told}.* as one cube \(T, H, W\)"
+    with pytest.raises(ValueError, match=said):
         read_fits(write_fits("a.fits", None, extensions=extensions))
+
+
+def test_images_whose_names_do_not_say_that_they_go_with_the_first_are_left_out_with_a_warning(write_fits, fits_cube):
+    first, second, third = fits_cube
+    extensions = [("LEFT", first), ("RIGHT", second), ("VAR_POISSON", third), ("MASK", third), ("SMALL", third[:8])]
+    with pytest.warns(UserWarning, match=r"a.fits holds 1 more images of the same shape \(RIGHT\) that are left out"):
+        images = read_fits(write_fits("a.fits", None, extensions=extensions))
+    assert np.array_equal(images.values, [first])
+    read_fits(write_fits("b.fits", first, sci=True, extensions=[("RIGHT", second)]))  # SCI says which it is
 
 
 def test_a_primary_image_with_another_like_it_is_refused_but_not_with_one_of_another_name_or_shape(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,12 @@ from typing import Any
 import numpy as np
 
 from torchmask.io import extra
+
+# parts of names of images that go with another one, as pipelines call them
+_COMPANION = re.compile(
+    "AREA|BACK|BAD|BIAS|BKG|BPM|CTX|DARK|DQ|ERR|FLAG|FLAT|GAIN|MASK|MODEL|NOISE|PSF|QUAL|RESID|RMS|SAMP|SIG|SKY|STAT|STD|"
+    "TIME|UNC|VAR|WAVE|WEIGHT|WHT"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +53,13 @@ def read_fits(path: str | Path) -> FITSImages:
     ------
     ValueError
         If the file is missing, not FITS, truncated or fails its checksum, has no image of 2 or 3 axes, or several
-        between which neither a name nor a shape decides, or if the shapes of its extensions disagree.
+        between which neither a name nor a shape decides (names that differ in their last digits number frames), or if
+        the shapes of its extensions disagree.
+
+    Warns
+    -----
+    UserWarning
+        If other images of the same shape are left out, without a name that says that they go with the first.
     """
     with extra("data"):
         from astropy.io import fits
@@ -69,6 +83,8 @@ def read_fits(path: str | Path) -> FITSImages:
     for warning in caught:  # for a truncated file or a wrong checksum astropy only warns
         if issubclass(warning.category, AstropyUserWarning) and not issubclass(warning.category, VerifyWarning):
             raise _damaged(path, warning.message)
+        if warning.category is _LeftOut:
+            warnings.warn(f"{path} {warning.message}", stacklevel=3)
     return images
 
 
@@ -81,6 +97,10 @@ class _Refused(Exception):
     """The FITS file is intact but does not contain what is needed."""
 
 
+class _LeftOut(UserWarning):
+    """The FITS file has more images than the one that is read."""
+
+
 def _images(path: Path, hdus: Any) -> FITSImages:
     science = [hdu for hdu in hdus if hdu.is_image and hdu.name == "SCI"]
     images = science or [hdu for hdu in hdus if hdu.is_image and hdu.header.get("NAXIS", 0) > 0]
@@ -91,8 +111,16 @@ def _images(path: Path, hdus: Any) -> FITSImages:
     alike = [hdu for hdu in images if _nature(hdu) == _nature(images[0])]
     if len(alike) > 1:
         raise _Refused(
-            f"holds {len(alike)} images of one shape without names that differ: if they are frames, write them as one "
-            "cube (T, H, W), or else write the one to use to a file of its own"
+            f"holds {len(alike)} images of one shape without names that differ{_but_in_digits(alike)}: if they are "
+            "frames, write them as one cube (T, H, W), or else write the one to use to a file of its own"
+        )
+    others = [hdu.name for hdu in images[1:] if hdu.shape == images[0].shape and not _COMPANION.search(hdu.name)]
+    if others:
+        warnings.warn(
+            f"holds {len(others)} more images of the same shape ({', '.join(others[:4])}{', ...' * (len(others) > 4)}) "
+            "that are left out: if they are frames, write them as one cube (T, H, W)",
+            _LeftOut,
+            stacklevel=2,
         )
     values = images[0].data
     if values is None or values.ndim not in (2, 3) or 0 in values.shape:
@@ -123,8 +151,15 @@ def _images(path: Path, hdus: Any) -> FITSImages:
 
 
 def _nature(hdu: Any) -> tuple[str, tuple[int, ...]]:
-    """Return what tells an image from its companions: its name, which a primary image lacks, and its shape."""
-    return "" if hdu.name == "PRIMARY" else hdu.name, hdu.shape
+    """Return what tells an image from its companions: its name, which a primary image lacks, without a number at its
+    end, and its shape."""
+    return "" if hdu.name == "PRIMARY" else hdu.name.rstrip("0123456789").rstrip("_- "), hdu.shape
+
+
+def _but_in_digits(alike: Sequence[Any]) -> str:
+    """Return a part of a message that says how the names of images differ, if they do."""
+    first, last = alike[0].name, alike[-1].name
+    return "" if first == last or first == "PRIMARY" else f" but in their digits ({first} to {last})"
 
 
 def _cards(header: Any) -> dict[str, bool | int | float | str]:
