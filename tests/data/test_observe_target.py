@@ -55,3 +55,20 @@ def test_each_file_has_the_gain_of_its_own_header(write_fits, fits_cube):
     paths = [write_fits(f"{gain:g}.fits", fits_cube, BUNIT="adu", GAIN=gain) for gain in (2.0, 5.0)]
     found = read_observation(paths, MASK).frames
     np.testing.assert_allclose(found.numpy(), np.concatenate([2.0 * fits_cube, 5.0 * fits_cube]), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("there", "lacking"),
+    [("ERR", ["x.fits"]), ("RDNOISE", ["x.fits"]), ("RDNOISE", [f"{number}.fits" for number in range(6)])],
+)
+def test_noise_that_only_some_files_tell_is_not_used_and_the_others_are_named(write_fits, fits_cube, there, lacking):
+    errors = [("ERR", np.full_like(fits_cube, 2.0))] if there == "ERR" else []
+    has = write_fits("has.fits", fits_cube, extensions=errors, RDNOISE=3.0 if there == "RDNOISE" else None)
+    others = [write_fits(name, fits_cube, RDNOISE=None) for name in lacking]
+    named = ", ".join(lacking[:4]) + (" and others" if len(lacking) > 4 else "")
+    with pytest.warns(UserWarning, match=rf"only 1 of {1 + len(lacking)} files have .*{there}.* as {named} have none"):
+        found = read_observation([has, *others], MASK)
+    assert found.errors is None
+    assert found.readout_noise is None
+    if there == "RDNOISE":
+        assert read_observation([has, *others], MASK, readout_noise=2.0).readout_noise == 2.0

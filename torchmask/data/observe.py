@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -25,6 +25,7 @@ from torchmask.optics.aperture import Aperture
 from torchmask.optics.saturation import find_saturated
 
 PathLike = str | Path
+_T = TypeVar("_T")
 
 
 def read_observation(
@@ -115,8 +116,9 @@ def read_observation(
     Warns
     -----
     UserWarning
-        If files or frames are left out, pixels are saturated, frames are clouded, a dark has another exposure time, or
-        a header states two pixel scales that differ by more than 1 %.
+        If files or frames are left out, pixels are saturated, frames are clouded, a dark has another exposure time, a
+        header states two pixel scales that differ by more than 1 %, or only some of the files have an ERR or a read-out
+        noise, which are not used then.
 
     Examples
     --------
@@ -171,13 +173,12 @@ def read_observation(
         headers.append(header)
     frames = np.concatenate([stack[0] for stack in stacks])
     valid = np.concatenate([stack[2] for stack in stacks])
-    errors = _joined([stack[1] for stack in stacks])
+    errors = _joined([stack[1] for stack in stacks], files)
     check_rotation(files, frames.shape[-1])
     kept = usable_frames(frames, valid, skip, numbers)
     if keep is not None:
         kept = kept[best_frames(frames[kept], valid[kept], keep, keep_by)]
-    known = [noise for noise in noises if noise is not None]
-    if readout_noise is None and len(known) == len(files):
+    if readout_noise is None and (known := _of_all(noises, files, "a read-out noise (RDNOISE or READNOIS)")):
         readout_noise = math.sqrt(np.average(np.square(known), weights=[len(stack[0]) for stack in stacks]))
     side = frames.shape[-1] if frames.shape[-1] == frames.shape[-2] else frames.shape[-2:]
     return Observation(
@@ -243,7 +244,22 @@ def _stack(
     return (values[cut] * factor, None if errors is None else errors[cut], valid[cut].copy()), header
 
 
-def _joined(parts: Sequence[np.ndarray | None]) -> np.ndarray | None:
-    """Return the arrays of all files concatenated; None if one file lacks them."""
-    there = [part for part in parts if part is not None]
-    return np.concatenate(there) if len(there) == len(parts) else None
+def _joined(errors: Sequence[np.ndarray | None], files: Sequence[FITSImages]) -> np.ndarray | None:
+    """Return the errors of all files concatenated; None if one file lacks them."""
+    known = _of_all(errors, files, "errors (ERR)")
+    return np.concatenate(known) if known else None
+
+
+def _of_all(values: Sequence[_T | None], files: Sequence[FITSImages], what: str) -> list[_T]:
+    """Return the values of all files; none if one file lacks its own, with a warning if only some files do."""
+    known = [value for value in values if value is not None]
+    if len(known) == len(files):
+        return known
+    if known:
+        lacking = [file.path.name for file, value in zip(files, values, strict=True) if value is None]
+        warnings.warn(
+            f"only {len(known)} of {len(files)} files have {what}, which are not used, as {', '.join(lacking[:4])}"
+            f"{' and others' * (len(lacking) > 4)} have none: the noise is measured from the frames unless it is told",
+            stacklevel=3,
+        )
+    return []
