@@ -88,3 +88,16 @@ def test_what_did_not_converge_or_is_not_explained_says_so(tmp_path, result, obs
     worse = dataclasses.replace(result, converged=False, verdict=verdict)
     cards = cards_of(tmp_path / "r.fits", worse, observation)
     assert (cards["CONVERGD"], cards["EXPLAIND"], cards["VERDICT"]) == (False, False, doubtful.value)
+
+
+def test_the_numbers_of_many_clouded_frames_are_whole(tmp_path, result):
+    """They fill more than one card."""
+    frames = torch.ones(60, 8, 8, dtype=torch.float64)
+    frames[:, 3:6, 3:6] = 1e4
+    frames[::3, 3:6, 3:6] = 1e3
+    numbers = tuple(range(100, 160))
+    mask = SparseAperture([[0.0, 0.38], [0.33, -0.2], [-0.35, -0.15]], 0.2, 1.0)
+    seen = Observation(frames, mask, Grid(8, 0.02 * ARCSEC, 550e-9), 3.0, frame_numbers=numbers)
+    cards = cards_of(tmp_path / "r.fits", result, seen)
+    assert cards["CLOUDED"] == ",".join(map(str, numbers[::3]))
+    assert cards["NCLOUD"] == 20

@@ -101,9 +101,9 @@ def save_restored(
             "NLOST": (len(verdict.frames), "frames that are not explained"),
         }
     clouded = clouded_frames(observation)
-    cards["NCLOUD"] = (len(clouded), "frames with less than half the usual light")
+    cards["NCLOUD"] = (len(clouded), "frames, CLOUDED, with half the usual light")
     if clouded:
-        cards["CLOUDED"] = (",".join(map(str, clouded)), "their numbers")
+        cards["CLOUDED"] = (",".join(map(str, clouded)), "")  # many go on in CONTINUE cards, which hold no comment
     for name, (value, comment) in cards.items():
         if not isinstance(value, float) or math.isfinite(value):  # FITS cards cannot hold NaN
             hdu.header[name] = (value, comment)
