@@ -57,6 +57,13 @@ def test_observations_bring_their_valid_pixels_and_errors_and_each_stack_may_hav
     assert torch.equal(found[1].object, method(r0=0.2).restore(stack(1), seed=3).object)
 
 
+def test_posterior_samples_do_not_depend_on_the_seed():
+    """Of known aberrations, which no search finds by another way."""
+    known = torch.zeros(3, 3, 3)
+    deviations = [method().restore(stack(0), coefficients=known, n_samples=2, seed=seed).object_std for seed in (0, 1)]
+    assert torch.equal(*deviations)
+
+
 class Deadly(torch.nn.Module):
     """A prior whose process dies."""
 
@@ -74,6 +81,13 @@ def test_a_process_that_dies_is_an_exception_of_its_stack():
 def test_refuses_before_any_work():
     with pytest.raises(ValueError, match="one tensor"):
         restore_many(method(), stack(0))
+    with pytest.raises(ValueError, match=r"one array of shape \(3, 32, 32\): give a list of stacks"):
+        restore_many(method(), stack(0).numpy())
+    with pytest.raises(TypeError, match=r"one Observation: give a list of them, such as \[observation\]"):
+        restore_many(method(), Observation(stack(0), MASK, GRID, readout_noise=None))
+    for wrong in (None, [None, method()]):
+        with pytest.raises(TypeError, match="method is a NoneType: it must be a MyopicDeconvolution, or a list of"):
+            restore_many(wrong, [stack(0), stack(1)])
     with pytest.raises(ValueError, match="1 methods are given for 2 stacks"):
         restore_many([method()], [stack(0), stack(1)])
     with pytest.raises(ValueError, match="backend is 'threads'"):

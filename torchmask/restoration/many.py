@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from functools import partial
 
+import numpy as np
 from torch import Tensor
 
 from torchmask.design.workers import require_backend, run_side_by_side
@@ -35,7 +36,8 @@ def restore_many(
     n_samples : int
         Number of posterior samples, as for `MyopicDeconvolution.restore`.
     seed : int
-        Seed of the posterior samples, as for `MyopicDeconvolution.restore`.
+        Seed of random starts, as for `MyopicDeconvolution.restore`, the same for all stacks. Posterior samples have
+        one of their own.
     backend : {"loky", "ray"}
         Processes on this machine (extra `design`), or a Ray cluster (extra `cluster`).
     n_workers : int, optional
@@ -53,7 +55,9 @@ def restore_many(
     ------
     ValueError
         Before any work, if the backend is unknown or not installed, `n_workers` is below 1, the numbers of methods and
-        stacks differ, or `stacks` is a single tensor.
+        stacks differ, or `stacks` is a single tensor or array.
+    TypeError
+        Before any work, if `stacks` is a single observation, or `method` is no method of restoration.
 
     Examples
     --------
@@ -87,12 +91,17 @@ def restore_in_turn(
 ) -> Iterator[tuple[int, RestorationResult | Exception]]:
     """Yield the index and the result of each stack as it finishes; otherwise the same as `restore_many`."""
     require_backend(backend, n_workers)
-    if isinstance(stacks, Tensor):
+    if isinstance(stacks, Tensor | np.ndarray):
         raise ValueError(
-            f"stacks is one tensor of shape {tuple(stacks.shape)}: give a list of stacks (T, H, W), or use "
-            "method.restore for a single one"
+            f"stacks is one {'tensor' if isinstance(stacks, Tensor) else 'array'} of shape {tuple(stacks.shape)}: give "
+            "a list of stacks (T, H, W), or use method.restore for a single one"
         )
-    methods = [method] * len(stacks) if isinstance(method, MyopicDeconvolution) else list(method)
+    if isinstance(stacks, Observation):
+        raise TypeError("stacks is one Observation: give a list of them, such as [observation]")
+    methods = [method] * len(stacks) if not isinstance(method, Sequence) else list(method)
+    for one in methods:
+        if not isinstance(one, MyopicDeconvolution):
+            raise TypeError(f"method is a {type(one).__name__}: it must be a MyopicDeconvolution, or a list of them")
     if len(methods) != len(stacks):
         raise ValueError(
             f"{len(methods)} methods are given for {len(stacks)} stacks: give one for all, or one for each"

@@ -48,8 +48,9 @@ def standard_deviations(
     """Return standard deviations (H', W') of the object below `cutoff` [cycles/pixel], and samples of the aberrations.
 
     The `n_samples` samples (S, T, K) scatter around zero as the truth does around `state`; what is not free does not
-    vary. The variance of the object is smoothed by the width of its prior, so that few samples suffice. `photon_share`
-    is the fraction of the noise variance that is photon noise, which is larger in bright pixels.
+    vary. They are drawn from one seed, whatever that of the restoration. The variance of the object is smoothed by the
+    width of its prior, so that few samples suffice. `photon_share` is the fraction of the noise variance that is photon
+    noise, which is larger in bright pixels.
     """
     generator = torch.Generator().manual_seed(0)
     reach = _REACH / cutoff
