@@ -19,6 +19,7 @@ from torchmask.cli.wording import in_options
 from torchmask.design.manufacture import save_json
 from torchmask.design.rules import MaskRules
 from torchmask.instrument.instrument import Instrument
+from torchmask.instrument.parts import Source
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.pupil import Aperture
 from torchmask.planning.plan import PlanInterrupted, plan_observation
@@ -28,7 +29,16 @@ from torchmask.viz.figures import mask_figure
 from torchmask.viz.planning import plan_figure
 
 _WORKSHOP = ("min_gap", "rim_margin", "keep_out")  # rules that the telescope does not set
+_ALTERNATIVES = (("filter", "width"), ("n_frames", "observing_time"))  # of which an instrument has one
 _SEARCH = ("n_subapertures", "hole_diameters", *_WORKSHOP, "budget", "seed")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceOptions(Source):
+    """The target: its brightness, by a magnitude or a rate, and the statistics of its image."""
+
+    def __post_init__(self) -> None:
+        """Leave the checks to the plan, which knows what stands in a file and not on the command line."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +52,8 @@ class Options(Instrument, CatalogOptions, InstrumentOptions, RunOptions):
     commands (instrument.json) to a new folder. The full pupil stands beside the masks. Takes minutes.
     """
 
+    source: SourceOptions
+    """Target of the observation."""
     mask: Annotated[Path | None, tyro.conf.arg(metavar="FILE|NAME|full")] = None
     """A mask that exists, or the full pupil: then the exposure alone is planned. None: masks are searched."""
     n_subapertures: tuple[int, ...] = (6, 9, 12, 16)
@@ -65,19 +77,41 @@ class Options(Instrument, CatalogOptions, InstrumentOptions, RunOptions):
     seed: int = 0
     """Random seed of the searches."""
 
+    def __post_init__(self) -> None:
+        """Put out what the file says where an option stands in its place, and check the instrument."""
+        source, known = _fields(self.source, Source), self.known_instrument()
+        if known is not None:
+            source |= _put_out(self.source, known.source, ("magnitude", "photon_rate"))
+            for pair in _ALTERNATIVES:
+                for name, value in _put_out(self, known, pair).items():
+                    object.__setattr__(self, name, value)
+        object.__setattr__(self, "source", SourceOptions(**source))
+        Source(**source)  # raises for a source that cannot be
+        super().__post_init__()
+
     @classmethod
     def of_instrument(cls, known: Instrument) -> Options:
         """Return the options that an instrument sets: all of it."""
-        return cls(**_fields(known))
+        return cls(**_fields(known, Instrument))
 
 
 def instrument_of(options: Instrument) -> Instrument:
     """Return the instrument among the options."""
-    return Instrument(**_fields(options))
+    values = _fields(options, Instrument)
+    values["source"] = Source(**_fields(options.source, Source))
+    return Instrument(**values)
 
 
-def _fields(known: Instrument) -> dict[str, Any]:
-    return {item.name: getattr(known, item.name) for item in dataclasses.fields(Instrument)}
+def _fields(record: Any, kind: type) -> dict[str, Any]:
+    return {item.name: getattr(record, item.name) for item in dataclasses.fields(kind)}
+
+
+def _put_out(told: Any, known: Any, pair: tuple[str, str]) -> dict[str, None]:
+    """Return which of two alternatives is the file's and goes, if both are told and the other one is not the file's."""
+    if None in [getattr(told, name) for name in pair]:
+        return {}
+    same = [name for name in pair if getattr(told, name) == getattr(known, name)]
+    return dict.fromkeys(same) if len(same) == 1 else {}
 
 
 def existing_mask(options: Options) -> Aperture | None:
