@@ -19,7 +19,7 @@ TINY = ["--n-frequencies", "32", "--budget", "60"]
 
 
 def observed(options):
-    return options.observation(options.n_frequencies, options.exponent, options.knee, options.fill_factor)
+    return options.observation(options.n_frequencies, options.fill_factor)
 
 
 def test_masks_of_catalogue_files_and_searches_are_ranked(tmp_path, capsys):

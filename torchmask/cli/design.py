@@ -23,7 +23,6 @@ from torchmask.design.drawing import LIFE_SIZE, require_scale, save_dxf, save_sv
 from torchmask.design.manufacture import least_pixels, save_fits, save_json
 from torchmask.design.redundancy import analyse_redundancy
 from torchmask.design.room import count_holes
-from torchmask.design.rules import MaskRules
 from torchmask.design.search import SearchResult, search_mask
 from torchmask.design.tolerance import machining_tolerance
 from torchmask.grid import ARCSEC, Grid
@@ -33,7 +32,6 @@ from torchmask.numbers import THROUGH_AIR, require_diameter, require_wavelength
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.packing import hole_diameter
 from torchmask.record import Callback, Record, fan_out
-from torchmask.spectra import PowerLawPSD
 
 _LENGTHS = ("subaperture_diameter", "strict_hole_diameter", "shortest_baseline", "longest_baseline", "largest_gap")
 _TOLERANCES = ("rms_error_tolerated", "rms_error_tolerated_standard_error")
@@ -49,7 +47,7 @@ _GROWTH, _SUCCESS = 0.01, 0.95  # tolerated growth of the MSE by machining error
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(ObservationOptions, MaskRules, SearchOptions, RunOptions):
+class Options(ObservationOptions, SearchOptions, RunOptions):
     """Search the positions of the holes that minimise the error of the restored image.
 
     Writes mask.json (for `torchmask simulate` and `restore`), mask.fits (an image in metres), the drawings mask.dxf and
@@ -97,17 +95,17 @@ def run(options: Options) -> None:
     require_scale(options.scale)
     require_diameter("mask_diameter", options.mask_diameter)
     require_wavelength("wavelength", options.wavelength, *THROUGH_AIR)
-    rules = options.constraints()
-    options.require_on_pupil(options.mask_diameter)
-    knee = PowerLawPSD.knee if options.knee is None else options.knee
-    observed = options.observation(options.n_frequencies, options.exponent, knee, options.fill_factor)
+    zones = options.rules()
+    zones.require_on_pupil(options.mask_diameter)
+    rules = zones.constraints()
+    observed = options.observation(options.n_frequencies, options.fill_factor)
     criterion = observed.criterion()
     if options.r0 is not None and observed.turbulence is None:
         warn_of_wide_holes(options, options.r0)
-    used = options.used_instrument(observed, options.central_obstruction)
+    kept = options.kept_instrument(observed)
     last: list[Record] = []
     with new_run("design", options, options.seed) as output:
-        output.keep_instrument(used)
+        output.keep_instrument(kept)
         started = time.perf_counter()
 
         def keep(record: Record) -> None:

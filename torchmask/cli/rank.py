@@ -17,7 +17,6 @@ from torchmask.design.criterion import AsymptoticMSE
 from torchmask.design.manufacture import load_mask, save_json
 from torchmask.design.pattern import Pattern
 from torchmask.design.ranking import Layout, Ranking, rank_masks
-from torchmask.design.rules import MaskRules
 from torchmask.design.search import search_mask
 from torchmask.instrument.instrument import Instrument
 from torchmask.io import atomic_write
@@ -31,7 +30,7 @@ _SHOWN = 5  # masks named on the terminal
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(ObservationOptions, MaskRules, RunOptions):
+class Options(ObservationOptions, RunOptions):
     """Rank masks by the error of the restored image, on one telescope.
 
     Each mask is ranked twice: as built, with its own holes and the light that they pass, scaled to the pupil; and laid
@@ -46,10 +45,6 @@ class Options(ObservationOptions, MaskRules, RunOptions):
     """Numbers of holes for which a mask is searched, to compare with."""
     fill_factor: float = 0.15
     """Common collecting area N d^2 / D^2 of round holes for masks laid afresh and searched."""
-    exponent: float = 1.5
-    """Exponent of the object's power-law power spectrum."""
-    knee: float = 1 / 64
-    """Frequency below which that spectrum is flat [cycles/pixel], one over the object's size in pixels."""
     n_frequencies: int = 256
     """Frequencies per side of the criterion's grid."""
     budget: int = 20_000
@@ -123,7 +118,7 @@ def search_masks(options: Options, criterion: AsymptoticMSE, output: Run) -> dic
             options.fill_factor,
             seed=options.seed,
             budget=options.budget,
-            constraints=options.constraints(),
+            constraints=options.rules().constraints(),
             callback=_in_one_run(output.callback, n),
         )
         name = _searched_name(n)
@@ -144,9 +139,9 @@ def ranking(options: Options, output: Run) -> Ranking:
     """Rank, and write everything to the folder of the run."""
     require_diameter("mask_diameter", options.mask_diameter)
     chosen = patterns(options)
-    observed = options.observation(options.n_frequencies, options.exponent, options.knee, options.fill_factor)
-    output.keep_instrument(options.used_instrument(observed, options.central_obstruction))
-    rules = MaskRules(**{name: getattr(options, name) for name in asdict(MaskRules())})
+    observed = options.observation(options.n_frequencies, options.fill_factor)
+    output.keep_instrument(options.kept_instrument(observed))
+    rules = options.rules()
     rules.require_on_pupil(options.mask_diameter)
     found = rank_masks(
         chosen,
@@ -165,7 +160,7 @@ def ranking(options: Options, output: Run) -> Ranking:
     light = light_of(options, observed)
     numbers = {"light": light, "rows": rows, "not_ranked": found.left_out, "floor": found.floor}
     told = describe(light)
-    output.report("ranking", numbers, f"{heading(options, told)}\n\n{found}", ranking_figure(found, told))
+    output.report("ranking", numbers, f"{heading(options, observed, told)}\n\n{found}", ranking_figure(found, told))
     return found
 
 
@@ -189,7 +184,7 @@ def describe(light: Mapping[str, float]) -> str:
     )
 
 
-def heading(options: Options, light: str) -> str:
+def heading(options: Options, observed: Observed, light: str) -> str:
     """Return what stands above the table."""
     air = "independent pistons"
     if options.criterion == "turbulent":
@@ -199,7 +194,7 @@ def heading(options: Options, light: str) -> str:
     at = "" if wavelength is None else f"{1e9 * wavelength:g} nm, "
     return (
         f"# Masks ranked by the error of the restored image\n\nD = {options.mask_diameter:g} m, "
-        f"{at}{air}, K = {options.n_frames}, p = {options.exponent:g}, {light}: others have the light of their own "
+        f"{at}{air}, K = {observed.n_frames}, p = {options.exponent:g}, {light}: others have the light of their own "
         "area. That common collecting area is of round holes. The floor is the part no mask can change; torchmask_N "
         "are searched masks, with which `over our best` compares those of the same N and area."
     )

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any, Self
 
 import torch
 
-from torchmask.atmosphere.layers import Layers
-from torchmask.atmosphere.phase import LayeredPhase, TurbulencePhase
-from torchmask.atmosphere.profiles import named_layers
-from torchmask.cli.band_options import FilterOptions
-from torchmask.cli.instrument_used import instrument_used
+from torchmask.atmosphere.phase import LayeredPhase
+from torchmask.cli.condition_options import ConditionOptions, TurbulenceOptions
+from torchmask.cli.instrument_used import UsedInstrumentOptions, with_light, with_size
 from torchmask.cli.obstacles import warn_of_blocked_holes
 from torchmask.cli.options import (
     DEFAULT_PHOTONS,
-    InstrumentOptions,
+    FULL,
     MaskOptions,
     RunOptions,
     load_aperture,
@@ -27,102 +26,19 @@ from torchmask.cli.run import new_run
 from torchmask.cli.stacks import STACK
 from torchmask.grid import ARCSEC, Grid
 from torchmask.instrument.instrument import Instrument
-from torchmask.numbers import require, require_r0, require_within
+from torchmask.numbers import require
 from torchmask.optics.aperture import SparseAperture
-from torchmask.optics.band import Band, warn_of_few_wavelengths
 from torchmask.optics.detector import Detector
 from torchmask.optics.geometry import MaskGeometry
-from torchmask.optics.passband import Passband
 from torchmask.optics.pixel import jittered, square_pixel
 from torchmask.optics.pupil import Aperture
 from torchmask.record import Record, fan_out
-from torchmask.simulation.conditions import Conditions
 from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
-from torchmask.simulation.wavefronts import Turbulence
 
-_DEFAULT_R0 = 0.15  # [m]
+_DEFAULT_FRAMES = 20
+_FULL_PUPIL = ("mask_diameter", "central_obstruction", "vane_width", "vane_angles")  # options of `--mask full`
 _MOST_PHOTONS = 1e15  # electrons per frame; the photon noise of more in a pixel is lost in the rounding of float64
-
-
-@dataclass(frozen=True)
-class TurbulenceOptions:
-    """Layers, wind and timing of the turbulence."""
-
-    profile: str | None = None
-    """Profile of layers at the zenith: hv57, las_campanas or mauna_kea; None: all turbulence at the pupil."""
-    layers: int = 8
-    """Number of layers into which the profile is grouped; theta0 and tau0 do not depend on it."""
-    wind: tuple[float, float] | None = None
-    """Wind speed towards +x and +y [m/s]; None: the winds of the profile, or no wind without one."""
-    frame_interval: float | None = None
-    """Time from the start of one frame to the next [s], for drifting turbulence; None: independent frames."""
-    exposure_time: float = 0.0
-    """Exposure time of a frame [s]; needs a wind."""
-
-    def make(self, r0: float | None, wavelength: float, outer_scale: float) -> Turbulence:
-        """Return the turbulence with Fried parameter `r0` [m], of which the option tells what None and inf mean."""
-        if self.wind is not None:
-            speed = math.hypot(*self.wind)
-            require_within("--turbulence.wind", speed, 0.0, 200.0, " m/s", "calm air to the fastest jet streams")
-        if r0 == math.inf:
-            return None
-        require_r0("--r0", r0)
-        if self.profile is not None:
-            layers = named_layers(self.profile, self.layers)
-            if r0 is not None or self.wind is not None:
-                winds = layers.winds if self.wind is None else [self.wind] * len(layers.heights)
-                layers = Layers.from_fractions(
-                    layers.r0(wavelength) if r0 is None else r0, wavelength, layers.heights, layers.strengths, winds
-                )
-            return LayeredPhase(layers, wavelength, outer_scale, self.frame_interval)
-        r0 = _DEFAULT_R0 if r0 is None else r0
-        if self.wind is None:
-            if self.frame_interval is not None:
-                raise ValueError("--turbulence.frame-interval needs --turbulence.wind or --turbulence.profile")
-            if self.exposure_time > 0:
-                raise ValueError("--turbulence.exposure-time needs --turbulence.wind or --turbulence.profile")
-            return TurbulencePhase(r0, outer_scale)
-        layers = Layers.from_fractions(r0, wavelength, [0.0], [1.0], [self.wind])
-        return LayeredPhase(layers, wavelength, outer_scale, self.frame_interval)
-
-
-@dataclass(frozen=True, kw_only=True)
-class ConditionOptions(FilterOptions):
-    """Observing conditions: sky, clouds and band."""
-
-    sky: float | None = None
-    """Sky background [electrons per pixel and frame]; None: from --instrument, or else 0."""
-    transparency_scatter: float = 0.0
-    """Standard deviation of the logarithm of each frame's transmission, due to clouds."""
-    band_width: float = 0.0
-    """Width of a top-hat band around the wavelength, instead of a filter [m]; 0: one wavelength."""
-
-    def make(self, exposure_time: float, wavelength: float, sky: float = 0.0) -> Conditions:
-        """Return the conditions for `simulate_observation`. Raises ValueError if a value is out of range."""
-        if not (math.isfinite(self.band_width) and 0 <= self.band_width < 2 * wavelength):
-            raise ValueError(
-                f"--conditions.band-width is {self.band_width}: it must be at least 0 m and below twice the wavelength"
-            )
-        if self.band_width and self.filter is not None:
-            raise ValueError("--conditions.band-width and --conditions.filter are both given: give only one of them")
-        if self.temperature is not None and not self.band_width and self.filter is None:
-            raise ValueError(
-                "--conditions.temperature is that of light in a band: give --conditions.filter or "
-                "--conditions.band-width, or leave it out"
-            )
-        band, passband = self.filter_band(wavelength), None if self.filter is None else Passband.find(self.filter)
-        if self.band_width:
-            passband = Passband.top_hat(wavelength, self.band_width)
-            band = Band.from_filter(passband, self.n_wavelengths, self.temperature)
-        if passband is not None:
-            warn_of_few_wavelengths(passband, self.n_wavelengths, self.temperature)
-        return Conditions(
-            sky=sky if self.sky is None else self.sky,
-            transparency_scatter=self.transparency_scatter,
-            exposure_time=exposure_time,
-            band=band,
-        )
 
 
 @dataclass(frozen=True)
@@ -152,7 +68,7 @@ class TrueMaskOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(InstrumentOptions, MaskOptions, RunOptions):
+class Options(UsedInstrumentOptions, MaskOptions, RunOptions):
     """Simulate short exposures of a scene through a mask and turbulence, with photon and read-out noise.
 
     Writes stack.npz (for `torchmask restore`; it also contains the truth), figures, config.yaml and the log to a new
@@ -162,11 +78,13 @@ class Options(InstrumentOptions, MaskOptions, RunOptions):
     scene: SceneOptions = field(default_factory=SceneOptions)
     """The target; --instrument tells its size, source.size over the field of the camera, if that is possible."""
     wavelength: float | None = None
-    """Wavelength of the observation [m]; None: the mean of the filter, or else that of the mask's .json file."""
+    """Wavelength of the observation [m]; None: from --instrument, or else the mean of the filter, or that of the mask's
+    .json file."""
     n_pixels: int = 128
     """Pixels per side of the image."""
     pixel_scale_arcsec: float | None = None
-    """Angle on the sky of one pixel [arcsec]; None: the largest without aliasing at the shortest wavelength."""
+    """Angle on the sky of one pixel [arcsec]; None: from --instrument, or else the largest without aliasing at the
+    shortest wavelength."""
     r0: float | None = None
     """Fried parameter of the turbulence at the wavelength [m]; None: that of the profile, or 0.15 without one; inf: no
     turbulence."""
@@ -178,8 +96,8 @@ class Options(InstrumentOptions, MaskOptions, RunOptions):
     """Sky, clouds and filter."""
     true_mask: TrueMaskOptions = field(default_factory=TrueMaskOptions)
     """Error of the mask's position."""
-    n_frames: int = 20
-    """Number of short exposures."""
+    n_frames: int | None = None
+    """Number of short exposures; None: from --instrument, or else 20."""
     n_photons: float | None = None
     """Electrons per frame through the mask, also outside the field; None: from --instrument, or else 1e7."""
     readout_noise: float = 1.5
@@ -193,24 +111,56 @@ class Options(InstrumentOptions, MaskOptions, RunOptions):
 
     @classmethod
     def of_instrument(cls, known: Instrument) -> Options:
-        """Return the options that an instrument sets; its light depends on the mask."""
+        """Return the options that an instrument sets; all others follow from it."""
         return cls(
             scene=scene_of(known),
-            wavelength=known.mean_wavelength,
             n_pixels=known.camera.n_pixels,
-            pixel_scale_arcsec=known.pixel_scale / ARCSEC,
             r0=known.site.r0,
             outer_scale=known.site.outer_scale,
             turbulence=TurbulenceOptions(wind=(known.site.wind, 0.0), exposure_time=known.exposure),
-            conditions=ConditionOptions(
-                filter=known.filter,
-                band_width=known.width or 0.0,
-                n_wavelengths=known.n_wavelengths,
-                temperature=known.source.temperature,
-            ),
-            n_frames=known.frames,
+            conditions=ConditionOptions(n_wavelengths=known.n_wavelengths),
             readout_noise=known.camera.readout_noise,
             pixel_fill=known.camera.pixel_fill,
+        )
+
+    def beside_file(self) -> dict[str, Any]:
+        """Return the values of options that say something of an instrument, a full pupil being its telescope."""
+        names = ("wavelength", "n_pixels", "pixel_scale_arcsec", "r0", "outer_scale", "n_frames", "readout_noise")
+        names = (*names, "pixel_fill", *(_FULL_PUPIL if str(self.mask) == FULL else ()))
+        turbulence, conditions = self.turbulence, self.conditions
+        return {name: getattr(self, name) for name in names} | {
+            "wind": None if turbulence.wind is None else math.hypot(*turbulence.wind),
+            "exposure": turbulence.exposure_time,
+            "filter": conditions.filter,
+            "width": conditions.band_width,
+            "n_wavelengths": conditions.n_wavelengths,
+            "temperature": conditions.temperature,
+        }
+
+    @property
+    def scene_follows(self) -> bool:
+        """Whether the size of the target is that of the file, whose angle it keeps."""
+        known = self.known_instrument()
+        return known is not None and self.scene.size == scene_of(known).size
+
+    def used_instrument(self) -> Instrument | None:
+        """Return the instrument of the file with what was given beside it, but for its light; None without a file."""
+        used = super().used_instrument()
+        if used is None or self.scene_follows:
+            return used
+        return with_size(used, self.scene.size * used.field_of_view / ARCSEC)
+
+    def following(self, used: Instrument, area: float) -> Self:
+        """Return the same with what follows from an instrument, for the light of an open area [m^2], unless given."""
+        size = scene_of(used).size if self.scene_follows else self.scene.size
+        return replace(
+            self,
+            scene=replace(self.scene, size=size),
+            wavelength=used.mean_wavelength,
+            pixel_scale_arcsec=used.pixel_scale / ARCSEC,
+            conditions=self.conditions.following(used, area),
+            n_photons=used.photons(area) if self.n_photons is None else self.n_photons,
+            n_frames=used.frames,
         )
 
 
@@ -233,22 +183,6 @@ def observing_wavelength(options: Options) -> float:
     return told
 
 
-def used_instrument(known: Instrument, area: float, options: Options) -> Instrument:
-    """Return the instrument of these options, with what was given beside its file; its light is that through `area`."""
-    turbulence = options.turbulence
-    given = {
-        name: getattr(options, name) for name in ("r0", "outer_scale", "n_pixels", "readout_noise", "pixel_fill")
-    } | {
-        "wind": None if turbulence.wind is None else math.hypot(*turbulence.wind),
-        "exposure": turbulence.exposure_time,
-        "pixel_scale": options.pixel_scale_arcsec,
-        "n_frames": options.n_frames,
-        "n_photons": options.n_photons,
-        "sky": options.conditions.sky,
-    }
-    return instrument_used(known, area, given)
-
-
 def run(options: Options) -> None:
     """Simulate, and write the stack."""
     known = options.known_instrument()
@@ -258,14 +192,16 @@ def run(options: Options) -> None:
     warn_of_blocked_holes(options.mask, told, telescope)
     true = options.true_mask.apply(told)
     aperture = true or told
-    wavelength = observing_wavelength(options)
+    used = options.used_instrument()
+    seen = options if used is None else options.following(used, float(told.area))
+    wavelength = observing_wavelength(seen)
     options.require_its_wavelength(wavelength)
-    photons, sky = (DEFAULT_PHOTONS, 0.0) if known is None else (known.photons(told.area), known.sky(told.area))
-    n_photons = photons if options.n_photons is None else options.n_photons
+    n_photons = DEFAULT_PHOTONS if seen.n_photons is None else seen.n_photons
+    n_frames = _DEFAULT_FRAMES if seen.n_frames is None else seen.n_frames
     require("--n-photons", options.n_photons, " electrons per frame", most=_MOST_PHOTONS)
-    conditions = options.conditions.make(options.turbulence.exposure_time, wavelength, sky)
+    conditions = seen.conditions.make(options.turbulence.exposure_time, wavelength)
     turbulence = options.turbulence.make(options.r0, wavelength, options.outer_scale)
-    pixel_scale = pixel_angle(options.pixel_scale_arcsec)
+    pixel_scale = pixel_angle(seen.pixel_scale_arcsec)
     if pixel_scale is None:
         # Real masks may reach beyond their nominal pupil.
         diameter = max(told.mask_diameter, told.extent, aperture.extent)
@@ -276,13 +212,13 @@ def run(options: Options) -> None:
         grid = Grid(options.n_pixels, pixel_scale, wavelength)
     require("--jitter", options.jitter, " pixels, half the field", zero=True, most=min(grid.shape) / 2)
     detector = Detector(options.readout_noise, pixel=jittered(square_pixel(options.pixel_fill), options.jitter))
-    scene = make_scene(grid.shape, n_photons, options.scene)
-    used = None if known is None else used_instrument(known, float(told.area), options)
+    scene = make_scene(grid.shape, n_photons, seen.scene)
+    kept = used and with_light(used, float(told.area), options.n_photons, options.conditions.sky)
     with new_run("simulate", options, options.seed) as output:
-        output.keep_instrument(used)
+        output.keep_instrument(kept)
         generator, records = torch.Generator().manual_seed(options.seed), list[Record]()
         observation = simulate_observation(
-            *(scene, aperture, grid, turbulence, detector, options.n_frames, generator),
+            *(scene, aperture, grid, turbulence, detector, n_frames, generator),
             conditions=conditions,
             told=None if true is None else told,
             allow_overlap=options.allow_overlap,
@@ -292,9 +228,9 @@ def run(options: Options) -> None:
         log_observation("observation", observation, output.logger, conditions.band)
         if isinstance(turbulence, LayeredPhase):
             output.summary.append(turbulence.layers.describe(wavelength))
-        kept = records[-1].scalars["kept_light"]
+        inside = records[-1].scalars["kept_light"]
         output.summary.append(
-            f"{options.n_frames} frames of {grid.shape[0]} x {grid.shape[1]} pixels of "
-            f"{grid.pixel_scale / ARCSEC:.4g} arcsec, {n_photons:.4g} photons in each, {100 * kept:.1f} % of the "
+            f"{n_frames} frames of {grid.shape[0]} x {grid.shape[1]} pixels of "
+            f"{grid.pixel_scale / ARCSEC:.4g} arcsec, {n_photons:.4g} photons in each, {100 * inside:.1f} % of the "
             "light inside the field"
         )

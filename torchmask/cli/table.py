@@ -12,14 +12,13 @@ from typing import Any, ClassVar
 import tyro
 
 from torchmask.cli.config import CONFIG, config_command, save_config
-from torchmask.cli.criterion_options import ExposureOptions, exposure_options
-from torchmask.cli.instrument_used import INSTRUMENT, instrument_used
+from torchmask.cli.criterion_options import ExposureOptions, exposure_options, rules_of, vanes_beside_file
+from torchmask.cli.instrument_used import INSTRUMENT, with_light
 from torchmask.cli.options import ConfigOptions, WorkerOptions, pixel_angle
 from torchmask.design.conditions import ExposureConditions
 from torchmask.design.space import AXES, DesignSpace
 from torchmask.design.table import design_table
 from torchmask.folders import free_name
-from torchmask.grid import ARCSEC
 from torchmask.instrument.instrument import Instrument
 from torchmask.io import read_json, to_json
 from torchmask.progress import Progress
@@ -41,38 +40,66 @@ class Options(ExposureOptions, DesignSpace, WorkerOptions, ConfigOptions):
     folder: tyro.conf.Positional[Path]
     """Folder for the table and its parts, such as runs/table."""
     pixel_scale_arcsec: float | None = None
-    """Angle on the sky of one pixel [arcsec]; None: the largest without aliasing for D, at the wavelength."""
+    """Angle on the sky of one pixel [arcsec]; None: from --instrument, or else the largest without aliasing for D, at
+    the wavelength."""
+    wavelength: float | None = None
+    """Wavelength of the observation [m], needed with a pixel scale; None: from --instrument, or none, as errors with
+    pixels of wavelength / (2 D) depend on no wavelength."""
+    n_photons: tuple[float, ...] | None = None  # pyright: ignore[reportIncompatibleVariableOverride] -- it may follow
+    """Electrons per frame at the reference fill factor; at others they are in proportion to N d^2. None: from
+    --instrument, or else 1e7."""
+    n_frames: tuple[int, ...] | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+    """Numbers of exposures, K; None: from --instrument, or else 20."""
+    diameter_over_r0: tuple[float, ...] | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+    """Strengths of turbulence, D / r0; None: from --instrument, or else 7. If empty, only MSE_a is computed, without a
+    limit on d / r0."""
+    knee: float | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+    """Frequency below which the object's spectrum is flat [cycles/pixel]; None: from --instrument, or else 1/64."""
+
+    def __post_init__(self) -> None:
+        """Leave all checks to the space that the options make, as some of its values follow from others."""
 
     @classmethod
     def of_instrument(cls, known: Instrument) -> Options:
-        """Return the options that an instrument sets, with the light of the reference fill factor."""
+        """Return the options that an instrument sets; all others follow from it."""
         return cls(
             folder=Path("runs/table"),
             mask_diameter=known.telescope.diameter,
             central_obstruction=known.telescope.central_obstruction,
             spiders=known.telescope.spiders,
-            wavelength=known.mean_wavelength,
             n_pixels=known.camera.n_pixels,
-            pixel_scale_arcsec=known.pixel_scale / ARCSEC,
-            n_photons=(known.photons(math.pi / 4 * cls.reference_fill_factor * known.telescope.diameter**2),),
-            n_frames=(known.frames,),
-            diameter_over_r0=(known.telescope.diameter / known.site.r0,),
             outer_scale=known.site.outer_scale,
             readout_noise=known.camera.readout_noise,
             exponent=known.source.exponent,
-            knee=known.knee,
             **exposure_options(known),
         )
+
+    def beside_file(self) -> dict[str, Any]:
+        """Return the values of options that say something of an instrument, but axes of several values."""
+        names = ("mask_diameter", "central_obstruction", "outer_scale", "wavelength", "n_pixels", "pixel_scale_arcsec")
+        given = {name: getattr(self, name) for name in (*names, "readout_noise", "exponent", "knee")}
+        strength = _only(self.diameter_over_r0)
+        given |= {"n_frames": _only(self.n_frames), "r0": self.mask_diameter / strength if strength else None}
+        return super().beside_file() | vanes_beside_file(self) | given
+
+    @property
+    def reference_area(self) -> float:
+        """Open area to which photons and sky belong [m^2]."""
+        return math.pi / 4 * self.reference_fill_factor * self.mask_diameter**2
+
+
+def _only(axis: tuple[Any, ...] | None) -> Any:
+    """Return the value of an axis that has one, or else None."""
+    return axis[0] if axis is not None and len(axis) == 1 else None
 
 
 def run(options: Options) -> None:
     """Fill the table, or go on with it."""
     require_table_folder(options.folder)
     space = space_of(options)
-    area = math.pi / 4 * space.reference_fill_factor * space.mask_diameter**2
-    conditions = options.conditions(space.grid.wavelength, area)
+    conditions = options.conditions(space.grid.wavelength, options.reference_area)
     require_rows_kept(options.folder, space, conditions)
-    used = used_instrument(options, area, conditions)
+    kept = kept_instrument(options)
     try:
         with Progress() as progress:
             table = design_table(space, options.folder, conditions=conditions, **options.keywords(progress))
@@ -80,8 +107,8 @@ def run(options: Options) -> None:
         print(f"\ncall again with {options.folder} to go on", file=sys.stderr)
         raise
     save_config(options.folder / CONFIG, "table", options, replace=True)  # that of a table with fewer rows
-    if used is not None:
-        used.save(options.folder / INSTRUMENT, replace=True)
+    if kept is not None:
+        kept.save(options.folder / INSTRUMENT, replace=True)
     print(table, f"\nwritten to {options.folder}", sep="\n")
 
 
@@ -89,11 +116,26 @@ def space_of(options: Options) -> DesignSpace:
     """Return the parameters of the table. Raises ValueError for another wavelength than that of --instrument."""
     quoted = {"--pixel-scale-arcsec": options.pixel_scale_arcsec is not None}
     wavelength = options.needed_wavelength(options.wavelength, quoted)
-    if wavelength is not None:
-        options.require_its_wavelength(wavelength)
-    values: dict[str, Any] = {item.name: getattr(options, item.name) for item in dataclasses.fields(DesignSpace)}
-    values |= {"wavelength": wavelength, "pixel_scale": pixel_angle(options.pixel_scale_arcsec)}
+    known, used = options.known_instrument(), options.used_instrument()
+    values: dict[str, Any] = {} if used is None else follow(used, options.reference_area)
+    told = {item.name: getattr(options, item.name) for item in dataclasses.fields(DesignSpace)}
+    values |= {name: value for name, value in told.items() if value is not None}
+    values |= dataclasses.asdict(rules_of(options, known, used))
+    values["wavelength"] = wavelength
+    if options.pixel_scale_arcsec is not None:
+        values["pixel_scale"] = pixel_angle(options.pixel_scale_arcsec)
     return DesignSpace(**values)
+
+
+def follow(used: Instrument, area: float) -> dict[str, Any]:
+    """Return what follows from an instrument for a table, unless it is given; `area` [m^2] is that of its light."""
+    return {
+        "n_photons": (used.photons(area),),
+        "n_frames": (used.frames,),
+        "diameter_over_r0": (used.telescope.diameter / used.site.r0,),
+        "pixel_scale": used.pixel_scale,
+        "knee": used.knee,
+    }
 
 
 def require_table_folder(folder: Path) -> None:
@@ -140,31 +182,10 @@ def _flag(name: str) -> str:
     return "--pixel-scale-arcsec" if name == "pixel_scale" else f"--{name.replace('_', '-')}"
 
 
-def used_instrument(options: Options, area: float, conditions: ExposureConditions | None) -> Instrument | None:
-    """Return the instrument of the table, with what was given beside its file; None without a file.
+def kept_instrument(options: Options) -> Instrument | None:
+    """Return the instrument of the table, for its folder; None without a file.
 
-    Of an axis with several values it keeps the file's. `area` [m^2] is that of the reference fill factor.
+    Of an axis with several values it keeps the file's.
     """
-    known = options.known_instrument()
-    if known is None:
-        return None
-    names = ("mask_diameter", "central_obstruction", "outer_scale", "n_pixels", "pixel_fill", "readout_noise")
-    frames, strength, photons = (
-        axis[0] if len(axis) == 1 else None for axis in (options.n_frames, options.diameter_over_r0, options.n_photons)
-    )
-    given = {name: getattr(options, name) for name in (*names, "exponent", "knee")} | {
-        "r0": strength and options.mask_diameter / strength,
-        "wind": math.hypot(*options.wind) if options.wind else None,
-        "exposure": options.exposure_time,
-        "n_frames": known.frames if frames is None else frames,
-        "pixel_scale": options.pixel_scale_arcsec,
-    }
-    used = instrument_used(known, area, given)
-    sky = None if conditions is None else conditions.sky
-    light = {"n_photons": _unless_same(photons, used.photons(area)), "sky": _unless_same(sky, used.sky(area))}
-    return instrument_used(known, area, given | light)
-
-
-def _unless_same(value: float | None, known: float) -> float | None:
-    """Return a value, or None, which changes nothing, if it differs from what is known by rounding only."""
-    return None if value is None or math.isclose(value, known, rel_tol=1e-9) else value
+    used = options.used_instrument()
+    return used and with_light(used, options.reference_area, _only(options.n_photons), options.sky)
