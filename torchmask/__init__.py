@@ -19,12 +19,13 @@ from torchmask.grid import Grid
 from torchmask.instrument.instrument import Instrument
 from torchmask.instrument.parts import Camera, Site, Source, Telescope
 from torchmask.interferometry.calibration import MaskCalibration, calibrate_mask
-from torchmask.interferometry.companion_map import fit_pair, map_companions
+from torchmask.interferometry.companion_map import map_companions
 from torchmask.interferometry.fringes import frame_observables
 from torchmask.interferometry.measurements import Measurements
 from torchmask.interferometry.observables import Observables
 from torchmask.interferometry.oifits import save_oifits
 from torchmask.interferometry.oifits_reader import load_oifits
+from torchmask.interferometry.pair_fit import fit_pair
 from torchmask.interferometry.visibilities import restored_observables
 from torchmask.observation import Observation
 from torchmask.optics.aperture import FullAperture, SparseAperture

@@ -10,9 +10,11 @@ from torchmask.cli.companion import summary
 from torchmask.cli.main import main
 from torchmask.grid import ARCSEC, MAS, Grid
 from torchmask.interferometry.companion_limits import DetectionLimits
-from torchmask.interferometry.companion_map import PairFit
+from torchmask.interferometry.disc_model import DiscFit, disc_visibilities
 from torchmask.interferometry.fringes import frame_observables
 from torchmask.interferometry.oifits import save_oifits
+from torchmask.interferometry.oifits_reader import load_oifits
+from torchmask.interferometry.pair_fit import PairFit
 from torchmask.observation import Observation
 from torchmask.optics.aperture import SparseAperture
 
@@ -83,6 +85,27 @@ def test_a_resolved_source_is_no_companion(write, tmp_path, capsys):
     assert "would be found" not in said
 
 
+def test_a_slightly_resolved_star_is_told_as_such(write, tmp_path, capsys):
+    """|V|^2 of a uniform disc of half the finest fringe: the pair that looks like it is closer than the search."""
+    single, star = write("single.oifits", ((0, 0, 1),), 1), write("star.oifits", ((0, 0, 1),), 2)
+    size = 0.5 * load_oifits(single).finest
+    with fits.open(single) as hdus:
+        rows = hdus["OI_VIS2"].data
+        baselines = torch.tensor(np.stack([rows["UCOORD"], rows["VCOORD"]], 1).astype(float))
+        rows["VIS2DATA"] *= disc_visibilities(baselines / GRID.wavelength, size)[:, None].numpy() ** 2
+        hdus.writeto(tmp_path / "disc.oifits")
+    assert run(tmp_path / "disc.oifits", "--star", star, "--out", tmp_path / "run") == 0
+    found = json.loads((tmp_path / "run/companion.json").read_text())
+    assert found["verdict"] == "resolved"
+    assert not found["detected"]
+    disc = found["disc"]
+    assert abs(disc["diameter"] - size / MAS) < 4 * disc["diameter_error"]
+    said = capsys.readouterr().out
+    closest = load_oifits(single).finest / 2 / MAS
+    assert f"resolved, or a pair closer than {closest:.4g} mas: a uniform disc of {disc['diameter']:.4g} +- " in said
+    assert "the companion that fits best leaves" in said
+
+
 def test_bounds_are_in_arcsec(write, tmp_path, capsys):
     star = write("star.oifits", ((0, 0, 1),), 2)
     wide = ("--least-arcsec", "0.1", "--most-arcsec", "0.3")
@@ -131,8 +154,8 @@ def test_a_companion_of_negative_light_is_none(write, tmp_path, capsys):
 
 def test_where_fringes_repeat_no_limit_is_told():
     companion, covariance = torch.tensor([0.1, 1e-7, 1e-7]).double(), 1e-4 * torch.eye(3).double()
-    fit = PairFit(companion, covariance, 20.0, 400.0, 22)
+    fit = PairFit(companion, covariance, 20.0, 400.0, DiscFit(1e-7, 1e-8, 200.0), 22, (5e-8, 1e-6))
     limits = DetectionLimits(np.array([0.1, 0.2]), np.array([0.01, np.inf]), np.array([0.001, np.inf]))
-    near, far = summary(fit, limits, side_known=True, farthest=1e-6)[-2:]
+    near, far = summary(fit, limits, side_known=True)[-2:]
     assert near == "  at 100 mas a companion of 0.01 +- 0.001 of the star's light would be found"
     assert far.startswith("  at 200 mas a companion would not be found everywhere")

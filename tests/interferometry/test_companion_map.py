@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from torchmask.grid import ARCSEC, Grid
-from torchmask.interferometry.companion_map import CompanionMap, fit_pair, map_companions, raster
+from torchmask.grid import Grid
+from torchmask.interferometry.companion_map import map_companions, raster
 from torchmask.interferometry.fringes import frame_observables
 from torchmask.interferometry.measurements import Measurements, join
+from torchmask.interferometry.pair_fit import fit_pair
+from torchmask.interferometry.pair_limits import pair_limits
 from torchmask.interferometry.pair_model import PairResiduals, pair_visibilities
 from torchmask.observation import Observation
 from torchmask.optics.aperture import SparseAperture
@@ -111,31 +113,6 @@ def test_a_star_alone_is_as_significant_as_chance(measure_pair):
     assert torch.allclose(linear, pulls, atol=0.15, rtol=0.15)
 
 
-def test_a_companion_at_the_limit_is_found_at_the_significance_of_the_limit(measure_pair):
-    limits = map_companions(measure_pair(seed=1000, rms=0.01)).limits(2 * measure_pair().finest)
-    assert (limits.errors > 0).all()
-    contrast = limits(TRUTH[1:])[None]
-    truth = torch.cat([contrast.double(), TRUTH[1:]])
-    found = [map_companions(measure_pair(truth, seed), TRUTH[None, 1:]) for seed in range(SEEDS)]
-    significance = torch.cat([each.contrast / each.errors for each in found])
-    # 5 of them, as far as the limit of the ring is that of this place and its own chance allows
-    slack = 5 * float(limits.errors[0] / limits.contrast[0])
-    assert abs(float(significance.mean()) - 5) < slack + 4 / math.sqrt(SEEDS)
-    assert float(significance.mean()) > 4
-
-
-def test_the_error_of_a_limit_holds_its_scatter_and_that_of_the_errors_themselves():
-    """Errors scaled by a chi-square of n degrees of freedom are known to 1 / (2 n)^(1/2) of themselves."""
-    places = torch.tensor([[0.0, 0.4], [-0.8, 0.0], [0.0, -1.2], [1.6, 0.0]], dtype=torch.float64)
-    errors = torch.tensor([1e-3, 1e-3, 2e-3, 4e-3], dtype=torch.float64)
-    found = CompanionMap(places * ARCSEC, errors, errors, errors, 30.0, 40.0, 32).limits(ARCSEC, 3.0)
-    own = 1 / math.sqrt(2 * 32)
-    assert found.separation == pytest.approx([0.6, 1.4], rel=1e-12)
-    assert found.contrast == pytest.approx([3e-3, 3 * math.sqrt(10) * 1e-3], rel=1e-12)
-    # in the second annulus 2 and 4 scatter by 1 about 3
-    assert found.errors == pytest.approx([own * 3e-3, 3e-3 * math.hypot(1, own * math.sqrt(10))], rel=1e-12)
-
-
 @pytest.mark.parametrize(("shortest", "most"), [(2.0, 1.25), (0.05, 25.0)])
 def test_a_raster_ends_at_half_the_widest_fringe_and_at_25_of_the_finest(shortest, most):
     """Baselines up to 5 m; separations in periods of their fringe, eight points to each."""
@@ -226,4 +203,4 @@ def test_where_fringes_repeat_no_companion_would_be_found():
     assert float(found.contrast[0]) == pytest.approx(0.1, rel=1e-6)
     assert found.contrast.isfinite().all()
     assert found.errors[1] > 1e6
-    assert found.limits(1e-6).contrast[1] > 1e6
+    assert pair_limits(seen, fit_pair(seen, truth), found.offsets, 1e-6).contrast[1] > 1e6

@@ -18,9 +18,11 @@ from torchmask.cli.run import new_run
 from torchmask.grid import ARCSEC, MAS
 from torchmask.interferometry.companion_errors import MEASURED, polar, rotation_towards
 from torchmask.interferometry.companion_limits import SIGNIFICANCE, DetectionLimits
-from torchmask.interferometry.companion_map import PairFit, fit_pair, map_companions, raster
+from torchmask.interferometry.companion_map import map_companions, raster
 from torchmask.interferometry.measurements import Measurements, join
 from torchmask.interferometry.oifits_reader import load_oifits
+from torchmask.interferometry.pair_fit import PairFit, fit_pair
+from torchmask.interferometry.pair_limits import pair_limits
 from torchmask.io import save_npz, write_json
 from torchmask.viz.companion import companion_figure
 
@@ -31,7 +33,7 @@ class Options(RunOptions):
 
     The files are those of `torchmask restore --oifits` or of any other program; several are analysed jointly. The
     command writes companion.json, the map of all positions tried (companion.npz) and a figure to a new folder. The exit
-    status is 3 if a star and one companion do not explain the measurements.
+    status is 3 if neither a star and one companion nor a uniform disc explains the measurements.
     """
 
     files: tyro.conf.Positional[tuple[Path, ...]] = ()
@@ -59,15 +61,17 @@ def run(options: Options) -> int:
         raise ValueError(f"--least-arcsec, --most-arcsec: {error}") from error
     with new_run("companion", options) as output:
         found = map_companions(measured, offsets)
-        limits = found.limits(measured.finest)
-        fit = fit_pair(measured, found.best)
+        fit = fit_pair(measured, found.best, *bounds)
+        limits = pair_limits(measured, fit, offsets, measured.finest)
         sides = len(measured.closure_phases) > 0
         numbers = {
             "files": [str(path) for path in options.files],
             "stars": [str(path) for path in options.star],
+            "verdict": fit.verdict,
             "explained": fit.explained,
             "detected": fit.detected,
             "companion": describe(fit),
+            "disc": describe_disc(fit),
             "side_known": sides,
             "limits": dataclasses.asdict(limits),
         }
@@ -82,8 +86,7 @@ def run(options: Options) -> int:
             output.summary.append(
                 "without --star, |V|^2 are taken as calibrated: losses of contrast look like companions"
             )
-        farthest = float(torch.linalg.vector_norm(found.offsets, dim=1).max())
-        output.summary.extend(summary(fit, limits, sides, farthest))
+        output.summary.extend(summary(fit, limits, sides))
     return 0 if fit.explained else NOT_EXPLAINED
 
 
@@ -132,11 +135,24 @@ def describe(fit: PairFit) -> dict[str, Any]:
     }
 
 
-def summary(fit: PairFit, limits: DetectionLimits, side_known: bool, farthest: float) -> Sequence[str]:
-    """Return the lines to print; limits only if the measurements are explained, as they rest on the residuals.
+def describe_disc(fit: PairFit) -> dict[str, float]:
+    """Return the uniform disc that fits best, in mas."""
+    disc = fit.disc
+    return {"diameter": disc.diameter / MAS, "diameter_error": disc.error / MAS, "chi_square": disc.chi_square}
 
-    Companions were looked for up to the separation `farthest` [rad].
-    """
+
+def summary(fit: PairFit, limits: DetectionLimits, side_known: bool) -> Sequence[str]:
+    """Return the lines to print; limits only if the measurements are explained, as they rest on the residuals."""
+    lines = verdict_lines(fit)
+    if not fit.explained:
+        return lines
+    if not side_known:
+        lines.append("without closure phases, a companion on the opposite side of the star fits equally well")
+    return [*lines, *limit_lines(limits)]
+
+
+def verdict_lines(fit: PairFit) -> list[str]:
+    """Return what the fit says, with the chi-squares of its rivals."""
     seen = describe(fit)
     errors, freedom = seen["errors"], f"of {fit.degrees_of_freedom} degrees of freedom"
     where = (
@@ -144,23 +160,41 @@ def summary(fit: PairFit, limits: DetectionLimits, side_known: bool, farthest: f
         f"{seen['separation']:.4g} +- {errors['separation']:.2g} mas from it at "
         f"{seen['position_angle']:.4g} +- {errors['position_angle']:.2g} deg, north through east"
     )
-    if not fit.explained:
+    least, most = (f"{value / MAS:.4g} mas" for value in fit.separations)
+    disc = f"a uniform disc of {fit.disc.diameter / MAS:.4g} +- {fit.disc.error / MAS:.2g} mas"
+    rivals = f"{fit.disc.chi_square:.4g} for {disc}, {fit.star_chi_square:.4g} for the star alone"
+    if fit.verdict == "not explained":
         return [
-            f"not explained: a star and one companion leave a chi-square of {fit.chi_square:.4g} {freedom}; up to "
-            f"{fit.limit:.4g} counts as explained; check that the star is a point and has one companion at most, "
-            f"within {farthest / MAS:.4g} mas (--most-arcsec looks farther), that --star is a point seen through the "
+            f"not explained: a star and one companion leave a chi-square of {fit.chi_square:.4g} {freedom}, and "
+            f"{disc} {fit.disc.chi_square:.4g}; up to {fit.limit:.4g} counts as explained; check that the star has one "
+            f"companion at most, within {most} (--most-arcsec looks farther), that --star is a point seen through the "
             "same mask, and the errors in the files",
             f"the companion that fits best, which the measurements contradict, is {where}",
         ]
-    head = "a companion" if fit.detected else f"no companion above {SIGNIFICANCE:g} standard errors; the likeliest is"
+    if fit.verdict == "resolved":
+        return [
+            f"resolved, or a pair closer than {least}: {disc} leaves a chi-square of {fit.disc.chi_square:.4g}, the "
+            f"star alone {fit.star_chi_square:.4g}",
+            f"the companion that fits best leaves {fit.chi_square:.4g} {freedom}, and is {where}",
+        ]
+    head = {
+        "companion": "a companion",
+        "none": f"no companion above {SIGNIFICANCE:g} standard errors; the likeliest is",
+        "outside": f"a pair closer than {least}, which --least-arcsec looks for, or a star that is resolved but no "
+        "uniform disc; what fits best is a companion",
+    }[fit.verdict]
+    if fit.verdict == "outside" and fit.separation > fit.separations[1]:
+        head = f"no companion within {most}: --most-arcsec looks farther, where what fits best is one"
     if seen["contrast"] <= 0:
         head = "no companion; what fits best is one of negative light, as fringes stronger than a star's make it,"
-    lines = [
-        f"{head} {where} ({fit.significance:.1f} standard errors; chi-square {fit.chi_square:.4g} {freedom}, "
-        f"{fit.star_chi_square:.4g} without it)"
+    return [
+        f"{head} {where} ({fit.significance:.1f} standard errors; chi-square {fit.chi_square:.4g} {freedom}, {rivals})"
     ]
-    if not side_known:
-        lines.append("without closure phases, a companion on the opposite side of the star fits equally well")
+
+
+def limit_lines(limits: DetectionLimits) -> list[str]:
+    """Return the faintest companion that would be found, at each separation."""
+    lines = []
     for place, contrast, error in zip(limits.separation, limits.contrast, limits.errors, strict=True):
         found = f"a companion of {contrast:.2g} +- {error:.1g} of the star's light would be found"
         if contrast > 1:

@@ -48,10 +48,12 @@ class PairResiduals:
 
     size: int
     unit: Tensor  # (3,) units of a companion's parameters: contrast 1, and the finest fringe
+    frequencies: Tensor  # (B, 2) of the squared visibilities [cycles per radian]
+    sides: Tensor  # (3 C, 2) of the sides of all triangles [cycles per radian]
 
     def __init__(self, measured: Measurements) -> None:
         self._seen = measured
-        self._frequencies, self._sides = measured.frequencies, measured.triangle_frequencies.flatten(0, 1)
+        self.frequencies, self.sides = measured.frequencies, measured.triangle_frequencies.flatten(0, 1)
         self.unit = torch.tensor([1.0, measured.finest, measured.finest], dtype=torch.float64)
         every = torch.eye(len(measured.vis2), dtype=torch.float64)
         self._vis2 = _whitening(measured.vis2_errors, measured.vis2_correlation, every)
@@ -62,22 +64,31 @@ class PairResiduals:
             raise ValueError(
                 f"there are {self.size} independent measurements: a companion's contrast and position need {PARAMETERS}"
             )
-        long, wide = torch.linalg.svdvals(torch.cat([self._frequencies, self._sides])).tolist()
+        long, wide = torch.linalg.svdvals(torch.cat([self.frequencies, self.sides])).tolist()
         if not wide > _LEAST_WIDTH * long:
             raise ValueError("all baselines have one direction: a companion's position needs more than one direction")
 
     def residuals(self, companion: Tensor) -> Tensor:
         """Return whitened differences (..., K) of measurements and model, for companions (..., 3)."""
-        vis2, phases = self._model(companion)
-        away = self._seen.closure_phases - phases
-        away = torch.atan2(away.sin(), away.cos())
-        return torch.cat([(self._seen.vis2 - vis2) @ self._vis2, away @ self._closures], -1)
+        return self.left_by(*(pair_visibilities(each, companion) for each in (self.frequencies, self.sides)))
+
+    def left_by(self, visibilities: Tensor, sides: Tensor) -> Tensor:
+        """Return whitened differences (..., K) of measurements and any model.
+
+        The model is its complex visibilities (..., B) at `frequencies`, and (..., 3 C) at `sides`.
+        """
+        away = self._seen.closure_phases - sides.unflatten(-1, (-1, 3)).prod(-1).angle()
+        return self.whiten(self._seen.vis2 - visibilities.abs() ** 2, torch.atan2(away.sin(), away.cos()))
+
+    def whiten(self, vis2: Tensor, phases: Tensor) -> Tensor:
+        """Return independent numbers of variance 1 (..., K) for differences of |V|^2 (..., B) and phases (..., C)."""
+        return torch.cat([vis2 @ self._vis2, phases @ self._closures], -1)
 
     def slopes(self, companion: Tensor) -> Tensor:
         """Return derivatives (K, 3) of the whitened model in the companion (3,)."""
         (of_vis2, vis2_turns), (of_phases, phase_turns) = self._slopes(companion)
-        sides = phase_turns[:, None] * self._sides
-        vis2 = torch.cat([of_vis2[:, None], vis2_turns[:, None] * self._frequencies], 1)
+        sides = phase_turns[:, None] * self.sides
+        vis2 = torch.cat([of_vis2[:, None], vis2_turns[:, None] * self.frequencies], 1)
         phases = torch.cat([of_phases[:, None], sides], 1).unflatten(0, (-1, 3)).sum(1)
         return torch.cat([self._vis2.T @ vis2, self._closures.T @ phases])
 
@@ -107,18 +118,12 @@ class PairResiduals:
         companion = torch.cat([offsets.new_zeros(len(offsets), 1), offsets], 1)
         for step in range(_STEPS + 1):
             (of_vis2, _), (of_phases, _) = self._slopes(companion)
-            of_phases = of_phases.unflatten(-1, (-1, 3)).sum(-1)
-            slope = torch.cat([of_vis2 @ self._vis2, of_phases @ self._closures], 1)
+            slope = self.whiten(of_vis2, of_phases.unflatten(-1, (-1, 3)).sum(-1))
             residual, curvature = self.residuals(companion), slope.square().sum(1)
             if step < _STEPS:
                 change = (slope * residual).sum(1) / curvature.clamp(min=_TINY)
                 companion[:, 0] = (companion[:, 0] + change).clamp(_FAINTEST, _BRIGHTEST)
         return companion[:, 0], curvature.rsqrt(), residual.square().sum(1)
-
-    def _model(self, companion: Tensor) -> tuple[Tensor, Tensor]:
-        vis2 = pair_visibilities(self._frequencies, companion).abs() ** 2
-        sides = pair_visibilities(self._sides, companion)
-        return vis2, sides.unflatten(-1, (-1, 3)).prod(-1).angle()
 
     def _slopes(self, companion: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
         """Return derivatives of |V|^2 (..., B), and of the phases of all sides of triangles (..., 3 C).
@@ -127,10 +132,10 @@ class PairResiduals:
         because forward differentiation of complex numbers takes far longer.
         """
         c = companion[..., :1]
-        turns = 2 * math.pi * (companion[..., 1:] @ self._frequencies.T)
+        turns = 2 * math.pi * (companion[..., 1:] @ self.frequencies.T)
         by_contrast = 2 * (1 - c) * (turns.cos() - 1) / (1 + c) ** 3
         by_turn = -2 * c * turns.sin() / (1 + c) ** 2
-        sides = -2 * math.pi * (companion[..., 1:] @ self._sides.T)
+        sides = -2 * math.pi * (companion[..., 1:] @ self.sides.T)
         wave = phasor(sides)
         ratio = wave / (1 + c * wave)
         return (by_contrast, 2 * math.pi * by_turn), (ratio.imag, -2 * math.pi * c * ratio.real)
@@ -139,6 +144,11 @@ class PairResiduals:
 def square(residual: Tensor) -> float:
     """Return the chi-square of residuals (K,)."""
     return float(residual.square().sum())
+
+
+def unexplained(chi_square: float, degrees_of_freedom: int) -> float:
+    """Return the reduced chi-square if it is above 1: the factor by which squared errors grow."""
+    return max(1.0, chi_square / max(1, degrees_of_freedom))
 
 
 def _whitening(errors: Tensor, correlation: Tensor | None, combinations: Tensor) -> Tensor:
