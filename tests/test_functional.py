@@ -120,7 +120,7 @@ def test_the_axis_that_is_mapped_may_be_any():
     population = torch.stack([CENTERS, 0.5 * CENTERS], dim=1)  # (masks, maps, N, 2)
 
     def values(centers: Tensor) -> Tensor:
-        return baseline_mse(centers, CRITERION._weight, CRITERION._ratio, geometry)
+        return baseline_mse(centers, *CRITERION._layers(), geometry)
 
     mapped = vmap(values, in_dims=1, out_dims=1)(population)
     close(mapped, torch.stack([values(CENTERS), values(0.5 * CENTERS)], dim=1))
@@ -141,6 +141,9 @@ def test_a_second_derivative_of_mse_a_is_refused_under_torch_func_too():
 
 
 def test_only_masks_are_mapped_over():
-    object_psd = CRITERION._weight.expand(2, *CRITERION._weight.shape)
+    object_psd = CRITERION.object_psd.expand(2, *CRITERION.object_psd.shape)
     with pytest.raises(ValueError, match="runs over the centres"):
-        vmap(lambda w: functional_call(CRITERION, {"_weight": w}, (MASK,)))(object_psd)
+        vmap(lambda psd: functional_call(CRITERION, {"object_psd": psd}, (MASK,)))(object_psd)
+    weight, ratio = CRITERION._layers()
+    with pytest.raises(ValueError, match="runs over the centres"):
+        vmap(lambda w: baseline_mse(CENTERS, w, ratio, CRITERION._geometry(MASK)))(weight.expand(2, *weight.shape))

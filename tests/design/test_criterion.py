@@ -6,6 +6,8 @@ import copy
 import math
 import pickle
 from collections.abc import Iterator
+from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,14 +16,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import hyp2f1
 from torch import Tensor, nn
+from torch.func import functional_call
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchmask.design import overlap
 from torchmask.design.criterion import AsymptoticMSE, wiener_mse
+from torchmask.design.turbulent import TurbulentMSE
 from torchmask.grid import Grid
 from torchmask.memory import AtATime
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.otf import analytic_otf
+from torchmask.optics.pixel import SquarePixel
 from torchmask.optics.round import disc_constants, disc_patches
 from torchmask.optics.shapes import Disc
 from torchmask.spectra import NoisePSD, PowerLawPSD
@@ -445,6 +450,60 @@ def test_state_survives_saving_copying_and_conversion() -> None:
     assert torch.equal(same.on_grid(24).object_psd, PowerLawPSD(1.5, 1e4)(grid_of(24)))
 
 
+@pytest.mark.parametrize("kind", [AsymptoticMSE, partial(TurbulentMSE, r0=0.3, pixel=SquarePixel())])
+@pytest.mark.parametrize("mode", [torch.enable_grad, torch.no_grad, torch.inference_mode])
+def test_values_follow_what_is_changed(kind: Any, mode: Any) -> None:
+    grid, mask = grid_of(16), mask_of(layouts()["random"])
+    s_o, s_n = psds("tensors", grid.shape, grid)
+
+    def values(criterion: AsymptoticMSE) -> list[float]:
+        return [float(criterion(mask)), float(criterion.relative(mask)), float(criterion.jensen_term(mask))]
+
+    expected = values(kind(grid, 100 * s_o, 7 * s_n, 50))
+    with mode():
+        criterion = kind(grid, s_o, s_n, 5)
+        before = values(criterion)
+        state = {"object_psd": 100 * criterion.object_psd, "noise_psd": 7 * criterion.noise_psd}
+        criterion.n_frames = 50
+        for _ in range(2):
+            assert [float(functional_call(criterion, state, mask))] == pytest.approx(expected[:1], rel=1e-13)
+        criterion.n_frames = 5
+        assert values(criterion) == before
+        criterion.object_psd.mul_(100)
+        copied = copy.deepcopy(criterion)  # before it is called again
+        criterion.n_frames = copied.n_frames = 50
+        for other in (criterion, copied):
+            other.noise_psd *= 7
+            assert values(other) == pytest.approx(expected, rel=1e-13)
+        assert float(criterion.on_grid(8)(mask)) == float(kind(grid, 100 * s_o, 7 * s_n, 50).on_grid(8)(mask))
+
+
+def test_another_grid_has_the_present_power_spectra() -> None:
+    criterion, mask = criterion_of(grid_of(32)), mask_of(layouts()["random"])
+    criterion.float().double()
+    coarse = criterion.on_grid(24).object_psd
+    torch.testing.assert_close(coarse, PowerLawPSD(1.5, 1e4)(grid_of(24)), rtol=1e-14, atol=0)  # not interpolated
+    criterion.object_psd.mul_(100)
+    assert torch.equal(criterion.on_grid(16).object_psd, criterion.object_psd[::2, ::2])
+    assert float(criterion.on_grid(32)(mask)) == float(criterion(mask))
+
+
+def test_a_number_of_frames_that_cannot_be_is_refused_when_it_is_used() -> None:
+    criterion = criterion_of(grid_of(16))
+    criterion.n_frames = 0
+    with pytest.raises(ValueError, match="n_frames is 0"):
+        criterion(mask_of(layouts()["random"]))
+
+
+def test_power_spectra_that_require_a_gradient_are_refused_in_a_call() -> None:
+    criterion, mask = criterion_of(grid_of(16)), mask_of(layouts()["random"])
+    noise = criterion.noise_psd.clone().requires_grad_()
+    with pytest.raises(ValueError, match="a PSD requires a gradient"):
+        functional_call(criterion, {"noise_psd": noise}, mask)
+    with torch.no_grad():
+        assert float(functional_call(criterion, {"noise_psd": noise}, mask)) == float(criterion(mask))
+
+
 def test_buffers_take_no_gradient_of_a_power_spectrum_that_trains() -> None:
     psd = PowerLawPSD(1.5, 1e4)(grid_of(16)).requires_grad_()
     criterion = AsymptoticMSE(grid_of(16), psd, psd / 1e4, 20)
@@ -509,6 +568,10 @@ def test_compiles_to_one_graph(shape: str) -> None:
         gradients += torch.autograd.grad(value.sum(), centers)
     torch.testing.assert_close(values[1], values[0], rtol=1e-13, atol=0)
     torch.testing.assert_close(gradients[1], gradients[0], rtol=1e-9, atol=0)
+    criterion.noise_psd.mul_(7)
+    torch.testing.assert_close(
+        compiled(mask_of(centers, shape)), criterion(mask_of(centers, shape)), rtol=1e-13, atol=0
+    )
 
 
 def test_pupils_without_closed_form_are_refused() -> None:

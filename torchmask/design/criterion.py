@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any, Self
+from typing import Self
 
 import torch
 from torch import Tensor, nn
 
 from torchmask.design.fluctuation import mean_inverse, piston_powers
 from torchmask.design.overlap import Geometry, baseline_mse
+from torchmask.design.psd_layers import KeptLayers, Layers, psd_layers
 from torchmask.grid import Grid
 from torchmask.memory import keep_freed_memory, require_memory
 from torchmask.numbers import whole_number
@@ -23,6 +24,7 @@ from torchmask.optics.aperture import FullAperture
 from torchmask.optics.pupil import Aperture
 from torchmask.spectra import PSD, evaluate_psd, resample_psd
 
+_SAME = 1e-6  # relative rounding of a PSD that was in float32
 _BYTES = 60  # of memory for each frequency, in one evaluation
 
 
@@ -58,7 +60,7 @@ class AsymptoticMSE(nn.Module):
     pixels of the grid and the 2 N^2 c^2 G^2 pixels of the patches, c = diameter of a sub-aperture / grid.period; large
     populations are split into chunks to limit memory. It raises ValueError for a full pupil and for c > 1/2. With
     `torch.func.vmap` over centres, the mapped axis is one more axis of the population. On CUDA equal calls may differ
-    by rounding (atomic sums).
+    by rounding (atomic sums). Values follow `object_psd`, `noise_psd` and `n_frames` where these are changed.
 
     Examples
     --------
@@ -73,8 +75,6 @@ class AsymptoticMSE(nn.Module):
 
     object_psd: Tensor
     noise_psd: Tensor
-    _weight: Tensor
-    _ratio: Tensor
 
     def __init__(self, grid: Grid, object_psd: PSD, noise_psd: PSD, n_frames: int) -> None:
         super().__init__()
@@ -82,43 +82,28 @@ class AsymptoticMSE(nn.Module):
         require_memory("n_pixels", max(grid.shape), _BYTES * math.prod(grid.shape), power=2)
         self.grid: Grid = grid
         self.n_frames: int = n_frames
+        self._kept = KeptLayers()
         self._object_model = None if isinstance(object_psd, Tensor) else object_psd
-        self.register_buffer("object_psd", evaluate_psd(object_psd, grid, "object_psd").detach())
-        self.register_buffer("noise_psd", evaluate_psd(noise_psd, grid, "noise_psd").detach())
+        self.register_buffer("object_psd", _made(object_psd, grid, "object_psd"))
+        self.register_buffer("noise_psd", _made(noise_psd, grid, "noise_psd"))
         if not bool((self.noise_psd > 0).all()):
             raise ValueError("noise_psd is 0 somewhere: it must be positive, or the error would be 0 there")
         if not bool((self.object_psd > 0).any()):
             raise ValueError("object_psd is 0 everywhere: there is nothing to restore")
-        self._pack()
         keep_freed_memory()  # values of populations take and free the same arrays over and over
-        self.register_load_state_dict_post_hook(_pack_again)
 
-    def _pack(self) -> None:
-        """Precompute weight and ratio, so that MSE_a is the sum of weight / (transfer + ratio) over half the plane.
+    def _layers(self) -> Layers:
+        """Return weight and ratio (layers, H // 2 + 1, W) of the present PSDs and number of frames."""
+        return self._kept.of(self.object_psd, self.noise_psd, self.n_frames, self._make_layers)
 
-        A frequency and its negative have the same transfer. If the PSDs differ there, they are kept in two layers.
-        """
-        rows, columns = self.grid.shape
-        height = rows // 2 + 1
-        double = torch.full((height, 1), 2.0, dtype=self.noise_psd.dtype, device=self.noise_psd.device)
-        double[0] = 1.0
-        if rows % 2 == 0:
-            double[-1] = 1.0
-        weight = self.noise_psd / (self.n_frames * rows * columns)
-        ratio = self.noise_psd / (self.n_frames * self.object_psd)
-        if all(bool((psd == _reflect(psd)).all()) for psd in (self.object_psd, self.noise_psd)):
-            weights, ratios = [weight[:height] * double], [ratio[:height]]
-        else:
-            weights = [weight[:height], _reflect(weight)[:height] * (double - 1)]
-            ratios = [ratio[:height], _reflect(ratio)[:height]]
-        self.register_buffer("_weight", torch.stack(weights), persistent=False)
-        self.register_buffer("_ratio", torch.stack(ratios), persistent=False)
+    def _make_layers(self, object_psd: Tensor, noise_psd: Tensor, n_frames: int) -> Layers:
+        return psd_layers(object_psd, noise_psd, whole_number("n_frames", n_frames))
 
     def forward(self, aperture: Aperture) -> Tensor:
         geometry = self._geometry(aperture)
         centers = aperture.centers
         flat = centers.reshape(math.prod(centers.shape[:-2]), *centers.shape[-2:])
-        weight, ratio = self._weight.to(centers.dtype), self._ratio.to(centers.dtype)
+        weight, ratio = (part.to(centers.dtype) for part in self._layers())
         return baseline_mse(flat, weight, ratio, geometry).reshape(centers.shape[:-2])
 
     def relative(self, aperture: Aperture) -> Tensor:
@@ -135,7 +120,7 @@ class AsymptoticMSE(nn.Module):
         """
         with torch.no_grad():
             mean, steady = self._powers(aperture)
-            weight, ratio = self._weight.to(mean.dtype), self._ratio.to(mean.dtype)
+            weight, ratio = (part.to(mean.dtype) for part in self._layers())
             mean, steady = mean[..., None, :, :], steady[..., None, :, :]
             variance = (mean**2 - steady).clamp(min=0) / self.n_frames
             excess = mean_inverse(mean, variance, ratio) - 1 / (mean + ratio)
@@ -170,13 +155,17 @@ class AsymptoticMSE(nn.Module):
         """Return the same criterion with its integral sampled on another grid of the same pixel scale.
 
         A coarse grid makes searches fast. The image does not change: the noise keeps its level, including the read-out
-        noise. A callable object PSD is evaluated again; tensors are interpolated (`resample_psd`).
+        noise. A callable object PSD is evaluated again; tensors are interpolated (`resample_psd`), and so is a PSD that
+        was changed.
         """
-        grid = replace(self.grid, n_pixels=n_pixels)
-        noise = resample_psd(self.noise_psd, grid.shape)
-        model = resample_psd(self.object_psd, grid.shape) if self._object_model is None else self._object_model
-        with self.object_psd.device:  # whatever the default device: PSDs are made where none is told
-            return self._like(grid, model, noise).to(self.object_psd.dtype)
+        grid, psd = replace(self.grid, n_pixels=n_pixels), self.object_psd
+        model = self._object_model
+        with psd.device:  # whatever the default device: PSDs are made where none is told
+            if model is None or not torch.allclose(
+                evaluate_psd(model, self.grid, "object_psd").to(psd), psd, rtol=_SAME, atol=0.0
+            ):
+                model = resample_psd(psd, grid.shape)
+            return self._like(grid, model, resample_psd(self.noise_psd, grid.shape)).to(psd.dtype)
 
     def _like(self, grid: Grid, object_psd: PSD, noise_psd: PSD) -> Self:
         """Return the same criterion with another grid and other PSDs."""
@@ -260,15 +249,8 @@ def wiener_mse(otfs: Tensor, object_psd: PSD, noise_psd: PSD) -> Tensor:
     return (s_o * torch.where(is_seen, s_n / torch.where(is_seen, denominator, 1.0), 1.0)).mean((-2, -1))
 
 
-def _reflect(image: Tensor) -> Tensor:
-    """Return the image (..., H, W) at the negative frequencies."""
-    return image.flip(-2, -1).roll((1, 1), (-2, -1))
-
-
-def _pack_again(module: nn.Module, _: Any) -> None:
-    """Update the criterion after load_state_dict, which may have changed the PSDs."""
-    assert isinstance(module, AsymptoticMSE)
-    module._pack()
-    model, psd = module._object_model, module.object_psd
-    if model is not None and not torch.equal(evaluate_psd(model, module.grid, "object_psd").to(psd), psd):
-        module._object_model = None
+def _made(psd: PSD, grid: Grid, name: str) -> Tensor:
+    """Return the values of a PSD (H, W) for a buffer, fit for a gradient whatever mode they are made in."""
+    values = evaluate_psd(psd, grid, name)
+    with torch.inference_mode(False):
+        return values.detach().clone() if values.is_inference() else values.detach()

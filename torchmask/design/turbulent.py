@@ -20,6 +20,7 @@ from torchmask.design.early_gradient import by_chunks
 from torchmask.design.frequency_plane import half_plane
 from torchmask.design.mask_transfer import MaskTransfer
 from torchmask.design.overlap import Geometry
+from torchmask.design.psd_layers import Layers
 from torchmask.grid import Grid
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.band import Band
@@ -131,16 +132,14 @@ class TurbulentMSE(AsymptoticMSE):
         self.pixel: PixelResponse | None = pixel
         self.noise_psd += sky * (getattr(noise_psd, "n_pixels", None) or math.prod(grid.shape))
         self._tables: dict[tuple[Any, ...], Any] = {}
-        self._pack()
 
-    def _pack(self) -> None:
-        super()._pack()
-        pixel = getattr(self, "pixel", None)
-        if pixel is not None:
-            nu_y, nu_x = self.grid.frequencies(self._ratio.dtype, self._ratio.device)
-            response = pixel.transfer(nu_y, nu_x).abs()[: self._ratio.shape[-2]] ** 2
-            self._weight /= response.clamp(min=_DARKEST)
-            self._ratio /= response.clamp(min=_DARKEST)
+    def _make_layers(self, object_psd: Tensor, noise_psd: Tensor, n_frames: int) -> Layers:
+        weight, ratio = super()._make_layers(object_psd, noise_psd, n_frames)
+        if self.pixel is None:
+            return weight, ratio
+        nu_y, nu_x = self.grid.frequencies(ratio.dtype, ratio.device)
+        response = self.pixel.transfer(nu_y, nu_x).abs()[: ratio.shape[-2]] ** 2
+        return weight / response.clamp(min=_DARKEST), ratio / response.clamp(min=_DARKEST)
 
     def _like(self, grid: Grid, object_psd: PSD, noise_psd: PSD) -> TurbulentMSE:
         # the sky is in the noise already
@@ -170,8 +169,7 @@ class TurbulentMSE(AsymptoticMSE):
 
     def _error(self, power: Tensor) -> Tensor:
         """Return the mean squared error (...) for E|OTF|^2 (..., H // 2 + 1, W)."""
-        # copies of those made in inference mode, which cannot be kept for a gradient
-        weight, ratio = (part.to(power.dtype, copy=part.is_inference()) for part in (self._weight, self._ratio))
+        weight, ratio = (part.to(power.dtype) for part in self._layers())
         return (weight / (power[..., None, :, :] + ratio)).sum((-3, -2, -1))
 
     def expected_power(self, aperture: Aperture) -> Tensor:
