@@ -1,10 +1,13 @@
 """Saturated and dead pixels and spikes that nobody has marked: filled in, without weight, and told."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.grid import Grid
+from torchmask.interferometry.fringes import frame_observables
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.detector import Detector
 from torchmask.optics.unmarked import leave_out_unmarked
@@ -72,6 +75,23 @@ def test_pixels_that_were_cut_off_before_a_flat_are_filled_in_and_told(frames):
     assert str(told[0].message).startswith(start)
     assert len(told) == 1
     torch.testing.assert_close(filled[valid], calibrated[valid], rtol=0, atol=0)
+
+
+@pytest.mark.filterwarnings("ignore:the fringes of the frames are not those of the mask")  # as its core is filled in
+def test_the_core_of_a_steady_star_that_was_cut_off_before_a_flat_is_filled_in_and_told():
+    """|V|^2 of the star, which nothing resolves, is 1; with 6 pixels taken for light it was 0.2 to 0.8."""
+    star = torch.zeros(GRID.shape, dtype=torch.float64)
+    star[24, 24] = 1e6
+    seen = simulate_observation(star, MASK, GRID, None, Detector(1.5), 6, generator=torch.Generator().manual_seed(0))
+    flat = 1 + 0.02 * torch.randn(GRID.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    level = float(seen.frames.mean(0).flatten().sort(descending=True).values[6])
+    calibrated = replace(seen, frames=seen.frames.clamp(max=level) / flat)
+    said = (
+        r"in 6 of 6 frames hold .* or more, and the brightest of them hold one value each in all frames, so the camera"
+    )
+    with pytest.warns(UserWarning, match=said):
+        observables = frame_observables(calibrated)
+    assert float((observables.vis2 - 1).abs().max()) < 0.05
 
 
 def test_what_is_marked_already_counts_neither_as_dead_nor_as_saturated(frames):

@@ -135,10 +135,13 @@ def test_an_object_wider_than_the_field_is_noticed(seen):
         method(readout_noise=READOUT, max_iterations=5).restore(seen.frames)  # this one does not
 
 
-@pytest.mark.parametrize(("gain", "readout_noise"), [(1.0, 100.0), (5.0, READOUT), (0.01, READOUT)])
-def test_a_wrong_noise_level_is_noticed(seen, gain, readout_noise):
+@pytest.mark.parametrize(
+    ("gain", "readout_noise", "told"),
+    [(1.0, 100.0, "check the gain and readout"), (5.0, READOUT, "check the gain"), (0.01, READOUT, "to be in ADU")],
+)
+def test_a_wrong_noise_level_is_noticed(seen, gain, readout_noise, told):
     """Readout noise that is far off, or frames in other units than electrons."""
-    with pytest.warns(UserWarning, match="check the gain and readout_noise"):
+    with pytest.warns(UserWarning, match=told):
         method(readout_noise=readout_noise, max_iterations=5).restore(gain * seen.frames)
 
 

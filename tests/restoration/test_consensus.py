@@ -119,7 +119,7 @@ BRISK |= {"retrievals": 0, "last_segments": 0}
 
 
 def restore(explained, schedule, **given):
-    frames = explained[0].frames * 500 + 500
+    frames = 3000 * (explained[0].frames + 1)  # electrons whose noise of 90 is a little above that of their photons
     method = MyopicDeconvolution(PUPIL, GRID, 6, r0=0.5, tolerance=0, schedule=schedule)
     return method.restore(frames, **given)
 

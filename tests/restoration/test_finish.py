@@ -765,7 +765,7 @@ def test_more_follows_the_search_of_a_full_pupil_where_its_aberrations_are_sough
     """With the prior of turbulence."""
     grid = Grid.nyquist(1.0, 500e-9, 16)
     model = ExposureModel(FullAperture(1.0), grid, 3, change.get("band"))
-    frames = torch.randn(2, 16, 16, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    frames = 8 * torch.randn(2, 16, 16, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     frames[:, 6:10, 6:10] += 1000
     free = change.get("free", Free.OBJECT | Free.ABERRATIONS)
     stack = FrameStack.of(frames, None, grid, FullAperture(1.0), None, Background.NONE)

@@ -18,11 +18,11 @@ PUPIL = FullAperture(1.0)
 READOUT = 3.0
 
 
-def exposures(n_frames=4, level=50.0, seed=0):
-    """A block on dark ground with photon and read-out noise."""
+def exposures(n_frames=4, level=50.0, seed=0, sky=0.0):
+    """A block on dark ground, or on a sky, with photon and read-out noise."""
     generator = torch.Generator().manual_seed(seed)
-    expected = torch.zeros(n_frames, *GRID.shape, dtype=torch.float64)
-    expected[:, 10:20, 12:22] = level
+    expected = torch.full((n_frames, *GRID.shape), sky, dtype=torch.float64)
+    expected[:, 10:20, 12:22] += level
     noise = READOUT * torch.randn(expected.shape, dtype=torch.float64, generator=generator)
     return torch.poisson(expected, generator=generator) + noise
 
@@ -144,9 +144,9 @@ def test_a_bright_border_is_noticed():
     """And what its light is taken for."""
     for assumed, taken in ((Background.NONE, "an object that extends beyond"), (Background.PER_FRAME, "for a sky")):
         with pytest.warns(UserWarning, match=taken):
-            stack = FrameStack.of(exposures() + 100.0, None, GRID, PUPIL, None, assumed)
+            stack = FrameStack.of(exposures(sky=100.0), None, GRID, PUPIL, None, assumed)
         assert not stack.fills_field
-    wide = exposures() + 40.0
+    wide = exposures(sky=40.0)
     wide[:, 1:9, 1:9] -= 30.0
     with pytest.warns(UserWarning, match="an object that extends beyond"):
         stack = FrameStack.of(wide, None, GRID, PUPIL, None, Background.IF_SEEN)

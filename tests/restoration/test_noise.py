@@ -7,7 +7,16 @@ import torch
 
 from torchmask.grid import Grid
 from torchmask.optics.aperture import FullAperture
-from torchmask.restoration.noise import FrameNoise, check_errors, even_photons, expected_variance, photon_slope
+from torchmask.optics.fading import beyond_faded
+from torchmask.optics.noise import noise_variance
+from torchmask.restoration.noise import (
+    FrameNoise,
+    check_errors,
+    even_photons,
+    expected_variance,
+    least_by_chance,
+    photon_slope,
+)
 
 GRID = Grid.nyquist(1.0, 550e-9, 32)
 PUPIL = FullAperture(1.0)
@@ -37,6 +46,82 @@ def test_wrong_noise_level_is_noticed():
         expected_variance(frames, GRID, PUPIL, 100.0)
     with pytest.warns(UserWarning, match="check the gain"):
         expected_variance(frames * 10, GRID, PUPIL, 0.0)  # not in electrons
+
+
+def exposed(n_frames=8, level=200.0, seed=0):
+    """Photons of a scene that varies over the field, and read-out noise of 3 electrons."""
+    generator = torch.Generator().manual_seed(seed)
+    lit = torch.poisson(blurred(n_frames, generator, level), generator=generator)
+    return lit + 3 * torch.randn(lit.shape, dtype=torch.float64, generator=generator)
+
+
+@pytest.mark.parametrize("readout", [None, 3.0])
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda frames: (frames / 8).round(),
+        lambda frames: frames / 2,
+        lambda frames: frames + 100,
+        lambda frames: frames / frames.mean(),
+        lambda frames: (frames + frames.roll(1, -1)) / 2,
+        lambda frames: (frames[:4] + frames[4:]) / 2,
+    ],
+    ids=["ADU", "few electrons per ADU", "bias", "normalised", "smoothed", "means"],
+)
+def test_noise_below_that_of_photons_is_noticed(spoil, readout):
+    """Their noise is less than electrons can have."""
+    with pytest.warns(UserWarning, match=r"photons alone give .*in ADU .*the gain.* bias .*give errors"):
+        expected_variance(spoil(exposed()), GRID, PUPIL, readout)
+
+
+@pytest.mark.parametrize("readout", [None, 3.0])
+@pytest.mark.parametrize("n_frames", [1, 8])
+def test_electrons_have_no_less_noise_than_photons_by_chance(n_frames, readout):
+    """Nor what is left of them beside a sky, nor where pixels are missing, nor twice the noise of an EMCCD."""
+    valid = torch.rand(n_frames, *GRID.shape, generator=torch.Generator().manual_seed(0)) > 0.1
+    for seed, level in enumerate([1e-2, 1.0, 30.0, 1e4] * 3):
+        frames = exposed(n_frames, level, seed)
+        expected_variance(frames, GRID, PUPIL, readout)
+        expected_variance(frames, GRID, PUPIL, readout, valid)
+        for sky in (0.9, 1.0, 1.5):
+            expected_variance(frames - sky * frames.mean(), GRID, PUPIL, None)
+        noise = torch.randn(frames.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+        expected_variance(frames + frames.clamp(min=0).sqrt() * noise, GRID, PUPIL, None)
+
+
+def test_means_of_several_reads_are_fine_with_their_errors():
+    """The photon noise of a mean of two is half of its light."""
+    frames = exposed()
+    means = (frames[:4] + frames[4:]) / 2
+    expected_variance(means, GRID, PUPIL, None, None, ((means.clamp(min=0) + 9) / 2).sqrt())
+
+
+def test_a_readout_noise_that_is_clearly_too_large_is_noticed():
+    """By less than the factor of 2 in the variance to which noise beyond the expected one goes unsaid."""
+    frames = exposed()
+    with pytest.warns(UserWarning, match=r"photon noise and readout_noise give 13.*check the gain and readout_noise"):
+        expected_variance(frames, GRID, PUPIL, 8.8)
+
+
+@pytest.mark.parametrize(("kind", "share"), [("none", 0.0), ("scattered", 0.1), ("scattered", 0.3), ("round", 0.2)])
+def test_the_least_noise_by_chance_is_some_standard_errors_away(kind, share):
+    """Of even light, and of a star, in whose frames fewer powers are independent."""
+    n_powers = 2 * int(beyond_faded(GRID, PUPIL, torch.ones(1, *GRID.shape)).sum())
+    y, x = torch.meshgrid(*(2 * [torch.arange(32.0) - 15.5]), indexing="ij")
+    for star in (False, True):
+        light = 200 * torch.exp(-(x**2 + y**2) / 30).double() if star else torch.full(GRID.shape, 50.0).double()
+        ratios, bounds = [], []
+        for seed in range(16):
+            generator = torch.Generator().manual_seed(seed)
+            frames = torch.poisson(light.expand(2, -1, -1), generator=generator)
+            valid = torch.rand(2, *GRID.shape, generator=generator) >= share
+            if kind == "round":
+                valid = (torch.hypot(x, y) < 16).expand(2, -1, -1)
+            seen, missing = frames[valid], int((~valid).sum())
+            ratios.append(noise_variance(frames, GRID, PUPIL, valid) / float(seen.mean()))
+            bounds.append(math.log(least_by_chance(seen, float(seen.mean()), n_powers, missing)))
+        scatter = float(torch.tensor(ratios).log().square().mean().sqrt())
+        assert scatter < -sum(bounds) / len(bounds) / 3, (star, scatter)  # of four standard errors, one for the 16
 
 
 def test_errors_that_were_measured_tell_the_variance_of_valid_pixels():

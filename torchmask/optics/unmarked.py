@@ -16,6 +16,7 @@ from torchmask.optics.ceilings import find_ceilings
 from torchmask.optics.dead import find_dead
 from torchmask.optics.saturation import find_saturated
 from torchmask.optics.spikes import find_spikes
+from torchmask.optics.steady import find_steady
 
 
 def leave_out_unmarked(
@@ -29,6 +30,7 @@ def leave_out_unmarked(
     kinds = (
         (find_saturated, _what_is_cut_off),
         (find_ceilings, _what_has_ceilings),
+        (find_steady, _what_never_varies),
         (find_dead, _what_is_dead),
         (partial(find_spikes, grid=grid, aperture=aperture), _what_stands_out),
     )
@@ -62,6 +64,14 @@ def _what_has_ceilings(frames: Tensor, cut_off: Tensor, share: str) -> str:
         f"{int(cut_off.sum())} pixels ({share}) in {int(cut_off.any(2).any(1).sum())} of {len(frames)} frames hold "
         f"{float(frames[cut_off].min()):.4g} or more, and pixels that reach so much come back to their own largest "
         "value again and again, so the camera seems to have cut them off before they were calibrated"
+    )
+
+
+def _what_never_varies(frames: Tensor, cut_off: Tensor, share: str) -> str:
+    return (
+        f"{int(cut_off.sum())} pixels ({share}) in {int(cut_off.any(2).any(1).sum())} of {len(frames)} frames hold "
+        f"{float(frames[cut_off].min()):.4g} or more, and the brightest of them hold one value each in all frames, so "
+        "the camera seems to have cut them off before they were calibrated"
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -14,10 +15,14 @@ from torchmask.grid import Grid
 from torchmask.io import as_tensor
 from torchmask.observation import number_frames
 from torchmask.optics.aperture import Aperture
+from torchmask.optics.fading import beyond_faded
 from torchmask.optics.noise import noise_variance
 
 _UNEVEN = 1.25  # times the least variance of a frame: below, one variance for all costs 1.3 % of the light at most
 _CLEARLY_MORE = 1.1  # times the expected variance, a few times the error of the estimate from one small frame
+_CLEARLY_LESS = 0.75  # times the expected variance: gains are known to 10 %, and neighbouring pixels share as much
+_SURE = 4.0  # standard errors that do not occur by chance
+_LEFT = 1 / 64  # of the powers beyond the cut-off that count, where many pixels are missing (measured)
 
 
 class FrameNoise(NamedTuple):
@@ -66,27 +71,55 @@ def expected_variance(
     It is that of `errors` if they are given, else that of photon and read-out noise if `readout_noise` is given, else
     measured by `noise_variance`. Noise clearly above that of photons and read-out comes from a sky that was subtracted
     or from a dark current; then the measured value is used. Raises ValueError if the noise is neither given nor
-    measurable. Warns if the given and the measured variance differ by more than a factor of 2.
+    measurable. Warns if the measured variance is more than twice the given one, or less than chance allows
+    (`least_by_chance`; half, if `errors` are given), and without `errors` also if it is less than that of photons.
     """
     measured = noise_variance(frames, grid, aperture, valid)
+    seen = frames if valid is None else frames[valid]
+    light = float(seen.mean())
     if errors is not None:
         variance = float((errors if valid is None else errors[valid]).square().mean())
         told = option = "errors"
     elif readout_noise is not None:
-        variance = float((frames if valid is None else frames[valid]).mean()) + readout_noise**2
+        variance = max(0.0, light) + readout_noise**2  # too much may have been subtracted
         told, option = "photon noise and readout_noise", "readout_noise"
     elif measured is not None and measured > 0:
-        return measured
+        variance, told, option = measured, "", ""
     else:
         raise ValueError("the noise cannot be measured beyond the cut-off frequency: give readout_noise or errors")
-    if measured is not None and not 0.5 < measured / variance < 2:
+    if measured is None:
+        return variance
+    n_powers = len(frames) * int(beyond_faded(grid, aperture, frames).sum())
+    n_missing = frames.numel() - seen.numel()
+    least = 0.5 if errors is not None else least_by_chance(seen, variance, n_powers, n_missing)
+    if errors is None and measured < light * least_by_chance(seen, light, n_powers, n_missing):
+        warnings.warn(
+            f"the noise of the frames is {measured**0.5:.3g} electrons rms, but photons alone give {light**0.5:.3g}: "
+            "the frames seem to be in ADU or normalised (multiply them by the gain), to hold a bias (subtract it), or "
+            "to be smoothed or means of several reads (give errors)",
+            stacklevel=5,
+        )
+    elif not least * variance <= measured <= 2 * variance:
         warnings.warn(
             f"the noise of the frames is {measured**0.5:.3g} electrons rms, but {told} give {variance**0.5:.3g}: check "
             f"the gain and {option}",
             stacklevel=5,
         )
-    more_than_light = errors is None and measured is not None and measured > _CLEARLY_MORE * variance
-    return measured if measured is not None and more_than_light else variance
+    return measured if errors is None and measured > _CLEARLY_MORE * variance else variance
+
+
+def least_by_chance(seen: Tensor, variance: float, n_powers: int, n_missing: int = 0) -> float:
+    """Return the part of the noise `variance` of valid pixels `seen` [electrons] that is the least to be measured.
+
+    The median of `n_powers` powers of noise beyond the cut-off, of which half are alike, has a relative standard error
+    of at most 2 over the root of their number. Where light is uneven, powers at neighbouring frequencies rise and fall
+    together, so that fewer of them count, by the mean square of the pixels' variances over the square of their mean.
+    Counts stand for the variances here: their own noise adds what chance changes in the number of photons. Each missing
+    pixel takes up to one power, and then the calibration on simulated noise has the same error again.
+    """
+    unevenness = 1 + float(seen.var(correction=0) / variance**2)
+    n_left = max(n_powers - n_missing, _LEFT * n_powers) / (2 if n_missing else 1)
+    return min(_CLEARLY_LESS, math.exp(-_SURE * 2 * math.sqrt(unevenness / n_left)))
 
 
 def check_errors(errors: Tensor | np.ndarray, frames: Tensor, valid: Tensor, numbers: Sequence[int] = ()) -> Tensor:
