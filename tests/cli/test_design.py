@@ -104,7 +104,7 @@ def criterion_of(module, n_frequencies, folder, monkeypatch):
     noise = {"readout_noise": 5.0, "n_pixels": 128}
     if module is not table:
         options = module.Options(n_photons=1e5, **noise)
-        return options.observation(n_frequencies, 1.5, 1 / 64, 0.15).criterion()
+        return options.observation(n_frequencies, 0.15).criterion()
     used = []
 
     def note(criterion, *_, **__):
@@ -192,7 +192,7 @@ def test_a_filter_tells_the_wavelength(tmp_path):
     options = Options(filter="bessell-V", criterion="turbulent", r0=0.1)
     assert options.observing_wavelength() == pytest.approx(550e-9, rel=0.02)
     assert Options(filter="bessell-V", wavelength=540e-9).observing_wavelength() == 540e-9
-    assert options.observation(32, 1.5, 1 / 64, 0.1).grid.wavelength == options.observing_wavelength()
+    assert options.observation(32, 0.1).grid.wavelength == options.observing_wavelength()
 
 
 def test_few_wavelengths_of_a_filter_are_warned_of():

@@ -96,8 +96,8 @@ def run(options: Options) -> None:
     require_diameter("mask_diameter", options.mask_diameter)
     require_wavelength("wavelength", options.wavelength, *THROUGH_AIR)
     zones = options.rules()
-    zones.require_on_pupil(options.mask_diameter)
     rules = zones.constraints()
+    zones.require_on_pupil(options.mask_diameter)
     observed = options.observation(options.n_frequencies, options.fill_factor)
     criterion = observed.criterion()
     if options.r0 is not None and observed.turbulence is None:
