@@ -302,6 +302,36 @@ def test_coefficients_must_fit_the_mask():
         module(np.zeros((3, 6)))
 
 
+@pytest.mark.parametrize("shape", ["disc", "hexagon"])
+def test_autocast_rounds_no_phase(shape):
+    mask = SparseAperture(torch.tensor([[0.0, 0.3], [0.3, -0.2], [-0.3, -0.2]]), 0.2, 1.0, shape)
+    grid = Grid.nyquist(1.0, WAVELENGTH, 32)
+    layer = ZernikePhase(mask, grid, 6)
+    coefficients = torch.randn(4, 3, 6, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    expected = layer(coefficients)
+    (slope,) = torch.autograd.grad((expected**2).sum(), coefficients)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        for one in (layer, ZernikePhase(mask, grid, 6)):
+            found = one(coefficients)
+            (again,) = torch.autograd.grad((found**2).sum(), coefficients)
+            assert found.dtype == one.basis.dtype == torch.float32
+            torch.testing.assert_close(found, expected, rtol=0, atol=1e-5)
+            torch.testing.assert_close(again, slope, rtol=0, atol=1e-6 * float(slope.norm()))
+    torch.testing.assert_close(one(coefficients), expected, rtol=0, atol=1e-5)  # also out of it
+
+
+def test_one_made_in_inference_mode_trains_later():
+    mask, grid = SparseAperture([[0.0, 0.3], [0.2, -0.2]], 0.3, 1.0), Grid.nyquist(1.0, WAVELENGTH, 32)
+    with torch.inference_mode():
+        layers = [
+            ZernikePhase(aperture, grid, 3) for aperture in (mask, SparseAperture(mask.centers.tolist(), 0.3, 1.0))
+        ]
+    for layer in layers:
+        coefficients = torch.ones(2, 3, dtype=torch.float64, requires_grad=True)
+        layer(coefficients).sum().backward()
+        assert float(coefficients.grad[:, 0].min()) > 1
+
+
 def test_a_thin_ring_has_few_modes():
     with pytest.raises(ValueError, match=r"66 modes are not independent .*0\.999"):
         aperture_modes(FullAperture(1.0, 0.999), torch.zeros(1, 2, dtype=torch.float64), 66)

@@ -10,9 +10,10 @@ from torchmask.grid import Grid
 from torchmask.memory import AtATime
 from torchmask.optics.aperture import FullAperture, SparseAperture
 from torchmask.optics.band import Band
+from torchmask.optics.pixel import SquarePixel
 from torchmask.optics.psf import psf_from_samples
 from torchmask.optics.zernike import ZernikePhase
-from torchmask.restoration.aberrations import AberrationBasis
+from torchmask.restoration.aberrations import AberrationBasis, plain_basis, turbulent_basis
 from torchmask.restoration.adjoint import curvature, data_fidelity
 from torchmask.restoration.forward import ExposureModel, Window, fast_size
 
@@ -43,6 +44,60 @@ def test_forward_is_a_convolution_seen_through_the_window(random_exposures):
         for column in range(GRID.shape[1]):
             expected[row, column] = (psf.roll((-row, -column), (0, 1)).flip(0, 1).roll((1, 1), (0, 1)) * image).sum()
     assert (model(image, z[:1])[0] - expected).abs().max() < 1e-13
+
+
+def slopes_of(model, dtype):
+    """The gradients of a model's frames in the object and the parameters of the phase."""
+    generator = torch.Generator().manual_seed(0)
+    image = torch.rand(model.window.field.shape, dtype=dtype, generator=generator).requires_grad_()
+    z = torch.randn(2, model.aberrations.n_parameters, dtype=dtype, generator=generator).requires_grad_()
+    return torch.autograd.grad((model(image, z) ** 2).sum(), (image, z))
+
+
+@pytest.mark.parametrize("shape", ["disc", "hexagon"])
+def test_autocast_rounds_no_frames_and_gradients(shape):
+    mask = SparseAperture(MASK.centers.float(), 0.36, 1.0, shape)
+    basis = turbulent_basis(mask, 3, 0, 0.2, 20.0).float()
+    model = ExposureModel(mask, FINE, basis)
+    z = torch.randn(2, basis.n_parameters, generator=torch.Generator().manual_seed(1))
+    image, precision = torch.rand(model.window.field.shape), torch.ones(1, 1, 1)
+    frames = torch.rand(2, *FINE.shape)
+
+    def results(model):
+        fit = data_fidelity(model, image, z, frames, precision, want_samples=True)
+        noise = torch.Generator().manual_seed(2)
+        return [
+            *slopes_of(model, torch.float32),
+            *fit,
+            curvature(model, image, z, precision, noise)[0],
+            basis.coefficients(z),
+        ]
+
+    expected = results(model)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        again = [results(model), results(ExposureModel(mask, FINE, basis))]
+    for found in again:
+        for one, other in zip(found, expected, strict=True):
+            assert one.dtype == other.dtype
+            assert float((one - other).norm()) < 1e-4 * float(other.norm())  # of bfloat16: 4e-3
+
+
+def test_one_made_in_inference_mode_trains_later():
+    band, pixel = Band.of(WAVELENGTHS, WEIGHTS), SquarePixel()
+    expected = slopes_of(ExposureModel(MASK, FINE, 3, band, pixel=pixel), torch.float64)
+    with torch.inference_mode():
+        models = [ExposureModel(MASK, FINE, 3, band, pixel=pixel)]
+        models.append(ExposureModel(MASK, FINE, plain_basis(MASK, 3), band, pixel=pixel))
+        moved = MASK.replace(MASK.centers + 0.1)
+        models.append(ExposureModel(moved, FINE, 3, band, pixel=pixel))
+        moved.centers.copy_(MASK.centers)
+        models[-1](torch.ones(models[-1].window.field.shape).double(), torch.zeros(2, 9).double())  # samples anew
+    for model in models:
+        for one, other in zip(slopes_of(model, torch.float64), expected, strict=True):
+            assert torch.equal(one, other)
+        basis = model.aberrations
+        z = torch.ones(2, 9, dtype=torch.float64, requires_grad=True)
+        assert torch.autograd.grad(basis.coefficients(z).sum(), z)[0].shape == z.shape
 
 
 def test_the_window_is_the_corner_of_a_wider_field():

@@ -16,6 +16,7 @@ from torchmask.grid import Grid
 from torchmask.numbers import whole_number
 from torchmask.optics.inputs import require_masks, require_tensor
 from torchmask.optics.pupil import Aperture, PupilSamples, can_be_read
+from torchmask.optics.unrounded import product, unrounded
 
 _INDEPENDENT = 1e-9  # smallest rms of the part of a mode that is orthogonal to the modes before it
 
@@ -90,7 +91,7 @@ def aperture_modes(aperture: Aperture, points: Tensor, n_modes: int) -> Tensor:
     if float(diagonal.abs().min()) < _INDEPENDENT:
         raise ValueError(f"{n_modes} modes are not independent on {shape!r}, which is too thin: lower n_modes")
     combine = torch.linalg.inv(triangle * diagonal.sign()[:, None])
-    return modes @ combine.to(modes)
+    return product(modes, combine.to(modes))
 
 
 def zernike_basis(samples: PupilSamples, aperture: Aperture, n_modes: int) -> Tensor:
@@ -148,9 +149,9 @@ class ZernikePhase(nn.Module):
         self.aperture: Aperture = aperture
         self.grid: Grid = grid
         self.oversampling: int = oversampling
-        with torch.no_grad():
+        with torch.inference_mode(False), torch.no_grad():  # it may train later, whatever mode it is made in
             self.register_buffer("basis", self._evaluate(), persistent=False)
-        self.register_buffer("basis_centers", aperture.centers.detach().clone(), persistent=False)
+            self.register_buffer("basis_centers", aperture.centers.detach().clone(), persistent=False)
 
     def _evaluate(self) -> Tensor:
         return zernike_basis(self.aperture.samples(self.grid, self.oversampling), self.aperture, self.n_modes)
@@ -174,4 +175,5 @@ class ZernikePhase(nn.Module):
         require_masks("coefficients", coefficients, basis.shape[:-3])
         if coefficients.ndim >= basis.ndim:
             basis = basis.unsqueeze(-4)
-        return torch.einsum("...npj,...nj->...np", basis, coefficients)
+        phase = torch.einsum("...npj,...nj->...np", *unrounded(basis, coefficients))
+        return phase.to(basis.dtype)

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torchmask.atmosphere.structure import coherence_distance
 from torchmask.atmosphere.von_karman import modal_covariance
 from torchmask.optics.aperture import Aperture
+from torchmask.optics.unrounded import product
 
 _STRENGTH_RANGE = (0.05, 20.0)  # limits of the turbulence's strength relative to its first guess, in (1/r0)^(5/3)
 _LEAST_ERROR = 1e-3  # rad
@@ -121,13 +122,13 @@ class AberrationBasis(nn.Module):
 
     def coefficients(self, z: Tensor) -> Tensor:
         """Return Zernike coefficients (..., N, J) [rad rms] of the parameters (..., K), in the middle of the frame."""
-        return (z @ self.mixing.to(z).T).unflatten(-1, (self.n_subapertures, self.n_modes))
+        return product(z, self.mixing.to(z).T).unflatten(-1, (self.n_subapertures, self.n_modes))
 
     def change(self, z: Tensor) -> Tensor | None:
         """Return the change (..., N, J) [rad rms] of the coefficients within a frame; None for snapshots."""
         if self.motion is None:
             return None
-        return (z @ self.motion.to(z).T).unflatten(-1, (self.n_subapertures, self.n_modes))
+        return product(z, self.motion.to(z).T).unflatten(-1, (self.n_subapertures, self.n_modes))
 
     def parameters_of_change(self, change: Tensor) -> Tensor:
         """Return the parameters (T, K) whose change is closest to (T, N, J) [rad rms]; all others are zero."""
@@ -278,8 +279,7 @@ def whitening(aperture: Aperture, n_modes: int, r0: float, outer_scale: float, d
     n_sub = aperture.n_subapertures
     common = torch.zeros(n_sub, n_modes, dtype=covariance.dtype, device=covariance.device)
     common[:, 0] = n_sub**-0.5
-    remove = torch.eye(n_sub * n_modes, dtype=covariance.dtype, device=covariance.device)
-    remove = remove - torch.outer(common.flatten(), common.flatten())
+    remove = torch.diag(torch.ones_like(common.flatten())) - torch.outer(common.flatten(), common.flatten())
     values, vectors = torch.linalg.eigh(remove @ covariance @ remove)
     return (vectors[:, 1:] * values[1:].clamp(min=0).sqrt()).flip(1).to(aperture.centers.device)
 

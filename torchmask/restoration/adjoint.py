@@ -11,6 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchmask.optics.unrounded import product, unrounded
 from torchmask.restoration.background import Background
 from torchmask.restoration.forward import ExposureModel, intensity
 from torchmask.restoration.parallel import Map
@@ -97,7 +98,7 @@ def data_fidelity(
         made = model.window.crop(torch.fft.irfft2(transfer * spectrum, s=shape))
         error = background.residual(frames[part] - made, weight)
         residual = error * -weight
-        value = -0.5 * torch.linalg.vecdot(residual.flatten(1), error.flatten(1)).double()
+        value = -0.5 * torch.linalg.vecdot(*unrounded(residual.flatten(1), error.flatten(1))).double()
         if not (want_object or want_aberrations):
             return value, None, None, None
         back = torch.fft.rfft2(residual, s=shape)
@@ -114,9 +115,9 @@ def data_fidelity(
     return DataFidelity(
         torch.cat(values),
         model.spectrum_adjoint(reduce(torch.add, by_object)).to(image.dtype) if want_object else None,
-        None if slope is None else (slope @ samples.basis).to(z.dtype),
+        None if slope is None else product(slope, samples.basis).to(z.dtype),
         reduce(torch.add, weights) if want_samples else None,
-        slope.T @ z.to(slope.dtype) if want_samples and slope is not None else None,
+        product(slope.T, z.to(slope.dtype)) if want_samples and slope is not None else None,
     )
 
 
@@ -169,7 +170,7 @@ def curvature(
         for _ in range(_PROBES):
             noise = torch.randn(weight.shape, dtype=weight.dtype, device="cpu", generator=generator).to(weight)
             back = torch.fft.irfft2(torch.fft.rfft2(noise * weight.sqrt(), s=shape) * conjugate, s=shape)
-            gradient = pull_back(samples, field, amplitude, back) @ samples.basis
+            gradient = product(pull_back(samples, field, amplitude, back), samples.basis)
             total += (gradient**2).sum(0).to(z.dtype) / _PROBES
         energy = (intensity(amplitude) ** 2).sum((1, 2))
         pixel += float((energy * weight.mean((1, 2))).sum())

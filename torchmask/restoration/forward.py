@@ -109,6 +109,7 @@ class ExposureModel(nn.Module):
 
     response: Tensor | None
 
+    @torch.inference_mode(False)  # it may train later, whatever mode it is made in
     def __init__(
         self,
         aperture: Aperture,

@@ -14,6 +14,7 @@ from torchmask.grid import Grid
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.band import Band
 from torchmask.optics.pupil import sample_holes
+from torchmask.optics.unrounded import product
 from torchmask.optics.zernike import zernike_basis
 from torchmask.restoration.aberrations import AberrationBasis
 
@@ -36,7 +37,7 @@ class OpenSamples(NamedTuple):
 
     def phase(self, z: Tensor) -> Tensor:
         """Return the phase (T, P) [rad] of the parameters z (T, K)."""
-        return z.to(self.basis.dtype) @ self.basis.T
+        return product(z.to(self.basis.dtype), self.basis.T)
 
     def field(self, phase: Tensor) -> Tensor:
         """Return the complex field (T, P) of a phase (T, P) [rad]."""
@@ -89,11 +90,11 @@ class SampledPupil(nn.Module):
         self.band: Band = band
         self.aberrations: AberrationBasis = aberrations
         kwargs = {"dtype": dtype or aperture.centers.dtype, "device": device}
-        with torch.no_grad():
+        with torch.inference_mode(False), torch.no_grad():  # it may train later, whatever mode it is made in
             for name, values in self._sample_where_it_lies()._asdict().items():
                 values = values.to(device) if name == "index" else values.to(**kwargs)
                 self.register_buffer(name, values, persistent=False)
-        self.register_buffer("centers", aperture.centers.detach().clone(), persistent=False)
+            self.register_buffer("centers", aperture.centers.detach().clone(), persistent=False)
         self.register_load_state_dict_post_hook(_forget)
 
     @property
@@ -108,10 +109,10 @@ class SampledPupil(nn.Module):
             self._require_sampling()
             return self.samples_at(centers)
         if not torch.equal(centers, self.centers):
-            with torch.no_grad():
+            with torch.inference_mode(False), torch.no_grad():
                 for name, values in self._sample_where_it_lies()._asdict().items():
                     setattr(self, name, values.to(self.index if name == "index" else self.basis))
-            self.centers = centers.detach().clone()
+                self.centers = centers.detach().clone()
         return OpenSamples(self.weights, self.index, self.basis, self.positions, self.chromaticity)
 
     def samples_at(self, centers: Tensor, *, with_closed: bool = False) -> OpenSamples:
@@ -154,7 +155,7 @@ class SampledPupil(nn.Module):
 
         mixing = self.aberrations.mixing_at(instant).to(modes).unflatten(0, (len(modes), self.aberrations.n_modes))
         ratio = self.grid.wavelength / wavelength
-        basis = ratio * torch.einsum("npj,njk->npk", modes, mixing)
+        basis = ratio * product(modes, mixing)  # (N, P, K)
         if self.aberrations.offsets is not None:
             basis = basis + self.aberrations.offsets.to(basis)[:, None]
         weights = kept(samples.weights)
