@@ -139,6 +139,31 @@ def test_a_mistake_is_one_line_and_nothing_is_written(write, tmp_path, capsys):
         assert not (tmp_path / "run").exists()
 
 
+def test_object_and_calibrator_may_be_in_one_file(write, tmp_path, capsys):
+    binary, star = write("binary.oifits", ((0, 0, 1), (-1.8, 1.2, 0.05)), 1), write("star.oifits", ((0, 0, 1),), 2)
+    with fits.open(binary) as one, fits.open(star) as other:
+        targets = fits.BinTableHDU(np.repeat(one["OI_TARGET"].data, 2), one["OI_TARGET"].header)
+        targets.data["TARGET_ID"], targets.data["TARGET"] = [1, 2], ["SCI", "CAL"]
+        kinds = ("OI_VIS2", "OI_T3", "OI_CORR")
+        for name in kinds:
+            other[name].header["CORRNAME"] = "CAL"
+        for name in kinds[:2]:
+            other[name].data["TARGET_ID"] = 2
+        hdus = [one[0], targets, one["OI_WAVELENGTH"], *(each[name] for each in (one, other) for name in kinds)]
+        fits.HDUList([hdu.copy() for hdu in hdus]).writeto(tmp_path / "both.fits")
+    both = tmp_path / "both.fits"
+    assert run(both, "--target", "SCI", "--star", both, "--out", tmp_path / "run") == 1
+    said = capsys.readouterr().err
+    assert "--star, --star-target: " in said
+    assert "holds several targets: say which of SCI, CAL is meant" in said
+    options = ("--target", "SCI", "--star", both, "--star-target", "CAL")
+    assert run(both, *options, "--out", tmp_path / "one") == 0
+    assert run(binary, "--star", star, "--out", tmp_path / "two") == 0
+    one, two = (json.loads((tmp_path / name / "companion.json").read_text()) for name in ("one", "two"))
+    assert one["companion"] == two["companion"]
+    assert one["detected"]
+
+
 def test_a_companion_of_negative_light_is_none(write, tmp_path, capsys):
     """|V|^2 are too large by 1.5 % where the calibrator has lost as much of its contrast."""
     single, star = write("single.oifits", ((0, 0, 1),), 2), write("star.oifits", ((0, 0, 1),), 3)

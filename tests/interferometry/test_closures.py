@@ -10,9 +10,10 @@ from hypothesis import strategies as st
 from torchmask.atmosphere.phase import TurbulencePhase
 from torchmask.grid import Grid
 from torchmask.interferometry.closures import closure_combinations
-from torchmask.interferometry.companion_map import fit_pair, map_companions
+from torchmask.interferometry.companion_map import map_companions
 from torchmask.interferometry.fringes import frame_observables
 from torchmask.interferometry.measurements import Measurements, join
+from torchmask.interferometry.pair_fit import fit_pair
 from torchmask.interferometry.pair_model import PairResiduals, square
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.detector import Detector

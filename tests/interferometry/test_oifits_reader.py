@@ -130,14 +130,15 @@ def interferometer(revision=1):
 
 
 @pytest.mark.parametrize("revision", [1, 2])
-def test_a_file_of_a_spectrograph_on_telescopes(revision, tmp_path, recwarn):
+def test_a_file_of_a_spectrograph_on_telescopes(revision, tmp_path):
     path = tmp_path / "pionier.fits"
     interferometer(revision).save(str(path))
     with pytest.raises(ValueError, match=r"several targets: say which of star, binary is meant"):
         load_oifits(path)
     with pytest.raises(ValueError, match=r"no target 'moon': it has star, binary"):
         load_oifits(path, "moon")
-    seen = load_oifits(path, "binary")
+    with pytest.warns(UserWarning, match="1 of 24 closure phases are left out"):
+        seen = load_oifits(path, "binary")
     # two times of six baselines and four triangles at three wavelengths, one flagged, one without error
     assert seen.vis2.shape == (2 * 6 * 3 - 1,)
     assert seen.closure_phases.shape == (2 * 4 * 3 - 1,)
@@ -150,11 +151,10 @@ def test_a_file_of_a_spectrograph_on_telescopes(revision, tmp_path, recwarn):
     # triangles 0-1-2, 0-1-3, 0-2-3, 1-2-3 of the first time and wavelength; no other shares a baseline with them
     correlation = seen.closure_correlation
     ours = [0, 2, 5, 8]
-    expected = torch.tensor([[3, 1, -1, 1], [1, 3, 1, -1], [-1, 1, 3, 1], [1, -1, 1, 3]], dtype=torch.float64) / 3
-    torch.testing.assert_close(correlation[ours][:, ours], expected)
+    torch.testing.assert_close(correlation[ours][:, ours], ONE_EXPOSURE)
     others = [n for n in range(len(correlation)) if n not in ours]
     assert not correlation[ours][:, others].any()
-    assert int((torch.linalg.eigvalsh(expected) > 1e-9).sum()) == 3
+    assert int((torch.linalg.eigvalsh(ONE_EXPOSURE) > 1e-9).sum()) == 3
 
 
 def test_values_without_a_positive_error_are_left_out(tmp_path, path, seen):
@@ -162,9 +162,55 @@ def test_values_without_a_positive_error_are_left_out(tmp_path, path, seen):
         hdus["OI_VIS2"].data["VIS2ERR"][:2] = [[0.0], [-0.01]]
         hdus["OI_T3"].data["T3PHIERR"][1] = 0.0
         hdus.writeto(tmp_path / "b.fits")
-    read = load_oifits(tmp_path / "b.fits")
+        hdus["OI_VIS2"].data["FLAG"][0] = True
+        hdus.writeto(tmp_path / "c.fits")
+    with pytest.warns(
+        UserWarning, match=r"b\.fits: 2 of 6 \|V\|\^2 and 1 of 4 closure phases are left out, as they"
+    ) as told:
+        read = load_oifits(tmp_path / "b.fits")
+    assert told[0].filename == __file__
+    with pytest.warns(UserWarning, match=r"c\.fits: 1 of 5 \|V\|\^2 and 1 of 4"):
+        load_oifits(tmp_path / "c.fits")
     torch.testing.assert_close(read.vis2, seen.vis2[2:], rtol=1e-12, atol=0)
     torch.testing.assert_close(read.closure_phases, seen.closure_phases[[0, 2, 3]], rtol=1e-12, atol=1e-15)
+
+
+def test_a_target_of_several_numbers_is_read_whole(tmp_path, path, seen):
+    """As of a star that was added again in each night; another target stays out."""
+    with fits.open(path) as hdus:
+        hdus["OI_VIS2"].data["TARGET_ID"] = [1, 1, 1, 2, 2, 3]
+        hdus["OI_T3"].data["TARGET_ID"] = [1, 2, 2, 3]
+        targets = hdus["OI_TARGET"]
+        three = fits.BinTableHDU(np.repeat(targets.data, 3), targets.header)
+        three.data["TARGET_ID"], three.data["TARGET"] = [1, 2, 3], ["star", "star", "moon"]
+        others = [hdu.copy() for hdu in hdus if hdu.name != "OI_TARGET"]
+        fits.HDUList([*others, three]).writeto(tmp_path / "b.fits")
+    read = load_oifits(tmp_path / "b.fits", "star")
+    torch.testing.assert_close(read.vis2, seen.vis2[:5], rtol=1e-12, atol=0)
+    assert len(read.closure_phases) == 3
+    assert len(load_oifits(tmp_path / "b.fits", "moon").vis2) == 1
+
+
+ONE_EXPOSURE = torch.tensor([[3, 1, -1, 1], [1, 3, 1, -1], [-1, 1, 3, 1], [1, -1, 1, 3]], dtype=torch.float64) / 3
+
+
+def test_exposures_of_one_day_are_told_apart_by_their_time(tmp_path, path):
+    """As in files of version 1 of the standard with the MJD of midnight."""
+    with fits.open(path) as hdus:
+        both = fits.BinTableHDU(hdus["OI_T3"].data[np.tile(np.arange(4), 2)], hdus["OI_T3"].header)
+        both.data["TIME"][4:] = 1800.0
+        kept = [hdu.copy() for hdu in hdus if hdu.name not in ("OI_CORR", "OI_T3")]
+        fits.HDUList([*kept, both]).writeto(tmp_path / "b.fits")
+    correlation = load_oifits(tmp_path / "b.fits").closure_correlation
+    torch.testing.assert_close(correlation, torch.block_diag(ONE_EXPOSURE, ONE_EXPOSURE))
+
+
+@pytest.mark.parametrize("unset", [0, -1])
+def test_triangles_without_stations_share_baselines_of_equal_coordinates(unset, tmp_path, path):
+    with fits.open(path) as hdus:
+        hdus["OI_T3"].data["STA_INDEX"] = unset
+        fits.HDUList([hdu.copy() for hdu in hdus if hdu.name != "OI_CORR"]).writeto(tmp_path / "b.fits")
+    torch.testing.assert_close(load_oifits(tmp_path / "b.fits").closure_correlation, ONE_EXPOSURE)
 
 
 def test_closure_phases_of_two_tables_are_independent_even_at_one_time(tmp_path, path):
@@ -173,8 +219,7 @@ def test_closure_phases_of_two_tables_are_independent_even_at_one_time(tmp_path,
         kept = [hdu.copy() for hdu in hdus if hdu.name != "OI_CORR"]
         fits.HDUList([*kept, hdus["OI_T3"].copy()]).writeto(tmp_path / "b.fits")
     correlation = load_oifits(tmp_path / "b.fits").closure_correlation
-    one = torch.tensor([[3, 1, -1, 1], [1, 3, 1, -1], [-1, 1, 3, 1], [1, -1, 1, 3]], dtype=torch.float64) / 3
-    torch.testing.assert_close(correlation, torch.block_diag(one, one))
+    torch.testing.assert_close(correlation, torch.block_diag(ONE_EXPOSURE, ONE_EXPOSURE))
 
 
 def test_what_is_no_oifits_is_refused(tmp_path, path):
@@ -207,7 +252,8 @@ def test_an_empty_table_and_places_that_are_not_finite_are_left_out(tmp_path, pa
         empty = fits.BinTableHDU(hdus["OI_T3"].data[:0], hdus["OI_T3"].header)
         kept = [hdu.copy() for hdu in hdus if hdu.name not in ("OI_T3", "OI_CORR")]
         fits.HDUList([*kept, empty]).writeto(tmp_path / "b.fits")
-    read = load_oifits(tmp_path / "b.fits")
+    with pytest.warns(UserWarning, match=r"1 of 6 \|V\|\^2 are left out"):
+        read = load_oifits(tmp_path / "b.fits")
     torch.testing.assert_close(read.vis2, seen.vis2[[0, 1, 3, 4, 5]], rtol=1e-12, atol=0)
     assert len(read.closure_phases) == 0
 

@@ -43,6 +43,8 @@ class Options(RunOptions):
     must be calibrated already."""
     target: str | None = None
     """Name of the target, for files with several."""
+    star_target: str | None = None
+    """Name of the calibrator star, for files of --star with several targets."""
     closures_only: tyro.conf.FlagCreatePairsOff[bool] = False
     """Ignore the squared visibilities, since closure phases alone need no calibrated contrast."""
     least_arcsec: float | None = None
@@ -54,14 +56,14 @@ class Options(RunOptions):
 def run(options: Options) -> int:
     """Read the files, search, and write and print the results; return the exit status."""
     measured = read_measurements(options)
-    bounds = [None if value is None else value * ARCSEC for value in (options.least_arcsec, options.most_arcsec)]
+    least, most = (None if value is None else value * ARCSEC for value in (options.least_arcsec, options.most_arcsec))
     try:
-        offsets = raster(measured, *bounds)
+        offsets = raster(measured, least, most)
     except ValueError as error:
         raise ValueError(f"--least-arcsec, --most-arcsec: {error}") from error
     with new_run("companion", options) as output:
         found = map_companions(measured, offsets)
-        fit = fit_pair(measured, found.best, *bounds)
+        fit = fit_pair(measured, found.best, least, most)
         limits = pair_limits(measured, fit, offsets, measured.finest)
         sides = len(measured.closure_phases) > 0
         numbers = {
@@ -99,7 +101,7 @@ def read_measurements(options: Options) -> Measurements:
             f"--star names {len(options.star)} files for {len(options.files)} of the object: give one for each, or one "
             "for all"
         )
-    stars = [load_oifits(path) for path in options.star]
+    stars = [read_star(path, options.star_target) for path in options.star]
     parts = []
     for number, path in enumerate(options.files):
         seen = load_oifits(path, options.target)
@@ -113,6 +115,14 @@ def read_measurements(options: Options) -> Measurements:
     if options.closures_only and not any(len(part.closure_phases) for part in parts):
         raise ValueError("--closures-only: the files have no closure phases")
     return join(parts)
+
+
+def read_star(path: Path, target: str | None) -> Measurements:
+    """Read a file of the calibrator star. Raises ValueError, which names the option."""
+    try:
+        return load_oifits(path, target)
+    except ValueError as error:
+        raise ValueError(f"--star, --star-target: {error}") from error
 
 
 def describe(fit: PairFit) -> dict[str, Any]:

@@ -26,7 +26,7 @@ def closure_combinations(measured: Measurements) -> Tensor:
     parts = []
     for number in range(group.max() + 1):
         mine = torch.as_tensor(group == number).nonzero().flatten()
-        vectors, values, _ = torch.linalg.svd(_incidence(measured.triangle_frequencies[mine]), full_matrices=False)
+        vectors, values, _ = torch.linalg.svd(incidence(measured.triangle_frequencies[mine]), full_matrices=False)
         own = vectors[:, values > _RANK * values[0]]
         part = own.new_zeros(n, own.shape[1])
         part[mine] = own
@@ -34,7 +34,7 @@ def closure_combinations(measured: Measurements) -> Tensor:
     return torch.cat(parts, 1)
 
 
-def _incidence(sides: Tensor) -> Tensor:
+def incidence(sides: Tensor) -> Tensor:
     """Return by which sign (C, B) the phase of each of B baselines enters closure phases, from `sides` (C, 3, 2)."""
     every = sides.flatten(0, 1)
     lengths = torch.linalg.vector_norm(every, dim=1)

@@ -109,14 +109,16 @@ class FringeModel:
         points = FringeModel(self.aperture, self.grid)  # the blur by pixels does not move light
         place = self._likeliest(light, counted)
         for _ in range(_PLACES):
-            columns = points.columns(*place)
-            normal, seen = (columns * counted.flatten()) @ columns.T, columns @ light.flatten()
-            values = torch.linalg.lstsq(normal, seen[:, None], driver="gelsd").solution[1:, 0]
-            fringes = counted * (values @ columns[1:]).view_as(counted)
-            before, place = place, self._likeliest(light - fringes, counted)
+            before, place = place, points.place_beside_fringes(light, counted, points.columns(*place))
             if math.dist(before, place) < _SETTLED:
                 break
         return place
+
+    def place_beside_fringes(self, light: Tensor, counted: Tensor, columns: Tensor) -> tuple[float, float]:
+        """Return the place (x, y) of `light` (H, W), a sum over `counted` frames, without the fringes in `columns`."""
+        normal, seen = (columns * counted.flatten()) @ columns.T, columns @ light.flatten()
+        values = torch.linalg.lstsq(normal, seen[:, None], driver="gelsd").solution[1:, 0]
+        return self._likeliest(light - counted * (values @ columns[1:]).view_as(counted), counted)
 
     def _likeliest(self, light: Tensor, counted: Tensor) -> tuple[float, float]:
         """Return the place (x, y) where the envelope explains most of `light` (H, W), a sum over `counted` frames.
@@ -147,8 +149,7 @@ class FringeModel:
         """
         height, width = self.grid.shape
         ramp = -2 * math.pi * (self._nu_x * (x + width // 2) + self._nu_y * (y + height // 2))
-        spectrum = self._transfer * phasor(ramp)
-        envelope = torch.fft.ifft2(spectrum).real
+        envelope = torch.fft.ifft2(self._transfer * phasor(ramp)).real
         waves = fringe_waves(self.aperture, self.grid, self.pairs)
         if self._seen is None:
             light, fringes = envelope[:height, :width].flatten(), waves * envelope[:height, :width].flatten()
@@ -179,30 +180,34 @@ class FringeModel:
         return torch.fft.ifft2(torch.fft.fft2(wide) * self._seen)[:height, :width].flatten()
 
 
-def fit_fringes(frames: Tensor, valid: Tensor, noise: PixelNoise, model: FringeModel) -> FringeFit:
-    """Fit fringes by weighted least squares to the valid pixels of each of `frames` (T, H, W).
+def fit_fringes(frames: Tensor, valid: Tensor, noise: PixelNoise, model: FringeModel, places: Tensor) -> FringeFit:
+    """Fit fringes by weighted least squares to the valid pixels of each of `frames` (T, H, W), around `places` (T, 2).
 
-    All frames share the centre of their mean, as the centre of a single faint frame would follow its noise. Weights are
-    one over the variance of the mean frame, blurred by one hole: weights correlated with the noise of a pixel would
-    favour low values and bias the fit.
+    Weights are one over the variance of the mean frame, blurred by one hole: weights correlated with the noise of a
+    pixel would favour low values and bias the fit.
 
     Raises ValueError if two baselines are too similar to be separated, or a valid pixel has no error that can be.
     """
     noise = replace(noise, variance=_variance_of_valid(noise, valid))
-    columns = model.columns(*model.centre(frames, valid))
-    weights = _weights(noise.variance, valid, model)
-    values = frames.new_empty(len(frames), len(columns))
-    covariance = frames.new_empty(len(frames), len(columns), len(columns))
+    weights, size = _weights(noise.variance, valid, model), 1 + 2 * len(model.pairs)
+    values, covariance = frames.new_empty(len(frames), size), frames.new_empty(len(frames), size, size)
     cubes = torch.empty(len(frames), 1 + len(model.triangles), dtype=torch.complex128)
-    same, group = torch.unique(valid.flatten(1), dim=0, return_inverse=True)
-    for number, good in enumerate(same):
-        chosen = (group == number).nonzero().flatten()
-        estimator = _estimator(columns, weights * good, model)
-        values[chosen] = frames[chosen].flatten(1) @ estimator.T
-        for frame in chosen.tolist():
-            covariance[frame] = (estimator * noise.variance[frame].flatten()) @ estimator.T
-        cubes[chosen] = _cubes(estimator, noise.third[chosen].flatten(1), model)
+    for place, around in _alike(places):
+        columns = model.columns(*place.tolist())
+        for good, among in _alike(valid[around].flatten(1)):
+            chosen = around[among]
+            estimator = _estimator(columns, weights * good, model)
+            values[chosen] = frames[chosen].flatten(1) @ estimator.T
+            for frame in chosen.tolist():
+                covariance[frame] = (estimator * noise.variance[frame].flatten()) @ estimator.T
+            cubes[chosen] = _cubes(estimator, noise.third[chosen].flatten(1), model)
     return FringeFit(values, covariance, cubes)
+
+
+def _alike(rows: Tensor) -> list[tuple[Tensor, Tensor]]:
+    """Return each distinct one of `rows` (T, ...) and the numbers of those that equal it."""
+    same, group = torch.unique(rows, dim=0, return_inverse=True)
+    return [(row, (group == number).nonzero().flatten()) for number, row in enumerate(same)]
 
 
 def as_complex(parts: Tensor) -> Tensor:

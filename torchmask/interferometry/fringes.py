@@ -12,6 +12,7 @@ from torchmask.interferometry.fringe_fit import (
     complex_covariances,
     fit_fringes,
 )
+from torchmask.interferometry.fringe_places import find_places
 from torchmask.interferometry.observables import Observables
 from torchmask.interferometry.visibilities import sky_stations, triangle_sides
 from torchmask.interferometry.which_mask import look_at_mask
@@ -58,13 +59,14 @@ def frame_observables(observation: Observation) -> Observables:
     Notes
     -----
     Saturated and dead pixels get no weight, nor do cosmic rays and hot pixels that stand out beyond the cut-off, and
-    warnings tell of them (`find_saturated`, `find_ceilings`, `find_dead`, `find_spikes`). Others tell of frames that
-    repeat earlier ones, and of fringes that are not those of the mask (`look_at_mask`).
+    warnings tell of them (`find_saturated`, `find_ceilings`, `find_steady`, `find_dead`, `find_spikes`). Others tell of
+    frames that repeat earlier ones, of faint ones that drift, and of fringes that are not those of the mask
+    (`look_at_mask`).
     The variances of light and fringes are subtracted from their squares, and the mean contribution of the pixels' noise
     from triple products (Wirnitzer 1985, J. Opt. Soc. Am. A 2, 14, for photon noise), so that means are unbiased even
-    for few photons. All frames share the centre of their mean. Light at an angle s from it is attenuated by the overlap
-    of a hole's diffraction pattern with itself shifted by s, so a companion must be well within
-    wavelength / (hole diameter).
+    for few photons. Frames are fitted around the light of their mean, or each around its own where that moves more than
+    noise does (`find_places`). Light at an angle s from it is attenuated by the overlap of a hole's diffraction pattern
+    with itself shifted by s, so a companion must be well within wavelength / (hole diameter).
 
     Examples
     --------
@@ -85,7 +87,8 @@ def frame_observables(observation: Observation) -> Observables:
     frames, valid = leave_out_unmarked(frames, valid, grid, aperture, stacklevel=2)
     warn_of_copies(frames, stacklevel=2)
     look_at_mask(frames, aperture, grid, valid=valid).warn(stacklevel=2)
-    fit = fit_fringes(frames, valid, _pixel_noise(observation, frames, valid), model)
+    noise = _pixel_noise(observation, frames, valid)
+    fit = fit_fringes(frames, valid, noise, model, find_places(frames, valid, noise, model, stacklevel=2))
     n = aperture.n_subapertures
     values, noise = fit.fringes * n, fit.fringe_noise * n**2
     visibilities, visibility_errors = _ratio(values, fit.light, noise / 2)

@@ -13,7 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchmask.interferometry.closures import incidence
+
 Triplets = tuple[np.ndarray, np.ndarray, np.ndarray]  # IINDX, JINDX and CORR
+_SHARED_SIDE = 1 / 3  # correlation of two closure phases that share a baseline, if all baselines are as noisy
 _NO_INDEX = 0  # for a row whose data are not in the matrix
 
 
@@ -61,3 +64,44 @@ def correlation_of(names: np.ndarray, places: np.ndarray, triplets: Mapping[str,
         matrix[a, b] = matrix[b, a] = torch.as_tensor(values[both])
         correlated = correlated or bool(both.any())
     return matrix if correlated else None
+
+
+def shared_sides(stations: np.ndarray, triangles: Tensor, exposure: np.ndarray) -> Tensor | None:
+    """Return the correlation (C, C) of closure phases with equally noisy baselines; None if no baseline is shared.
+
+    Parameters
+    ----------
+    stations : (C, 3) array
+        Stations of each triangle; where they are not three, baselines are told by their coordinates.
+    triangles : (C, 2, 2) tensor
+        First and second baseline of each triangle [m].
+    exposure : (C, L) array
+        Numbers that differ between exposures, which share no noise.
+    """
+    matrix = np.eye(len(stations))
+    _, group = np.unique(exposure, axis=0, return_inverse=True)
+    for number in range(group.max(initial=-1) + 1):
+        mine = np.flatnonzero(group.ravel() == number)
+        if all(len(set(triangle)) == len(triangle) for triangle in stations[mine].tolist()):
+            signs = _signs(stations[mine])
+        else:
+            first, second = triangles[mine].unbind(1)
+            signs = incidence(torch.stack([first, second, -first - second], 1)).numpy()
+        matrix[np.ix_(mine, mine)] = _SHARED_SIDE * signs @ signs.T
+    return None if (matrix == np.diag(matrix.diagonal())).all() else torch.as_tensor(matrix)
+
+
+def _signs(stations: np.ndarray) -> np.ndarray:
+    """Return by which sign (C, B) each of B baselines enters the closure phases of triangles of `stations` (C, 3)."""
+    names = sorted({frozenset(pair) for triangle in stations for pair in _pairs(triangle)}, key=sorted)
+    column = {name: index for index, name in enumerate(names)}
+    signs = np.zeros((len(stations), len(names)))
+    for row, triangle in enumerate(stations):
+        for first, second in _pairs(triangle):
+            signs[row, column[frozenset((first, second))]] = 1 if first < second else -1
+    return signs
+
+
+def _pairs(triangle: np.ndarray) -> list[tuple[int, int]]:
+    i, j, k = triangle.tolist()
+    return [(i, j), (j, k), (k, i)]

@@ -15,11 +15,11 @@ import torch
 from torch import Tensor
 
 from torchmask.interferometry.measurements import Measurements
-from torchmask.interferometry.oifits_correlations import correlation_of, read_correlations
+from torchmask.interferometry.oifits_correlations import correlation_of, read_correlations, shared_sides
 from torchmask.io import extra
 from torchmask.numbers import require_wavelength
 
-_SHARED_SIDE = 1 / 3  # correlation of two closure phases that share a baseline, if all baselines are as noisy
+_SIDES = ("U1COORD", "V1COORD", "U2COORD", "V2COORD")
 _LONGEST = 1e4  # [m], beyond any interferometer of light, and below baselines that were divided by its wavelength
 
 
@@ -29,9 +29,10 @@ class _Rows:
 
     columns : (M, ...) values
     stations : (M, 2 or 3) stations of the baseline or triangle, -1 where unknown
-    exposure : (M, 3) number of its table, time and wavelength
+    exposure : (M, 3) number of its table, exposure and wavelength
     corrname : (M,) name of the number's matrix of correlations
     place : (M,) index in that matrix, 0 if it is in none
+    unusable : number of those that are left out though no flag says so
     """
 
     columns: dict[str, np.ndarray]
@@ -40,6 +41,7 @@ class _Rows:
     exposure: np.ndarray
     corrname: np.ndarray
     place: np.ndarray
+    unusable: int
 
 
 def load_oifits(path: str | Path, target: str | None = None) -> Measurements:
@@ -68,6 +70,11 @@ def load_oifits(path: str | Path, target: str | None = None) -> Measurements:
         If the file is missing, cut off or is not OIFITS, a table lacks a column or its OI_WAVELENGTH or has not as many
         values as that, wavelengths or baselines are in another unit than m, phases in rad, the target is not in the
         file or not named although there are several, or no valid measurement is left.
+
+    Warns
+    -----
+    UserWarning
+        If measurements that are not flagged are left out.
 
     Examples
     --------
@@ -106,7 +113,7 @@ def load_oifits(path: str | Path, target: str | None = None) -> Measurements:
 
 
 def _read(path: Path, hdus: Any, target: str | None) -> Measurements:
-    chosen = _target_number(path, hdus, target)
+    chosen = _target_numbers(path, hdus, target)
     waves = {
         str(hdu.header["INSNAME"]).strip(): np.asarray(hdu.data["EFF_WAVE"], dtype=float).ravel()
         for hdu in hdus
@@ -114,26 +121,29 @@ def _read(path: Path, hdus: Any, target: str | None) -> Measurements:
     }
     triplets = read_correlations(hdus)
     vis2 = _gather(path, hdus, "OI_VIS2", ("VIS2DATA", "VIS2ERR"), ("UCOORD", "VCOORD"), chosen, waves)
-    sides = ("U1COORD", "V1COORD", "U2COORD", "V2COORD")
-    t3 = _gather(path, hdus, "OI_T3", ("T3PHI", "T3PHIERR"), sides, chosen, waves)
+    t3 = _gather(path, hdus, "OI_T3", ("T3PHI", "T3PHIERR"), _SIDES, chosen, waves)
     if not len(vis2.wavelength) and not len(t3.wavelength):
         raise ValueError(
             f"{path} has no squared visibility and no closure phase that is finite and not flagged: give an OIFITS "
             "file with OI_VIS2 or OI_T3 tables, such as `torchmask restore --oifits` writes"
         )
     _check_units(path, vis2, t3)
+    _warn_of_unusable(path, vis2, t3)
+    triangles = _tensor(t3, *_SIDES).view(-1, 2, 2)
     closure_correlation = correlation_of(t3.corrname, t3.place, triplets)
+    if closure_correlation is None:
+        closure_correlation = shared_sides(t3.stations, triangles, t3.exposure)
     return Measurements(
         baselines=_tensor(vis2, "UCOORD", "VCOORD"),
         wavelengths=torch.as_tensor(vis2.wavelength),
         vis2=torch.as_tensor(vis2.columns["VIS2DATA"]),
         vis2_errors=torch.as_tensor(vis2.columns["VIS2ERR"]),
         vis2_correlation=correlation_of(vis2.corrname, vis2.place, triplets),
-        triangles=_tensor(t3, *sides).view(-1, 2, 2),
+        triangles=triangles,
         triangle_wavelengths=torch.as_tensor(t3.wavelength),
         closure_phases=torch.as_tensor(t3.columns["T3PHI"]).deg2rad(),
         closure_errors=torch.as_tensor(t3.columns["T3PHIERR"]).deg2rad(),
-        closure_correlation=_shared_sides(t3) if closure_correlation is None else closure_correlation,
+        closure_correlation=closure_correlation,
     )
 
 
@@ -147,17 +157,34 @@ def _check_units(path: Path, *kinds: _Rows) -> None:
                 raise ValueError(f"{path}: {name} reaches {longest:.4g}: it must be in m, not divided by wavelength")
 
 
-def _target_number(path: Path, hdus: Any, target: str | None) -> int | None:
-    """Return the TARGET_ID of the target; None if the file names none."""
-    tables = [hdu.data for hdu in hdus if hdu.name == "OI_TARGET"]
-    names = {str(row["TARGET"]).strip(): int(row["TARGET_ID"]) for table in tables for row in table}
-    if target is not None:
-        if target not in names:
-            raise ValueError(f"{path} has no target {target!r}: it has {', '.join(names) or 'none with a name'}")
-        return names[target]
-    if len(names) > 1:
+def _warn_of_unusable(path: Path, vis2: _Rows, t3: _Rows) -> None:
+    kinds = {"|V|^2": vis2, "closure phases": t3}
+    told = [
+        f"{rows.unusable} of {rows.unusable + len(rows.wavelength)} {name}"
+        for name, rows in kinds.items()
+        if rows.unusable
+    ]
+    if told:
+        warnings.warn(
+            f"{path}: {' and '.join(told)} are left out, as they are not finite or have no positive error",
+            stacklevel=4,
+        )
+
+
+def _target_numbers(path: Path, hdus: Any, target: str | None) -> list[int] | None:
+    """Return every TARGET_ID of the target; None if the file names none."""
+    rows = [
+        (str(row["TARGET"]).strip(), int(row["TARGET_ID"]))
+        for hdu in hdus
+        if hdu.name == "OI_TARGET"
+        for row in hdu.data
+    ]
+    names = list(dict.fromkeys(name for name, _ in rows))
+    if target is not None and target not in names:
+        raise ValueError(f"{path} has no target {target!r}: it has {', '.join(names) or 'none with a name'}")
+    if target is None and len(names) > 1:
         raise ValueError(f"{path} holds several targets: say which of {', '.join(names)} is meant")
-    return next(iter(names.values()), None)
+    return [number for name, number in rows if target in (None, name)] or None
 
 
 def _gather(
@@ -166,7 +193,7 @@ def _gather(
     kind: str,
     measured: tuple[str, str],
     places: tuple[str, ...],
-    target: int | None,
+    target: list[int] | None,
     waves: dict[str, np.ndarray],
 ) -> _Rows:
     """Read all valid numbers of the tables of a kind; `measured` names the columns of values and errors."""
@@ -192,18 +219,19 @@ def _gather(
         none = np.zeros(0)
         columns = dict.fromkeys((*measured, *places), none)
         nowhere = np.zeros((0, 3), dtype=int)
-        return _Rows(columns, none, nowhere, nowhere, none.astype(str), none.astype(int))
+        return _Rows(columns, none, nowhere, nowhere, none.astype(str), none.astype(int), 0)
     return _Rows(
         {name: np.concatenate([part.columns[name] for part in parts]) for name in parts[0].columns},
         *(
             np.concatenate([getattr(part, name) for part in parts])
             for name in ("wavelength", "stations", "exposure", "corrname", "place")
         ),
+        unusable=sum(part.unusable for part in parts),
     )
 
 
 def _good_rows(
-    hdu: Any, table: int, measured: tuple[str, str], places: tuple[str, ...], target: int | None, wave: np.ndarray
+    hdu: Any, table: int, measured: tuple[str, str], places: tuple[str, ...], target: list[int] | None, wave: np.ndarray
 ) -> _Rows:
     data, n = hdu.data, len(wave)
     shape = (len(data), n)
@@ -211,9 +239,11 @@ def _good_rows(
     good = np.isfinite(values) & np.isfinite(errors) & (errors > 0) & np.isfinite(wave)
     for name in places:
         good &= np.isfinite(np.asarray(data[name], dtype=float)).reshape(-1, 1)
-    good &= ~np.asarray(data["FLAG"], dtype=bool).reshape(shape)
+    meant = ~np.asarray(data["FLAG"], dtype=bool).reshape(shape)
     if target is not None:
-        good &= np.asarray(data["TARGET_ID"]).reshape(-1, 1) == target
+        meant &= np.isin(np.asarray(data["TARGET_ID"]).reshape(-1, 1), target)
+    unusable = int((meant & ~good).sum())
+    good &= meant
 
     def spread(column: Any) -> np.ndarray:
         """Return a column's value of the row of each valid number."""
@@ -222,7 +252,8 @@ def _good_rows(
     columns = {measured[0]: values[good], measured[1]: errors[good]}
     columns |= {name: spread(np.asarray(data[name], dtype=float)) for name in places}
     channels = np.broadcast_to(np.arange(n), shape)
-    _, times = np.unique(np.asarray(data["MJD"], dtype=float), return_inverse=True)
+    clocks = [np.asarray(data[name], dtype=float) for name in ("MJD", "TIME") if name in hdu.columns.names]
+    _, times = np.unique(np.stack(clocks, 1), axis=0, return_inverse=True)
     exposure = np.stack([np.full(good.sum(), table), spread(times), channels[good]], 1)
     holes = np.asarray(data["STA_INDEX"], dtype=int).reshape(len(data), -1)
     stations = np.broadcast_to(holes[:, None], (*shape, holes.shape[1]))[good]
@@ -230,28 +261,7 @@ def _good_rows(
     first = np.asarray(data[index]).reshape(-1, 1) if index in hdu.columns.names else np.zeros((len(data), 1), int)
     place = np.where(first > 0, first + channels, 0)[good].astype(int)
     corrname = np.full(good.sum(), str(hdu.header.get("CORRNAME", "")).strip())
-    return _Rows(columns, np.broadcast_to(wave, shape)[good], stations, exposure, corrname, place)
-
-
-def _shared_sides(rows: _Rows) -> Tensor | None:
-    """Return the correlation (C, C) of closure phases with equally noisy baselines; None if no baseline is shared."""
-    matrix = np.eye(len(rows.wavelength))
-    _, group = np.unique(rows.exposure, axis=0, return_inverse=True)
-    for number in range(group.max(initial=-1) + 1):
-        mine = np.flatnonzero(group.ravel() == number)
-        names = sorted({frozenset(pair) for triangle in rows.stations[mine] for pair in _pairs(triangle)}, key=sorted)
-        column = {name: index for index, name in enumerate(names)}
-        signs = np.zeros((len(mine), len(names)))
-        for row, triangle in enumerate(rows.stations[mine]):
-            for first, second in _pairs(triangle):
-                signs[row, column[frozenset((first, second))]] = 1 if first < second else -1
-        matrix[np.ix_(mine, mine)] = _SHARED_SIDE * signs @ signs.T
-    return None if (matrix == np.diag(matrix.diagonal())).all() else torch.as_tensor(matrix)
-
-
-def _pairs(triangle: np.ndarray) -> list[tuple[int, int]]:
-    i, j, k = triangle.tolist()
-    return [(i, j), (j, k), (k, i)]
+    return _Rows(columns, np.broadcast_to(wave, shape)[good], stations, exposure, corrname, place, unusable)
 
 
 def _tensor(rows: _Rows, *names: str) -> Tensor:
