@@ -9,7 +9,7 @@ from torchmask.restoration.myopic import MyopicDeconvolution
 from torchmask.restoration.schedule import Schedule
 
 BRIEF = {"start_iterations": 20, "segment": 10, "sharp_after": 10, "escapes": 0, "starts": 1, "faint_starts": 1}
-BRIEF |= {"last_segments": 1, "last_settling": 5, "comparing": 3, "rounds": 2, "fine_rounds": 2, "moves": 2, "noisy": 0.0}
+BRIEF |= {"last_segments": 1, "last_settling": 5, "comparing": 3, "rounds": 2, "moves": 2, "noisy": 0.0}
 BRIGHT, FAINT = {"faint": 0.0}, {"faint": math.inf}
 
 

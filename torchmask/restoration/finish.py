@@ -5,11 +5,12 @@ model leaves unexplained. So once the search has ended, the aberrations gain mod
 (`ObjectPrior.choices`, `cross_validation`), and that descent goes on while it gains. Where noise leaves the aberrations
 of a mask uncertain, they are integrated out after it, or in its place if frames are faint, under a prior at the scale
 of the object; a faint search under a lighter prior descends under the given one before. Modes that are asked for beyond
-those of a faint search are fitted to the object that is found without them. Between segments of the last descent the phases of frames are retrieved that a mask's search has left in
-poor minima (`retrieval`). For a full pupil its segments begin with the object settled for the aberrations at hand: a
-joint descent is too slow at the frequencies that a full pupil hardly passes, in which most of the error in bright light
-would lie. The prior of a last descent is adapted to the object that is known by then; where an integration follows,
-only the prior of that is, unless the frames show gentle slopes. In faint frames none is.
+those of a faint search are fitted to the object that is found without them. Between segments of the last descent the
+phases of frames are retrieved that a mask's search has left in poor minima (`retrieval`). For a full pupil its segments
+begin with the object settled for the aberrations at hand: a joint descent is too slow at the frequencies that a full
+pupil hardly passes, in which most of the error in bright light would lie. The prior of a last descent is adapted to the
+object that is known by then; where an integration follows, only the prior of that is, unless the frames show gentle
+slopes. In faint frames none is.
 Where the aberrations are known, the object alone descends once more, under the prior of its whole family
 (`ObjectPrior.family`) that the frames choose.
 """
