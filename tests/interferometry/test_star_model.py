@@ -143,3 +143,29 @@ def test_the_scatter_of_frames_is_that_of_their_mean():
     information = Information(2 * ones, 2 * (numbers - numbers.mean())[:, None], ones, nothing)
     assert float(information.noise_covariance) == pytest.approx(1 / 10, rel=1e-12)
     assert float(information.covariance) == pytest.approx(float(numbers.var()) / 5, rel=1e-12)
+
+
+@pytest.mark.parametrize(("n", "size"), [(2, 8), (3, 8), (10, 4)])
+def test_errors_of_few_frames_are_those_of_all_their_parameters(n, size):
+    """Frames that differ by twice their noise: the mean square of pulls is that of F for all parameters and frames.
+
+    It is m / (m - 2) with m = size (n - 1); for each parameter by itself it is infinite for two or three frames.
+    """
+    generator, squares = torch.Generator().manual_seed(0), []
+    nothing = torch.zeros(size, size, dtype=torch.float64)
+    for _ in range(400):
+        numbers = 2 * torch.randn(n, size, generator=generator, dtype=torch.float64)
+        ones = torch.eye(size, dtype=torch.float64).expand(n, -1, -1)
+        covariance = Information(ones, numbers - numbers.mean(0), ones, nothing).covariance
+        squares.append(numbers.mean(0) ** 2 / covariance.diagonal())
+    m = size * (n - 1)
+    assert float(torch.stack(squares).mean()) == pytest.approx(m / (m - 2), rel=0.15)
+
+
+def test_scatter_below_the_noise_counts_by_the_number_of_frames():
+    """The noise has the weight of ten: four frames that agree have 10 / 14 of its variance."""
+    ones, nothing = torch.ones(4, 1, 1, dtype=torch.float64), torch.zeros(1, 1, dtype=torch.float64)
+    information = Information(ones, torch.zeros(4, 1, dtype=torch.float64), ones, nothing)
+    assert float(information.covariance) == pytest.approx(10 / 14 / 4, rel=1e-12)
+    single = Information(ones[:1], torch.zeros(1, 1, dtype=torch.float64), ones[:1], nothing)
+    assert float(single.covariance) == 1.0

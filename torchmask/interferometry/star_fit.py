@@ -15,6 +15,7 @@ _HALVINGS = 8  # maximum number of halvings of a step that makes the fit worse
 _DAMPING = (1e-3, 1e8)  # Levenberg-Marquardt damping: initial value, and value at which a frame's fit ends
 _LOOSE = (10.0, 3.0)  # [rad] prior rms of pistons and tilts, and of higher modes: loose, for what data do not constrain
 _EVEN = 1e-3  # prior rms of the mean log transmission, which is degenerate with the light of the frames
+_PRIOR = 10  # frames whose weight the noise has in covariances
 _LEAST_MEDIAN = 0.5  # of the mean light through a hole: a wide object is fitted best by the blob of one hole
 
 
@@ -54,9 +55,18 @@ class Information:
 
     @property
     def covariance(self) -> Tensor:
-        """Covariance (S, S) from the scatter between frames (sandwich estimate), or from noise for a single frame."""
+        """Covariance (S, S) from the scatter between frames (sandwich estimate), or from noise for a single frame.
+
+        The scatter of few frames is itself uncertain. So the noise enters as a prior with the weight of ten frames,
+        scaled by how much more than noise the scores of the frames differ from 0.
+        """
         bread, n = self.noise_covariance, len(self.scores)
-        return bread if n == 1 else bread @ (self.scores.T @ self.scores) @ bread * (n / (n - 1))
+        if n == 1:
+            return bread
+        scatter, noise = self.scores.T @ self.scores * (n / (n - 1)), self.matrices.sum(0)
+        inverses = torch.linalg.pinv(self.matrices, hermitian=True)
+        misfit = torch.einsum("ts,tsr,tr->", self.scores, inverses, self.scores) / (n - 1) / self.scores.shape[1]
+        return bread @ (_PRIOR * misfit.clamp(min=1) * noise + n * scatter) @ bread / (_PRIOR + n)
 
 
 def start_frame(
