@@ -10,7 +10,8 @@ from torchmask.cli.companion import summary
 from torchmask.cli.main import main
 from torchmask.grid import ARCSEC, MAS, Grid
 from torchmask.interferometry.companion_limits import DetectionLimits
-from torchmask.interferometry.disc_model import DiscFit, disc_visibilities
+from torchmask.interferometry.disc_model import DiscFit
+from torchmask.interferometry.disc_visibility import disc_visibilities
 from torchmask.interferometry.fringes import frame_observables
 from torchmask.interferometry.oifits import save_oifits
 from torchmask.interferometry.oifits_reader import load_oifits
@@ -164,6 +165,30 @@ def test_object_and_calibrator_may_be_in_one_file(write, tmp_path, capsys):
     assert one["detected"]
 
 
+def test_a_calibrator_of_known_diameter_takes_no_contrast_off(write, tmp_path, capsys):
+    """Its own |V|^2 are those of a disc of half the finest fringe; taken for a point, it brightens the object."""
+    single, star = write("single.oifits", ((0, 0, 1),), 1), write("star.oifits", ((0, 0, 1),), 2)
+    size = 0.5 * load_oifits(single).finest
+    with fits.open(star) as hdus:
+        rows = hdus["OI_VIS2"].data
+        baselines = torch.tensor(np.stack([rows["UCOORD"], rows["VCOORD"]], 1).astype(float))
+        rows["VIS2DATA"] *= disc_visibilities(baselines / GRID.wavelength, size)[:, None].numpy() ** 2
+        hdus.writeto(tmp_path / "disc.oifits")
+    known = ("--star", tmp_path / "disc.oifits", "--star-diameter-mas", size / MAS)
+    assert run(single, *known, "--star-diameter-error-mas", 0.01 * size / MAS, "--out", tmp_path / "known") == 0
+    found = json.loads((tmp_path / "known/companion.json").read_text())
+    assert found["verdict"] == "none"
+    assert run(single, *known[:2], "--out", tmp_path / "point") in (0, 3)
+    assert json.loads((tmp_path / "point/companion.json").read_text())["companion"]["contrast"] < 0
+    for options, message in (
+        (("--star-diameter-mas", 0.1), "--star-diameter-mas has 1 values for 0 files of --star"),
+        (("--star", star, "--star-diameter-error-mas", 1, 2), "--star-diameter-error-mas has 2 values for 1 files"),
+        (("--star", star, "--star-diameter-mas", 1e6), "shows no fringes on the longest baseline"),
+    ):
+        assert run(single, *options, "--out", tmp_path / "refused") == 1
+        assert message in capsys.readouterr().err
+
+
 def test_a_companion_of_negative_light_is_none(write, tmp_path, capsys):
     """|V|^2 are too large by 1.5 % where the calibrator has lost as much of its contrast."""
     single, star = write("single.oifits", ((0, 0, 1),), 2), write("star.oifits", ((0, 0, 1),), 3)
@@ -182,5 +207,8 @@ def test_where_fringes_repeat_no_limit_is_told():
     fit = PairFit(companion, covariance, 20.0, 400.0, DiscFit(1e-7, 1e-8, 200.0), 22, (5e-8, 1e-6))
     limits = DetectionLimits(np.array([0.1, 0.2]), np.array([0.01, np.inf]), np.array([0.001, np.inf]))
     near, far = summary(fit, limits, side_known=True)[-2:]
-    assert near == "  at 100 mas a companion of 0.01 +- 0.001 of the star's light would be found"
+    assert near == (
+        "  at 100 mas a companion of 0.01 +- 0.001 of the star's light would be found half of the time, one of 0.013 "
+        "in nine of ten"
+    )
     assert far.startswith("  at 200 mas a companion would not be found everywhere")

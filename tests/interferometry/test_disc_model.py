@@ -8,7 +8,8 @@ import pytest
 import torch
 from scipy.special import j1
 
-from torchmask.interferometry.disc_model import disc_residuals, disc_slope, disc_slopes, disc_visibilities, fit_disc
+from torchmask.interferometry.disc_model import disc_residuals, disc_slope, fit_disc
+from torchmask.interferometry.disc_visibility import disc_slopes, disc_visibilities
 from torchmask.interferometry.pair_model import PairResiduals
 
 SEEDS = 40

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from torchmask.grid import Grid
+from torchmask.interferometry.disc_visibility import disc_visibilities
 from torchmask.interferometry.fringes import frame_observables
 from torchmask.observation import Observation
 from torchmask.optics.aperture import SparseAperture
@@ -79,3 +80,22 @@ def test_a_star_of_another_mask_or_without_fringes_is_refused(expose_points):
     dark = replace(star, vis2=star.vis2 * torch.tensor([1, 1, -1, 1, 1, 1]))
     with pytest.raises(ValueError, match=r"no fringes of holes 0-3"):
         raw.calibrate(dark)
+
+
+def test_triple_amplitudes_and_visibilities_are_divided_by_those_of_a_known_disc_too(expose_points):
+    mask, grid = SparseAperture(CENTERS, 0.06, 1.0), Grid.nyquist(0.9, WAVELENGTH, 48, 1.1)
+    raw, star = (measured(expose_points(mask, grid, electrons=3e4, n_frames=3), mask, grid, seed) for seed in (0, 1))
+    size, error = 2e-7, 1e-8
+    point, known = raw.calibrate(star), raw.calibrate(star, size, error, WAVELENGTH)
+    disc = disc_visibilities(raw.baselines / WAVELENGTH, size)
+    number = {tuple(pair): index for index, pair in enumerate(raw.pairs.tolist())}
+    sides = [[number[pair] for pair in ((i, j), (j, k), (i, k))] for i, j, k in raw.triangles.tolist()]
+    torch.testing.assert_close(known.visibilities, point.visibilities * disc)
+    torch.testing.assert_close(known.triple_amplitudes, point.triple_amplitudes * disc[torch.tensor(sides)].prod(1))
+    step = 1e-4 * size
+    above, below = (raw.calibrate(star, size + sign * step, 0.0, WAVELENGTH) for sign in (1, -1))
+    by_size = (above.triple_amplitudes - below.triple_amplitudes) / (2 * step) * error
+    surplus = known.triple_covariance - raw.calibrate(star, size, 0.0, WAVELENGTH).triple_covariance
+    torch.testing.assert_close(surplus, by_size[:, None] * by_size, rtol=1e-5, atol=1e-12)
+    with pytest.raises(ValueError, match="diameter needs the wavelength"):
+        raw.calibrate(star, size)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchmask.interferometry.companion_map import map_companions, raster
-from torchmask.interferometry.disc_model import disc_visibilities
+from torchmask.interferometry.disc_visibility import disc_visibilities
 from torchmask.interferometry.pair_fit import RIVAL, fit_pair
 
 DIRECTION = torch.tensor([0.6, -0.8], dtype=torch.float64)

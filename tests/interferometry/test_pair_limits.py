@@ -8,8 +8,9 @@ import torch
 from torch.autograd.functional import jacobian
 
 from torchmask.grid import ARCSEC
+from torchmask.interferometry.companion_limits import MOSTLY
 from torchmask.interferometry.companion_map import map_companions, raster
-from torchmask.interferometry.disc_model import disc_visibilities
+from torchmask.interferometry.disc_visibility import disc_visibilities
 from torchmask.interferometry.pair_fit import fit_pair
 from torchmask.interferometry.pair_limits import contrast_errors, pair_limits
 from torchmask.interferometry.pair_model import PairResiduals, pair_visibilities
@@ -100,3 +101,19 @@ def test_limits_beside_a_resolved_star_are_about_those_of_a_point(measure_pair):
     ratio = limits_of(seen, raster(seen), star.finest).contrast / limits_of(star, raster(star), star.finest).contrast
     assert ratio.min() > 0.7
     assert ratio.max() < 2
+
+
+@pytest.mark.parametrize(("factor", "share"), [(1.0, 0.5), (MOSTLY, 0.9)])
+def test_a_companion_at_the_limit_is_found_half_of_the_time_and_a_brighter_one_mostly(factor, share, measure_pair):
+    """Searched for anew each time, at the separation of a limit in any direction."""
+    seen = measure_pair(seed=1000, rms=0.005)
+    limits = limits_of(seen, raster(seen), seen.finest)
+    found = []
+    for seed in range(SEEDS):
+        angle = torch.tensor(2 * math.pi * seed / SEEDS, dtype=torch.float64)
+        place = limits.separation[0] * ARCSEC * torch.stack([angle.cos(), angle.sin()])
+        truth = torch.cat([torch.tensor([factor * limits.contrast[0]], dtype=torch.float64), place])
+        one = measure_pair(truth, seed, rms=0.005)
+        found.append(fit_pair(one, map_companions(one).best).detected)
+    # the limit is that of a ring whose errors scatter, and the search takes the place where chance helps most
+    assert abs(sum(found) / SEEDS - share) < 4 * math.sqrt(share * (1 - share) / SEEDS)

@@ -17,7 +17,7 @@ from torchmask.cli.program import NOT_EXPLAINED
 from torchmask.cli.run import new_run
 from torchmask.grid import ARCSEC, MAS
 from torchmask.interferometry.companion_errors import MEASURED, polar, rotation_towards
-from torchmask.interferometry.companion_limits import SIGNIFICANCE, DetectionLimits
+from torchmask.interferometry.companion_limits import MOSTLY, SIGNIFICANCE, DetectionLimits
 from torchmask.interferometry.companion_map import map_companions, raster
 from torchmask.interferometry.measurements import Measurements, join
 from torchmask.interferometry.oifits_reader import load_oifits
@@ -39,12 +39,17 @@ class Options(RunOptions):
     files: tyro.conf.Positional[tuple[Path, ...]] = ()
     """OIFITS files of the star that may have a companion."""
     star: tuple[Path, ...] = ()
-    """OIFITS files of an unresolved calibrator star: one for each of the files, or one for all. Without it the files
+    """OIFITS files of a calibrator star: one for each of the files, or one for all. Without it the files
     must be calibrated already."""
     target: str | None = None
     """Name of the target, for files with several."""
     star_target: str | None = None
     """Name of the calibrator star, for files of --star with several targets."""
+    star_diameter_mas: tuple[float, ...] = ()
+    """Angular diameters of the calibrator stars, uniform discs [mas]: one for each file of --star, or one for all.
+    Without them they are points."""
+    star_diameter_error_mas: tuple[float, ...] = ()
+    """Rms errors of --star-diameter-mas [mas], as many."""
     closures_only: tyro.conf.FlagCreatePairsOff[bool] = False
     """Ignore the squared visibilities, since closure phases alone need no calibrated contrast."""
     least_arcsec: float | None = None
@@ -102,19 +107,30 @@ def read_measurements(options: Options) -> Measurements:
             "for all"
         )
     stars = [read_star(path, options.star_target) for path in options.star]
+    sizes = one_for_each("--star-diameter-mas", options.star_diameter_mas, len(stars))
+    errors = one_for_each("--star-diameter-error-mas", options.star_diameter_error_mas, len(stars))
     parts = []
     for number, path in enumerate(options.files):
         seen = load_oifits(path, options.target)
         if stars:
             star = number if len(stars) > 1 else 0
             try:
-                seen = seen.calibrate(stars[star])
+                seen = seen.calibrate(stars[star], MAS * sizes[star], MAS * errors[star])
             except ValueError as error:
                 raise ValueError(f"--star {options.star[star]} and {path}: {error}") from error
         parts.append(seen.closures_only() if options.closures_only else seen)
     if options.closures_only and not any(len(part.closure_phases) for part in parts):
         raise ValueError("--closures-only: the files have no closure phases")
     return join(parts)
+
+
+def one_for_each(option: str, values: tuple[float, ...], count: int) -> tuple[float, ...]:
+    """Return as many values as stars: those given, one for all, or zeros. Raises ValueError for another number."""
+    if len(values) not in (0, 1, count) or (values and not count):
+        raise ValueError(
+            f"{option} has {len(values)} values for {count} files of --star: give one for each, or one for all"
+        )
+    return values if len(values) == count else (values or (0.0,)) * count
 
 
 def read_star(path: Path, target: str | None) -> Measurements:
@@ -206,7 +222,10 @@ def limit_lines(limits: DetectionLimits) -> list[str]:
     """Return the faintest companion that would be found, at each separation."""
     lines = []
     for place, contrast, error in zip(limits.separation, limits.contrast, limits.errors, strict=True):
-        found = f"a companion of {contrast:.2g} +- {error:.1g} of the star's light would be found"
+        found = (
+            f"a companion of {contrast:.2g} +- {error:.1g} of the star's light would be found half of the time, one of "
+            f"{MOSTLY * contrast:.2g} in nine of ten"
+        )
         if contrast > 1:
             found = "a companion would not be found everywhere: at some places its fringes are those of the star alone"
         lines.append(f"  at {1000 * place:.4g} mas {found}")

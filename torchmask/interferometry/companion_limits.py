@@ -13,6 +13,9 @@ from torchmask.grid import ARCSEC
 from torchmask.record import Brief
 
 SIGNIFICANCE = 5.0  # in units of the scatter without a companion, above which a companion counts as detected
+MOSTLY = (
+    1 + 1.2816 / SIGNIFICANCE
+)  # times a limit: the contrast at which chance takes the significance below in a tenth
 _ANNULUS, _REACH = 0.1, 0.025  # [arcsec] width of an annulus, and margin around it in which scatter is measured
 
 
@@ -42,6 +45,8 @@ def search_offsets(step: float, least: float = 0.1, most: float = 0.7) -> Tensor
 @dataclass(frozen=True, eq=False, repr=False)
 class DetectionLimits(Brief):
     """Contrast of the faintest detectable companion in annuli around the star.
+
+    A companion as bright as the limit is found about half of the time, and one of `MOSTLY` times that in nine of ten.
 
     separation : (A,) middle of each annulus [arcsec]
     contrast : (A,) limiting flux over that of the star

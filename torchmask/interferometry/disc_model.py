@@ -1,8 +1,4 @@
-"""Visibility of a uniform disc, and the disc that fits measurements best: the rival of a companion.
-
-A disc of angular diameter a has V = 2 J1(x) / x, with x = pi a f at a frequency of modulus f (Hanbury Brown et al.
-1974, MNRAS 167, 121).
-"""
+"""The uniform disc that fits measurements best: the rival of a companion."""
 
 from __future__ import annotations
 
@@ -12,39 +8,14 @@ from typing import Any
 
 import torch
 from scipy.optimize import minimize_scalar
-from scipy.special import j1, jv
 from torch import Tensor
 
+from torchmask.interferometry.disc_visibility import FIRST_NULL, disc_slopes, disc_visibilities
 from torchmask.interferometry.pair_model import PairResiduals, square, unexplained
 
-_SMALL = 1e-3  # argument below which the first two terms of the series are exact to rounding
 _PER_ELEMENT = 16  # diameters tried per period of the finest fringe
 _WIDEST = 25  # largest diameter tried, in periods of the finest fringe
-_FIRST_NULL = 1.22  # diameter, in periods of its fringe, at which a baseline sees none
 _EXACT = 1e-9  # of the finest fringe, to which the diameter is fitted
-
-
-def disc_visibilities(frequencies: Tensor, diameters: Tensor | float) -> Tensor:
-    """Return visibilities (..., F) of uniform discs of `diameters` (...) [rad] at frequencies (F, 2) [cycles per rad].
-
-    Examples
-    --------
-    A baseline of 1.22 wavelengths over the diameter sees no fringes:
-
-    >>> baseline = torch.tensor([[1.2196699e6, 0.0]], dtype=torch.float64)
-    >>> bool(disc_visibilities(baseline, 1e-6).abs() < 1e-7)
-    True
-    """
-    x = _argument(frequencies, diameters)
-    first = torch.from_numpy(j1(x.numpy()))  # that of PyTorch is accurate to 1e-7 only
-    return torch.where(x < _SMALL, 1 - x**2 / 8, 2 * first / x.clamp(min=_SMALL))
-
-
-def disc_slopes(frequencies: Tensor, diameters: Tensor | float) -> Tensor:
-    """Return derivatives (..., F) of `disc_visibilities` in the diameters [1 / rad]."""
-    x = _argument(frequencies, diameters)
-    by_x = torch.where(x < _SMALL, -x / 4, -2 * torch.from_numpy(jv(2, x.numpy())) / x.clamp(min=_SMALL))
-    return math.pi * torch.linalg.vector_norm(frequencies, dim=1) * by_x
 
 
 @dataclass(frozen=True)
@@ -77,7 +48,7 @@ def fit_disc(problem: PairResiduals) -> DiscFit:
     """
     finest = float(problem.unit[1])
     lengths = torch.linalg.vector_norm(torch.cat([problem.frequencies, problem.sides]), dim=1)
-    largest = min(_FIRST_NULL / float(lengths.min()), _WIDEST * finest)
+    largest = min(FIRST_NULL / float(lengths.min()), _WIDEST * finest)
     step = finest / _PER_ELEMENT
     tried = torch.arange(0, largest + step, step, dtype=torch.float64)
     nearest = float(tried[disc_residuals(problem, tried).square().sum(-1).argmin()])
@@ -103,8 +74,3 @@ def disc_slope(problem: PairResiduals, diameter: float) -> Tensor:
     frequencies = problem.frequencies
     by_diameter = 2 * disc_visibilities(frequencies, diameter) * disc_slopes(frequencies, diameter)
     return problem.whiten(by_diameter, by_diameter.new_zeros(len(problem.sides) // 3))
-
-
-def _argument(frequencies: Tensor, diameters: Tensor | float) -> Tensor:
-    sizes = torch.as_tensor(diameters, dtype=torch.float64)[..., None]
-    return math.pi * sizes * torch.linalg.vector_norm(frequencies, dim=1)

@@ -5,6 +5,7 @@ Signs are those of `torchmask.interferometry.observables`.
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,6 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from torchmask.interferometry.disc_visibility import FIRST_NULL, disc_slopes, disc_visibilities
 from torchmask.record import Brief
 
 _CERTAIN = 4.0  # errors to which a divisor is known, so that first order holds
@@ -113,15 +115,32 @@ class Measurements(Brief):
             vis2_correlation=None,
         )
 
-    def calibrate(self, star: Measurements) -> Measurements:
-        """Calibrate with the measurements of an unresolved star, and propagate the errors of both.
+    def calibrate(self, star: Measurements, diameter: float = 0.0, diameter_error: float = 0.0) -> Measurements:
+        """Calibrate with the measurements of a star of known diameter, and propagate the errors of both.
 
-        |V|^2 is divided by the star's, and its closure phases are subtracted. Baselines are those of the object.
+        |V|^2 is divided by the star's, as a point would have them, and its closure phases are subtracted. Baselines are
+        those of the object.
 
-        Raises ValueError if the star was not seen on the same baselines and at the same wavelengths in the same order,
-        or shows no fringes on one of them. Warns as `warn_of_faint_star` does.
+        Parameters
+        ----------
+        star : Measurements
+            Measurements of a star on the same baselines.
+        diameter, diameter_error : float
+            Angular diameter of the star, a uniform disc, and its rms error [rad], which all |V|^2 share.
+
+        Raises
+        ------
+        ValueError
+            If the star was not seen on the same baselines and at the same wavelengths in the same order, or shows no
+            fringes on one of them, or the diameter is negative or so large that a disc shows none.
+
+        Warns
+        -----
+        UserWarning
+            As `warn_of_faint_star` does.
         """
         _require_same(self, star)
+        visibilities, slopes = known_disc(star.frequencies, diameter, diameter_error)
         dark = int((star.vis2 <= 0).sum())
         if dark:
             raise ValueError(
@@ -129,9 +148,11 @@ class Measurements(Brief):
                 "frames of it"
             )
         warn_of_faint_star(star.vis2, star.vis2_errors, stacklevel=2)
-        ratio = self.vis2 / star.vis2
+        point = star.vis2 / visibilities**2
+        ratio, common = self.vis2 / point, 2 * slopes / visibilities
         own, its = (_covariance(each.vis2_errors, each.vis2_correlation) for each in (self, star))
-        vis2 = (own + ratio[:, None] * ratio * its) / (star.vis2[:, None] * star.vis2)
+        its = its / (star.vis2[:, None] * star.vis2) + common[:, None] * common
+        vis2 = own / (point[:, None] * point) + ratio[:, None] * ratio * its
         one, other = (_covariance(each.closure_errors, each.closure_correlation) for each in (self, star))
         closure = one + other
         phases = self.closure_phases - star.closure_phases
@@ -158,6 +179,22 @@ def join(measurements: Sequence[Measurements]) -> Measurements:
         vis2_correlation=_blocks([(len(each.vis2), each.vis2_correlation) for each in measurements]),
         closure_correlation=_blocks([(len(each.closure_phases), each.closure_correlation) for each in measurements]),
     )
+
+
+def known_disc(frequencies: Tensor, diameter: float, error: float) -> tuple[Tensor, Tensor]:
+    """Return visibilities (F,) of a uniform disc at frequencies (F, 2) [cycles per rad], and their common error (F,).
+
+    Raises ValueError unless diameter and error [rad] are not negative, and all baselines are within its first null.
+    """
+    if not (diameter >= 0 and error >= 0):
+        raise ValueError(f"the star's diameter is {diameter:g} +- {error:g} rad: neither must be negative")
+    null = FIRST_NULL / float(torch.linalg.vector_norm(frequencies, dim=1).max()) if len(frequencies) else math.inf
+    if not diameter + error < null:
+        raise ValueError(
+            f"the star's diameter is {diameter:g} +- {error:g} rad: a disc of {null:.3g} shows no fringes on the "
+            "longest baseline, so a smaller star is needed"
+        )
+    return disc_visibilities(frequencies, diameter), error * disc_slopes(frequencies, diameter)
 
 
 def warn_of_faint_star(vis2: Tensor, errors: Tensor, stacklevel: int) -> None:

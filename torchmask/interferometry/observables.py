@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchmask.interferometry.measurements import SAME, Measurements, correlation, warn_of_faint_star
+from torchmask.interferometry.measurements import SAME, Measurements, correlation, known_disc, warn_of_faint_star
 from torchmask.record import Brief
 
 
@@ -99,22 +99,29 @@ class Observables(Brief):
             closure_correlation=correlation(self.closure_covariance),
         )
 
-    def calibrate(self, star: Observables) -> Observables:
-        """Calibrate with the observables of an unresolved star, which removes losses of contrast common to both.
+    def calibrate(
+        self, star: Observables, diameter: float = 0.0, diameter_error: float = 0.0, wavelength: float | None = None
+    ) -> Observables:
+        """Calibrate with the observables of a star of known diameter, which removes losses of contrast common to both.
 
-        |V|^2 and triple amplitudes are divided by the star's, and its closure phases are subtracted. Complex
-        visibilities are divided too, which is meaningful only for stable pistons. Errors and covariances of both are
-        propagated to first order. Directions on the sky are those of the object.
+        |V|^2 and triple amplitudes are divided by the star's, as a point would have them, and its closure phases are
+        subtracted. Complex visibilities are divided too, which is meaningful only for stable pistons. Errors and
+        covariances of both are propagated to first order. Directions on the sky are those of the object.
 
         Parameters
         ----------
         star : Observables
-            Observables of an unresolved star with the same mask and band, by the same function.
+            Observables of a star with the same mask and band, by the same function.
+        diameter, diameter_error : float
+            Angular diameter of the star, a uniform disc, and its rms error [rad], which all baselines share.
+        wavelength : float, optional
+            Wavelength of the light [m], which a diameter needs.
 
         Raises
         ------
         ValueError
-            If the star was observed with another mask, or has no fringes on some baseline.
+            If the star was observed with another mask, or has no fringes on some baseline, or its diameter has no
+            wavelength, is negative or so large that a disc shows no fringes.
 
         Warns
         -----
@@ -139,6 +146,7 @@ class Observables(Brief):
             names = ", ".join("-".join(map(str, self.pairs[index].tolist())) for index in dark)
             raise ValueError(f"the star shows no fringes of holes {names}: use a brighter star, or more frames of it")
         warn_of_faint_star(star.vis2, star.vis2_errors, stacklevel=2)
+        star = star._as_point(diameter, diameter_error, wavelength)
         vis2, vis2_covariance = _divide(self.vis2, self.vis2_covariance, star.vis2, star.vis2_covariance)
         triple, triple_covariance = _divide(
             self.triple_amplitudes, self.triple_covariance, star.triple_amplitudes, star.triple_covariance
@@ -158,6 +166,30 @@ class Observables(Brief):
             triple_covariance=triple_covariance,
         )
 
+    def _as_point(self, diameter: float, error: float, wavelength: float | None) -> Observables:
+        """Return the observables divided by those of a uniform disc, whose error all of them share."""
+        if diameter == error == 0:
+            return self
+        if wavelength is None:
+            raise ValueError("the star's diameter needs the wavelength [m]: give it too")
+        visibilities, errors = known_disc(self.baselines / wavelength, diameter, error)
+        relative = errors / visibilities
+        index = {tuple(pair): number for number, pair in enumerate(self.pairs.tolist())}
+        sides = [[index[i, j], index[j, k], index[i, k]] for i, j, k in self.triangles.tolist()]
+        of_triangle = torch.tensor(sides, dtype=torch.int64).view(-1, 3)
+        triple = visibilities[of_triangle].prod(1)
+        return replace(
+            self,
+            visibilities=self.visibilities / visibilities,
+            visibility_errors=torch.hypot(self.visibility_errors, self.visibilities.abs() * relative) / visibilities,
+            vis2=self.vis2 / visibilities**2,
+            vis2_covariance=_widen(self.vis2, self.vis2_covariance, visibilities**2, 2 * relative),
+            triple_amplitudes=self.triple_amplitudes / triple,
+            triple_covariance=_widen(
+                self.triple_amplitudes, self.triple_covariance, triple, relative[of_triangle].sum(1)
+            ),
+        )
+
     def _require_same_mask(self, star: Observables) -> None:
         lengths = [torch.linalg.vector_norm(each.baselines, dim=1) for each in (self, star)]
         same = torch.equal(self.pairs, star.pairs) and torch.equal(self.triangles, star.triangles)
@@ -172,3 +204,9 @@ def _divide(values: Tensor, covariance: Tensor, by: Tensor, by_covariance: Tenso
     """Return values / by (M,) and its covariance (M, M), to first order."""
     ratio, outer = values / by, by[:, None] * by
     return ratio, (covariance + ratio[:, None] * ratio * by_covariance) / outer
+
+
+def _widen(values: Tensor, covariance: Tensor, by: Tensor, relative: Tensor) -> Tensor:
+    """Return the covariance (M, M) of values / by (M,), where `by` has `relative` errors (M,) of one cause."""
+    common = values * relative
+    return (covariance + common[:, None] * common) / (by[:, None] * by)

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from torchmask.grid import ARCSEC
 from torchmask.interferometry.companion_limits import SIGNIFICANCE, DetectionLimits
-from torchmask.interferometry.disc_model import disc_slope, disc_visibilities
+from torchmask.interferometry.disc_model import disc_slope
+from torchmask.interferometry.disc_visibility import disc_visibilities
 from torchmask.interferometry.measurements import Measurements
 from torchmask.interferometry.pair_fit import PairFit
 from torchmask.interferometry.pair_model import PARAMETERS, PairResiduals, pair_visibilities, unexplained
