@@ -75,3 +75,29 @@ def test_what_lies_beyond_the_search_is_not_within_it(pair_at):
     assert fit.verdict == "outside"
     assert not fit.detected
     assert fit_pair(seen, truth).verdict == "companion"
+
+
+@pytest.mark.parametrize("closures", [True, False])
+def test_stars_of_equal_light_are_equal_within_their_errors(closures, measure_pair):
+    """Whose |V|^2 alone are the same to first order for any two that are nearly equal."""
+    truth = torch.tensor([1.0, 4.4e-7, -2.4e-7], dtype=torch.float64)
+    away, errors = [], []
+    for seed in range(12):
+        seen = measure_pair(truth, seed)
+        if not closures:
+            seen = replace(
+                seen,
+                triangles=seen.triangles[:0],
+                triangle_wavelengths=seen.triangle_wavelengths[:0],
+                closure_phases=seen.closure_phases[:0],
+                closure_errors=seen.closure_errors[:0],
+                closure_correlation=None,
+            )
+        fit = fit_pair(seen, truth * torch.tensor([0.8, 1.03, 0.97], dtype=torch.float64))
+        assert fit.verdict == "companion"
+        assert fit.companion[0] <= 1
+        away.append(1 - float(fit.companion[0]))
+        errors.append(float(fit.covariance[0, 0].sqrt()))
+    assert max(one / error for one, error in zip(away, errors, strict=True)) < 4
+    assert max(errors) < 0.2
+    assert min(away) < min(errors)

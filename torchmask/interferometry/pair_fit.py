@@ -23,6 +23,7 @@ STEPS = 40  # maximum number of Gauss-Newton steps for contrast and position
 RIVAL = 9.0  # chi-square by which a companion must be better than what it is told from: three standard errors
 _WIDEST = 25  # maximum radius of a search, in periods of the finest fringe
 _LEAST_CURVATURE = 1e-12  # of the largest: below, the companion's position along some direction is unconstrained
+_EQUAL = 0.999  # brightest contrast at which its slopes are taken
 _ERRORS_WITHIN = 1.5  # factor by which errors may be too small: 20 frames give them to 16 %, three times which is 1.5
 _CHANCE = 5.0  # standard deviations of the chi-square that are put down to chance
 
@@ -156,14 +157,34 @@ def fit_pair(
     """
     problem = PairResiduals(measured)
     found, residual = problem.descend(start.double(), steps)
-    slopes, freedom = problem.slopes(found) * problem.unit, problem.size - PARAMETERS
+    freedom = problem.size - PARAMETERS
+    covariance = _covariance(problem, found) * unexplained(square(residual), freedom)
+    star = square(problem.residuals(torch.zeros_like(found)))
+    bounds = separations(measured, least, most)
+    return PairFit(found, covariance, square(residual), star, fit_disc(problem), freedom, bounds)
+
+
+def _covariance(problem: PairResiduals, companion: Tensor) -> Tensor:
+    """Return the covariance (3, 3) of a companion for errors of the measurements as told.
+
+    At a contrast of 1 |V|^2 do not change with it to first order, so it is taken one error of the contrast below.
+    """
+    away = companion.clone()
+    away[0] = min(float(away[0]), _EQUAL)
+    found = _inverse(problem, away)
+    error, room = float(found[0, 0].sqrt()), 1 - float(away[0])
+    if error <= room:
+        return found
+    away[0] = max(0.0, 1 - math.sqrt(error * room))
+    return _inverse(problem, away)
+
+
+def _inverse(problem: PairResiduals, companion: Tensor) -> Tensor:
+    """Return the inverse (3, 3) of the curvature. Raises ValueError if the position is unconstrained."""
+    slopes = problem.slopes(companion) * problem.unit
     values, vectors = torch.linalg.eigh(slopes.T @ slopes)
     if not values[0] > _LEAST_CURVATURE * values[-1]:
         raise ValueError(
             "the measurements do not constrain a companion's position: baselines in more than one direction are needed"
         )
-    scale = unexplained(square(residual), freedom)
-    covariance = scale * (vectors / values) @ vectors.T * problem.unit[:, None] * problem.unit
-    star = square(problem.residuals(torch.zeros_like(found)))
-    bounds = separations(measured, least, most)
-    return PairFit(found, covariance, square(residual), star, fit_disc(problem), freedom, bounds)
+    return (vectors / values) @ vectors.T * problem.unit[:, None] * problem.unit

@@ -18,7 +18,7 @@ from torchmask.optics.phasor import phasor
 
 PARAMETERS = 3  # of a companion: contrast, east and north
 _FAINTEST, _BRIGHTEST = -0.5, 0.98  # range of contrasts of a map; at 1 the derivatives in the contrast vanish
-_EQUAL = 0.999  # the brightest of a fit
+_SWAPPED = 2.0  # the brightest on the way of a fit, whose stars then change their roles
 _STEPS = 12  # number of Gauss-Newton steps for the contrast at each position
 _HALVINGS = 20  # maximum number of halvings of a step that makes a fit worse
 _TINY = torch.finfo(torch.float64).tiny  # curvature where fringes repeat exactly, and any contrast fits
@@ -93,14 +93,17 @@ class PairResiduals:
         return torch.cat([self._vis2.T @ vis2, self._closures.T @ phases])
 
     def descend(self, start: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-        """Fit a companion by Gauss-Newton steps from `start` (3,); return it and its residuals (K,)."""
+        """Fit a companion by Gauss-Newton steps from `start` (3,); return it and its residuals (K,).
+
+        Its contrast is 1 at most: the brighter one is the star.
+        """
         found, residual = start, self.residuals(start)
         for _ in range(steps):
             slopes = self.slopes(found) * self.unit
             change = self.unit * torch.linalg.lstsq(slopes, residual[:, None]).solution[:, 0]
             for _ in range(_HALVINGS):
                 moved = found + change
-                moved[0] = moved[0].clamp(max=_EQUAL)
+                moved[0] = moved[0].clamp(max=_SWAPPED)
                 after = self.residuals(moved)
                 if moved[0] >= _FAINTEST and square(after) < square(residual):
                     break
@@ -111,6 +114,8 @@ class PairResiduals:
             found, residual = moved, after
             if gained < _ENOUGH * self.size:
                 break
+        if found[0] > 1:
+            found = torch.cat([1 / found[:1], -found[1:]])
         return found, residual
 
     def best_contrasts(self, offsets: Tensor) -> tuple[Tensor, Tensor, Tensor]:
