@@ -211,4 +211,10 @@ def test_where_fringes_repeat_no_limit_is_told():
         "  at 100 mas a companion of 0.01 +- 0.001 of the star's light would be found half of the time, one of 0.013 "
         "in nine of ten"
     )
+    rival = (torch.tensor([0.05, 0.0, 2e-7]).double(), 21.5)
+    told = summary(fit, limits, side_known=True, rival=rival)[1]
+    assert told == (
+        f"the place is not certain: 0.05 of the star's light {2e-7 / MAS:.4g} mas away at 0 deg leave a chi-square of "
+        "21.5"
+    )
     assert far.startswith("  at 200 mas a companion would not be found everywhere")

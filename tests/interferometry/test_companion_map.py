@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchmask.grid import Grid
-from torchmask.interferometry.companion_map import map_companions, raster
+from torchmask.interferometry.companion_map import map_companions, raster, rival_place
 from torchmask.interferometry.fringes import frame_observables
 from torchmask.interferometry.measurements import Measurements, join
 from torchmask.interferometry.pair_fit import fit_pair
@@ -204,3 +204,21 @@ def test_where_fringes_repeat_no_companion_would_be_found():
     assert found.contrast.isfinite().all()
     assert found.errors[1] > 1e6
     assert pair_limits(seen, fit_pair(seen, truth), found.offsets, 1e-6).contrast[1] > 1e6
+
+
+def test_a_place_that_fits_as_well_is_named_and_no_worse_one(measure_pair):
+    """Baselines on a lattice see the same a period away; those of six other holes tell where it is."""
+    baselines = torch.tensor([[1, 0], [0, 1], [3, 1], [1, 2], [2, 3]], dtype=torch.float64)
+    ones, none = torch.ones(5, dtype=torch.float64), torch.zeros(0, dtype=torch.float64)
+    truth = torch.tensor([0.1, 6e-7, 3e-7], dtype=torch.float64)
+    vis2 = pair_visibilities(baselines / 2e-6, truth).abs() ** 2
+    seen = Measurements(baselines, 2e-6 * ones, vis2, 0.01 * ones, None, none.view(0, 2, 2), none, none, none, None)
+    fit = fit_pair(seen, truth, most=2e-6)
+    place, chi_square = rival_place(seen, map_companions(seen, raster(seen, most=2e-6)), fit)
+    assert chi_square < 1e-3
+    periods = [(place[1:] - sign * truth[1:]) / 2e-6 for sign in (1, -1)]
+    assert min(float((each - each.round()).abs().max()) for each in periods) < 1e-3
+    assert max(float(each.abs().max()) for each in periods) > 0.5
+    assert rival_place(seen, map_companions(seen), fit_pair(seen, truth)) is None
+    one = measure_pair(TRUTH, 0)
+    assert rival_place(one, map_companions(one), fit_pair(one, TRUTH)) is None

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from torchmask.data.observe import read_observation
 from torchmask.grid import Grid
 from torchmask.interferometry.fringes import frame_observables
 from torchmask.interferometry.observables import Observables
@@ -129,6 +130,18 @@ def test_unknown_things_are_said_to_be_unknown(tmp_path, mask, grid, expose_poin
     assert "no sky coordinates" in str(primary["COMMENT"])
     assert "date is not known" in str(primary["COMMENT"])
     np.testing.assert_allclose(observables.stations, mask.centers)
+
+
+def test_the_integration_time_of_a_cube_is_that_of_the_whole_exposure(tmp_path, mask, grid, expose_points, sky_cards):
+    """As of JWST, whose XPOSURE is that of all integrations (EFFEXPTM): 69 of 0.3772 s in 26.013 s for AB Dor."""
+    cards = {"EFFINTTM": 0.3772, "XPOSURE": 3 * 0.3772, "EFFEXPTM": 3 * 0.3772, "BUNIT": "electron"}
+    cards |= sky_cards(0.3, grid.pixel_scale) | {"WAVELEN": grid.wavelength}
+    frames = expose_points(mask, grid, n_frames=3).numpy()
+    fits.PrimaryHDU(frames, fits.Header(cards)).writeto(tmp_path / "cube.fits")
+    observation = read_observation(tmp_path / "cube.fits", mask)
+    save_oifits(tmp_path / "a.oifits", frame_observables(observation), observation, bandwidth=1e-8)
+    times = fits.getdata(tmp_path / "a.oifits", "OI_VIS2")["INT_TIME"]
+    np.testing.assert_allclose(times, 3 * 0.3772, rtol=1e-12)
 
 
 def test_what_is_not_finite_is_flagged(tmp_path, mask, grid, expose_points):

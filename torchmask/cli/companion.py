@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 import tyro
+from torch import Tensor
 
 from torchmask.cli.options import RunOptions
 from torchmask.cli.program import NOT_EXPLAINED
@@ -18,7 +19,7 @@ from torchmask.cli.run import new_run
 from torchmask.grid import ARCSEC, MAS
 from torchmask.interferometry.companion_errors import MEASURED, polar, rotation_towards
 from torchmask.interferometry.companion_limits import MOSTLY, SIGNIFICANCE, DetectionLimits
-from torchmask.interferometry.companion_map import map_companions, raster
+from torchmask.interferometry.companion_map import map_companions, raster, rival_place
 from torchmask.interferometry.measurements import Measurements, join
 from torchmask.interferometry.oifits_reader import load_oifits
 from torchmask.interferometry.pair_fit import PairFit, fit_pair
@@ -70,6 +71,7 @@ def run(options: Options) -> int:
         found = map_companions(measured, offsets)
         fit = fit_pair(measured, found.best, least, most)
         limits = pair_limits(measured, fit, offsets, measured.finest)
+        rival = rival_place(measured, found, fit) if fit.detected else None
         sides = len(measured.closure_phases) > 0
         numbers = {
             "files": [str(path) for path in options.files],
@@ -79,6 +81,7 @@ def run(options: Options) -> int:
             "detected": fit.detected,
             "companion": describe(fit),
             "disc": describe_disc(fit),
+            "rival": None if rival is None else {**polar(rival[0]), "chi_square": rival[1]},
             "side_known": sides,
             "limits": dataclasses.asdict(limits),
         }
@@ -93,7 +96,7 @@ def run(options: Options) -> int:
             output.summary.append(
                 "without --star, |V|^2 are taken as calibrated: losses of contrast look like companions"
             )
-        output.summary.extend(summary(fit, limits, sides))
+        output.summary.extend(summary(fit, limits, sides, rival))
     return 0 if fit.explained else NOT_EXPLAINED
 
 
@@ -167,13 +170,24 @@ def describe_disc(fit: PairFit) -> dict[str, float]:
     return {"diameter": disc.diameter / MAS, "diameter_error": disc.error / MAS, "chi_square": disc.chi_square}
 
 
-def summary(fit: PairFit, limits: DetectionLimits, side_known: bool) -> Sequence[str]:
-    """Return the lines to print; limits only if the measurements are explained, as they rest on the residuals."""
+def summary(
+    fit: PairFit, limits: DetectionLimits, side_known: bool, rival: tuple[Tensor, float] | None = None
+) -> Sequence[str]:
+    """Return the lines to print; limits only if the measurements are explained, as they rest on the residuals.
+
+    A `rival` is a companion elsewhere that fits as well, and its chi-square.
+    """
     lines = verdict_lines(fit)
     if not fit.explained:
         return lines
     if not side_known:
         lines.append("without closure phases, a companion on the opposite side of the star fits equally well")
+    if rival is not None:
+        place, contrast = polar(rival[0]), float(rival[0][0])
+        lines.append(
+            f"the place is not certain: {contrast:.3g} of the star's light {place['separation']:.4g} mas away at "
+            f"{place['position_angle']:.4g} deg leave a chi-square of {rival[1]:.4g}"
+        )
     return [*lines, *limit_lines(limits)]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -11,13 +12,15 @@ from torch import Tensor
 from torchmask.grid import ARCSEC
 from torchmask.interferometry.companion_limits import search_offsets
 from torchmask.interferometry.measurements import Measurements
-from torchmask.interferometry.pair_fit import STEPS, separations
+from torchmask.interferometry.pair_fit import RIVAL, STEPS, PairFit, separations
 from torchmask.interferometry.pair_model import PARAMETERS, PairResiduals, square, unexplained
 from torchmask.memory import require_memory
 from torchmask.record import Brief
 
 _PER_ELEMENT = 8  # points of the raster along the finest fringe
 _CHUNK = 1024  # positions at a time
+_APART = 0.5  # of the finest fringe, from which on two places are different
+_PLACES = 4  # number of other places that are fitted
 _BYTES = 80  # of memory for each position: itself, its separation, and what is found there
 
 
@@ -130,3 +133,52 @@ def map_companions(measured: Measurements, offsets: Tensor | None = None) -> Com
     star = square(problem.residuals(contrast.new_zeros(PARAMETERS)))
     error = error * math.sqrt(unexplained(least, freedom))
     return CompanionMap(offsets, contrast, error, chi_square, least, star, freedom)
+
+
+def rival_place(measured: Measurements, found: CompanionMap, fit: PairFit) -> tuple[Tensor, float] | None:
+    """Return the companion (3,) that fits best elsewhere, and its chi-square; None if none is as good as that of `fit`.
+
+    As good is what leaves a chi-square that is larger by less than `RIVAL`, scaled as errors are. Elsewhere is half a
+    period of the finest fringe away from it and, without closure phases, from its opposite.
+
+    Examples
+    --------
+    Baselines of whole metres at 2 micrometres see the same every 2 microradians:
+
+    >>> from torchmask.interferometry.pair_fit import fit_pair
+    >>> from torchmask.interferometry.pair_model import pair_visibilities
+    >>> baselines = torch.tensor([[1, 0], [0, 1], [3, 1], [1, 2], [2, 3]], dtype=torch.float64)
+    >>> ones, none = torch.ones(5, dtype=torch.float64), torch.zeros(0, dtype=torch.float64)
+    >>> truth = torch.tensor([0.1, 6e-7, 3e-7], dtype=torch.float64)
+    >>> vis2 = pair_visibilities(baselines / 2e-6, truth).abs() ** 2
+    >>> seen = Measurements(
+    ...     baselines, 2e-6 * ones, vis2, 0.01 * ones, None, none.view(0, 2, 2), none, none, none, None)
+    >>> found = map_companions(seen, raster(seen, most=2e-6))
+    >>> place, chi_square = rival_place(seen, found, fit_pair(seen, truth, most=2e-6))
+    >>> turns = (place[1:] - truth[1:]) / 2e-6, (place[1:] + truth[1:]) / 2e-6
+    >>> any(bool((each - each.round()).abs().max() < 1e-3) for each in turns), chi_square < 1e-3
+    (True, True)
+    >>> rival_place(seen, map_companions(seen), fit_pair(seen, truth)) is None
+    True
+    """
+    problem = PairResiduals(measured)
+    apart, (least, most) = _APART * measured.finest, fit.separations
+    same = [fit.companion[1:]] + [-fit.companion[1:]] * (len(measured.closure_phases) == 0)
+    tried, best = list(same), None
+    for _ in range(_PLACES):
+        free = (_distance(found.offsets, tried) > apart) & (found.contrast > 0)
+        if not bool(free.any()):
+            break
+        index = int(torch.where(free, found.chi_square, torch.inf).argmin())
+        place, residual = problem.descend(torch.cat([found.contrast[index, None], found.offsets[index]]), STEPS)
+        tried.append(found.offsets[index])
+        inside = least <= float(torch.linalg.vector_norm(place[1:])) <= most
+        if inside and place[0] > 0 and float(_distance(place[None, 1:], same)) > apart:
+            best = min(best or (place, math.inf), (place, square(residual)), key=lambda each: each[1])
+    left = unexplained(fit.chi_square, fit.degrees_of_freedom)
+    return best if best is not None and best[1] - fit.chi_square < RIVAL * left else None
+
+
+def _distance(offsets: Tensor, places: Sequence[Tensor]) -> Tensor:
+    """Return the distances (M,) of offsets (M, 2) from the nearest of some places (2,)."""
+    return torch.linalg.vector_norm(offsets[:, None] - torch.stack(list(places)), dim=-1).amin(1)

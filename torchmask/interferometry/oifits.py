@@ -40,7 +40,8 @@ def save_oifits(
         Result of `frame_observables` or `restored_observables`.
     observation : Observation
         Observation that they come from. Its header gives target, telescope, date and orientation; without sky
-        coordinates u is along the columns and v along the rows of the image, and a COMMENT says so.
+        coordinates u is along the columns and v along the rows of the image, and a COMMENT says so. INT_TIME is the
+        exposure time of a frame, 0 if it is not known, times their number.
     bandwidth : float, optional
         Width of the band [m], EFF_BAND. None: that of the header's FILTER, if it is known.
 
@@ -89,7 +90,7 @@ def save_oifits(
 
     date, mjd = _date(header)
     common = {"DATE-OBS": date[:10], "ARRNAME": _ARRAY, "INSNAME": _text(header, "INSTRUME")}
-    seconds = float(header.get("XPOSURE", 0.0)) * len(observation.frames)
+    seconds = (observation.exposure_time or 0.0) * len(observation.frames)
     hdus = fits.HDUList([_primary(header, date)])
     hdus.append(_target(header))
     hdus.append(_array(observables, observation))
