@@ -73,6 +73,8 @@ UNITS = {
     "r0": r"\[m\]",
     "imaging.outer_scale": "units of D",
     "outer_scale": r"\[m\]",
+    "star_diameter_mas": r"\[mas\]",
+    "star_diameter_error_mas": r"\[mas\]",
     "pixel_scale_arcsec": r"\[arcsec\]",
     "least_arcsec": r"\[arcsec\]",
     "most_arcsec": r"\[arcsec\]",

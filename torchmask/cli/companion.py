@@ -50,7 +50,7 @@ class Options(RunOptions):
     """Angular diameters of the calibrator stars, uniform discs [mas]: one for each file of --star, or one for all.
     Without them they are points."""
     star_diameter_error_mas: tuple[float, ...] = ()
-    """Rms errors of --star-diameter-mas [mas], as many."""
+    """Rms errors of those diameters [mas], as many."""
     closures_only: tyro.conf.FlagCreatePairsOff[bool] = False
     """Ignore the squared visibilities, since closure phases alone need no calibrated contrast."""
     least_arcsec: float | None = None

@@ -29,7 +29,8 @@ def pair_limits(
 
     It is that of a further companion beside what the fit shows: a companion, a resolved star, or else the star alone,
     whose parameters are fitted together with the contrast. One as bright as a limit is found about half of the time, as
-    chance makes it brighter or fainter by one error.
+    chance makes it brighter or fainter by one error. Places within half the finest fringe of a known companion or,
+    without closure phases, of its opposite do not count, as the two are not told apart there.
 
     The error of a limit combines its scatter within the annulus with the uncertainty of the errors themselves, if they
     were scaled by the residuals.
@@ -47,7 +48,8 @@ def pair_limits(
     significance : float
         Number of errors.
     """
-    errors = contrast_errors(measured, fit, offsets.double())
+    offsets = _apart(measured, fit, offsets.double())
+    errors = contrast_errors(measured, fit, offsets)
     away = torch.linalg.vector_norm(offsets, dim=1)
     ring = (away / annulus).floor().long()
     places, limits, scatter = [], [], []
@@ -59,6 +61,14 @@ def pair_limits(
         limits.append(limit)
         scatter.append(math.hypot(float(here.std(unbiased=False)), own))
     return DetectionLimits(np.array(places), np.array(limits), np.array(scatter))
+
+
+def _apart(measured: Measurements, fit: PairFit, offsets: Tensor) -> Tensor:
+    """Return the offsets that are apart from the companion, if there is one."""
+    if fit.verdict not in ("companion", "outside"):
+        return offsets
+    known = torch.stack([fit.companion[1:]] + [-fit.companion[1:]] * (len(measured.closure_phases) == 0))
+    return offsets[torch.cdist(offsets, known).amin(1) > measured.finest / 2]
 
 
 def contrast_errors(measured: Measurements, fit: PairFit, offsets: Tensor) -> Tensor:
