@@ -103,7 +103,8 @@ def test_a_sky_that_is_known_is_taken_off_with_its_noise_counted(seen):
 
 
 def test_a_sky_that_explains_the_frames_is_taken_off(seen, tmp_path):
-    bright, options = dataclasses.replace(seen, frames=seen.frames + 50), OIFITSOptions(oifits=True, bandwidth=1e-8)
+    sky = torch.poisson(torch.full_like(seen.frames, 50.0), generator=torch.Generator().manual_seed(0))
+    bright, options = dataclasses.replace(seen, frames=seen.frames + sky), OIFITSOptions(oifits=True, bandwidth=1e-8)
     ended = MyopicDeconvolution(MASK, GRID, 3, readout_noise=1.0, max_iterations=1).restore(bright.frames)
     assert ended.verdict is not None
     assert not ended.verdict.explained

@@ -71,11 +71,19 @@ def five_hole_basis(five_holes) -> AberrationBasis:
     """Piston, tip and tilt of every hole, white under turbulence.
 
     On a ring modes come in pairs that are as strong, between which rounding chooses: a triangular factor is unique, so
-    that the same numbers draw the same aberrations on every processor.
+    that the same numbers draw the same aberrations on every processor. The last piston follows from the others, and
+    has to be the last row for that.
     """
-    mixing = turbulent_basis(five_holes, 3, 0, R0, OUTER_SCALE).mixing
-    factor = torch.linalg.qr(mixing.T).R
-    return AberrationBasis((factor * factor.diagonal().sign()[:, None]).T, 3)
+    return triangular(turbulent_basis(five_holes, 3, 0, R0, OUTER_SCALE))
+
+
+def triangular(basis: AberrationBasis) -> AberrationBasis:
+    """Return the basis of snapshots with the same covariance whose parameters no rounding turns into each other."""
+    mixing, last = basis.mixing, len(basis.mixing) - basis.n_modes
+    order = [*range(last), *range(last + 1, len(mixing)), last]
+    factor = torch.linalg.qr(mixing[order].T).R
+    root = (factor * factor.diagonal().sign()[:, None]).T
+    return AberrationBasis(root[torch.tensor(order).argsort()], basis.n_modes)
 
 
 @pytest.fixture(scope="session")
@@ -87,7 +95,7 @@ def explain(five_holes, five_hole_basis) -> Callable[..., tuple[MyopicObjective,
         model = model or ExposureModel(five_holes, grid, five_hole_basis)
         image = torch.zeros(model.window.field.shape, dtype=torch.float64)
         image[10:19, 8:16], image[13:16, 16:25] = 6.0, 3.0
-        generator, basis = torch.Generator().manual_seed(0), model.aberrations
+        generator, basis = torch.Generator().manual_seed(2), model.aberrations
         z = torch.randn(n_frames, basis.n_parameters, dtype=torch.float64, generator=generator)
         z = basis.with_common_of(z, z[:1])
         frames = model(image, z)

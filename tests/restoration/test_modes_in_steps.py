@@ -57,7 +57,7 @@ def test_further_modes_change_no_object_of_faint_frames(restored):
 def test_a_search_that_is_cut_short_has_none_of_them(restored, light):
     result, _ = restored(8, max_iterations=1, **light)
     assert result.coefficients.shape == (2, 5, 8)
-    assert (result.coefficients[..., 6:] == 0).all()
+    assert float(result.coefficients[..., 6:].abs().max()) < 1e-9
 
 
 def test_fewer_modes_are_searched_as_they_are(restored):

@@ -168,7 +168,11 @@ def smeared(five_holes):
     generator, scene = torch.Generator().manual_seed(2), torch.zeros(SIDE, SIDE, dtype=torch.float64)
     scene[12:20, 13:19], scene[15:18, 6:27] = 3.0, 1.5
     scene *= 3e6 / scene.sum()
-    z = torch.randn(6, model.aberrations.n_parameters, dtype=torch.float64, generator=generator)
+    basis = model.aberrations
+    axes = torch.nn.functional.normalize(basis.mixing + basis.motion, dim=0).chunk(2, dim=1)
+    drawn = torch.randn(2, 6, len(basis.mixing), dtype=torch.float64, generator=generator)
+    # along the modes: on a ring some are as strong as others, and rounding chooses between them
+    z = torch.cat([normal @ own for normal, own in zip(drawn, axes, strict=True)], dim=1)
     frames = torch.poisson(model(model.window.embed(scene), z), generator=generator)
     return Smeared(frames, scene, model.aberrations.change(z))
 

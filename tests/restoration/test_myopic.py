@@ -67,7 +67,7 @@ def test_a_restoration_in_inference_mode_is_the_same(restoring, observation):
     ("max_iterations", "exposure", "enter"), [(4000, 0.0, True), (4000, 1.0, True), (3, 0.0, False), (3, 1.0, False)]
 )
 def test_modes_that_are_asked_for_enter_after_a_faint_search(max_iterations, exposure, enter, observation):
-    """The search is that of six modes; others descend before the integration, or are zero if it is cut short."""
+    """The search is that of six modes; others are fitted to the object in the end, or zero if it is cut short."""
     course = {"segment": 5, "sharp_after": 99, "start_iterations": 10, "escapes": 0, "faint_starts": 1, "starts": 1}
     schedule = Schedule(faint=math.inf, rounds=2, moves=2, **course)
 
@@ -82,7 +82,7 @@ def test_modes_that_are_asked_for_enter_after_a_faint_search(max_iterations, exp
     assert torch.equal(ten.cost, six.cost)
     shown = [record.arrays["coefficients"] for record in records if record.stage == "restoration" and record.arrays]
     assert {coefficients.shape[-1] for coefficients in shown} == {6}
-    assert any(record.stage == "before integration" for record in records) is enter
+    assert any(record.stage == "further modes" for record in records) is enter
     shape = (len(observation.frames), observation.aperture.n_subapertures, 10)
     assert ten.coefficients.shape == shape
     assert ten.coefficients_std.shape == shape[1:]

@@ -73,7 +73,7 @@ def _require_numbers(*psds: Tensor) -> None:
     """Raise ValueError for PSDs that `torch.func.vmap` maps over, or that require a gradient."""
     if torch.is_grad_enabled() and any(psd.requires_grad for psd in psds):
         raise ValueError("a PSD requires a gradient, which a criterion has in the centres only: detach the PSD")
-    if not all(can_be_read(psd) for psd in psds):
+    if not all(can_be_read(psd) or psd.is_meta for psd in psds):
         raise ValueError("torch.func.vmap over a criterion runs over the centres: the PSDs must be the same for all")
 
 
@@ -83,8 +83,9 @@ def _version(psd: Tensor) -> object:
 
 
 def _are_even(*psds: Tensor) -> bool:
-    """Return whether PSDs are known to be the same at opposite frequencies, which a compiler cannot know."""
-    return not torch.compiler.is_compiling() and all(bool((psd == _reflect(psd)).all()) for psd in psds)
+    """Return whether PSDs are known to be the same at opposite frequencies, which needs numbers."""
+    has_numbers = not (torch.compiler.is_compiling() or any(psd.is_meta for psd in psds))
+    return has_numbers and all(bool((psd == _reflect(psd)).all()) for psd in psds)
 
 
 def _reflect(image: Tensor) -> Tensor:

@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from torchmask.restoration.checkpoint import Progress, Status
 from torchmask.restoration.frames import FrameStack
@@ -46,7 +45,7 @@ def assemble_result(
     return RestorationResult(
         object=(model.window.crop(state.image) * stack.unit).clone(),
         extended_object=state.image * stack.unit,
-        coefficients=_first_modes(model.aberrations.coefficients(state.z), n_modes),
+        coefficients=model.aberrations.coefficients(state.z)[..., :n_modes],
         transmission=transmission,
         background=(background * stack.unit + stack.known).mean((1, 2)).to(transmission),
         model=frames * stack.unit + stack.known,
@@ -64,13 +63,8 @@ def assemble_result(
         magnification=state.geometry.magnification,
         geometry_std=_geometry_deviations(objective, state) if refined else None,
         verdict=verdict,
-        motion=None if change is None else _first_modes(change, n_modes),
+        motion=None if change is None else change[..., :n_modes],
     )
-
-
-def _first_modes(coefficients: Tensor, n_modes: int | None) -> Tensor:
-    """Return the first `n_modes` modes of coefficients (T, N, J), and zeros for those a short search lacks."""
-    return coefficients if n_modes is None else pad(coefficients, (0, n_modes - coefficients.shape[-1]))
 
 
 def _geometry_deviations(objective: MyopicObjective, state: State) -> Tensor:

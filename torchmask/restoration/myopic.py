@@ -273,7 +273,7 @@ class MyopicDeconvolution:
             settings = (unlimited, self.minimizer, self.schedule, recipe.last_modes, recipe.exposure_tau0)
             check_prior(self.prior, model.window.embed(stack.frames.mean(0).clamp(min=0)).double())
             file = Checkpoint.of(checkpoint, objective, settings, (*known.tensors, *tensors_of(start)))
-            progress = solver.solve(known, start, file)
+            progress = solver.solve(known, start, file, self.n_modes)
             verdict = replace(solver.judge.verdict(solver.objective, progress.ending), **look._asdict())
             verdict = verdict.of_measured_noise() if self.readout_noise is None and errors is None else verdict
             result = assemble_result(solver.objective, stack, progress, solver.prior_r0, verdict, n_modes=self.n_modes)

@@ -48,7 +48,7 @@ from torchmask.restoration.starts import (
     start_from_result,
     start_rms,
 )
-from torchmask.restoration.state import State
+from torchmask.restoration.state import Modes, State
 from torchmask.restoration.traits import End, Refinement, Traits
 
 
@@ -106,8 +106,13 @@ class Solver:
         known = (self.setting, stack, self.judge, traits, schedule)
         self.restarts: Restarts = Restarts(*known, self.first_inflation, averages, minimizer, callback)
 
-    def solve(self, known: Known, start: RestorationResult | None = None, file: Checkpoint | None = None) -> Progress:
-        """Run a restoration to its end, from scratch, from an earlier result or from a checkpoint."""
+    def solve(
+        self, known: Known, start: RestorationResult | None = None, file: Checkpoint | None = None, n_modes: int = 0
+    ) -> Progress:
+        """Run a restoration to its end, from scratch, from an earlier result or from a checkpoint.
+
+        Its aberrations have `n_modes` at least, if the search had fewer: those that nothing has found are zero.
+        """
         if known.covariance is not None:  # the prior is centred on the estimated aberrations
             centre = expected_parameters(self.objective, known.coefficients)
             self.objective = self.objective.with_changes(centre=centre)
@@ -126,6 +131,9 @@ class Solver:
             how = (self.schedule, self.minimizer, self.callback, self.traits, save_nothing if cut_short else save)
             given = self.objective.with_changes(prior=self.given)
             self.objective = Finisher(self.setting, *how, self.stack.change).finish(given, ended, self.end)
+        if self.setting.still.n_modes < n_modes and ended.state.modes is not Modes.FINER:
+            ended.state = self.setting.in_all_modes(ended.state)
+            self._place(ended.state)
         return ended
 
     def begin(self, known: Known, start: RestorationResult | None) -> Progress:
