@@ -75,13 +75,12 @@ class PairFit(Brief):
     def verdict(self) -> Verdict:
         """What the measurements show.
 
-        "companion" : it is worth `SIGNIFICANCE` standard errors and gives light, a uniform disc does not do as well,
-            and it is in the searched annulus, or closer with a contrast that is known to as many of its errors
-        "outside" : all this, but what fits best is elsewhere: beyond the search, or so close that contrast and
-            separation are not told apart, as of a resolved star that is no uniform disc
-        "resolved" : a uniform disc does as well, within a chi-square of `RIVAL`: a resolved star, or a closer pair
-        "none" : the star alone does as well
-        "not explained" : no star explains the measurements, with a companion or as a disc
+        A "companion" is worth `SIGNIFICANCE` standard errors and gives light, no uniform disc does as well, and
+        it is in the searched annulus, or closer with a contrast that is known to as many of its errors. One
+        "outside" is all this, but elsewhere: beyond the search, or so close that contrast and separation are
+        not told apart, as of a resolved star that is no uniform disc. "resolved" is where a uniform disc does
+        as well, within a chi-square of `RIVAL`, as of a resolved star or a closer pair, and "none" where the
+        star alone does. "not explained" is what no star explains, with a companion or as a disc.
         """
         best = min(self.chi_square, self.disc.chi_square)
         if best > self.limit:
