@@ -86,15 +86,21 @@ def test_a_resolved_source_is_no_companion(write, tmp_path, capsys):
     assert "would be found" not in said
 
 
-def test_a_slightly_resolved_star_is_told_as_such(write, tmp_path, capsys):
-    """|V|^2 of a uniform disc of half the finest fringe: the pair that looks like it is closer than the search."""
-    single, star = write("single.oifits", ((0, 0, 1),), 1), write("star.oifits", ((0, 0, 1),), 2)
-    size = 0.5 * load_oifits(single).finest
-    with fits.open(single) as hdus:
+def write_disc(point, path):
+    """Write what is in a file as it would be for a disc of half the finest fringe; return its diameter [rad]."""
+    size = 0.5 * load_oifits(point).finest
+    with fits.open(point) as hdus:
         rows = hdus["OI_VIS2"].data
         baselines = torch.tensor(np.stack([rows["UCOORD"], rows["VCOORD"]], 1).astype(float))
         rows["VIS2DATA"] *= disc_visibilities(baselines / GRID.wavelength, size)[:, None].numpy() ** 2
-        hdus.writeto(tmp_path / "disc.oifits")
+        hdus.writeto(path)
+    return size
+
+
+def test_a_slightly_resolved_star_is_told_as_such(write, tmp_path, capsys):
+    """|V|^2 of a uniform disc of half the finest fringe: the pair that looks like it is closer than the search."""
+    single, star = write("single.oifits", ((0, 0, 1),), 1), write("star.oifits", ((0, 0, 1),), 2)
+    size = write_disc(single, tmp_path / "disc.oifits")
     assert run(tmp_path / "disc.oifits", "--star", star, "--out", tmp_path / "run") == 0
     found = json.loads((tmp_path / "run/companion.json").read_text())
     assert found["verdict"] == "resolved"
@@ -168,12 +174,7 @@ def test_object_and_calibrator_may_be_in_one_file(write, tmp_path, capsys):
 def test_a_calibrator_of_known_diameter_takes_no_contrast_off(write, tmp_path, capsys):
     """Its own |V|^2 are those of a disc of half the finest fringe; taken for a point, it brightens the object."""
     single, star = write("single.oifits", ((0, 0, 1),), 1), write("star.oifits", ((0, 0, 1),), 2)
-    size = 0.5 * load_oifits(single).finest
-    with fits.open(star) as hdus:
-        rows = hdus["OI_VIS2"].data
-        baselines = torch.tensor(np.stack([rows["UCOORD"], rows["VCOORD"]], 1).astype(float))
-        rows["VIS2DATA"] *= disc_visibilities(baselines / GRID.wavelength, size)[:, None].numpy() ** 2
-        hdus.writeto(tmp_path / "disc.oifits")
+    size = write_disc(star, tmp_path / "disc.oifits")
     known = ("--star", tmp_path / "disc.oifits", "--star-diameter-mas", size / MAS)
     assert run(single, *known, "--star-diameter-error-mas", 0.01 * size / MAS, "--out", tmp_path / "known") == 0
     found = json.loads((tmp_path / "known/companion.json").read_text())

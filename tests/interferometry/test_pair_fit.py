@@ -7,7 +7,7 @@ import torch
 
 from torchmask.interferometry.companion_map import map_companions, raster
 from torchmask.interferometry.disc_visibility import disc_visibilities
-from torchmask.interferometry.pair_fit import RIVAL, fit_pair
+from torchmask.interferometry.pair_fit import RIVAL, PairVerdict, fit_pair
 
 DIRECTION = torch.tensor([0.6, -0.8], dtype=torch.float64)
 
@@ -37,7 +37,7 @@ def test_a_uniform_disc_is_resolved_and_no_companion(diameter, seed, measure_pai
     seen = replace(star, vis2=star.vis2 - 1 + disc_visibilities(star.frequencies, size) ** 2)
     fit = search(seen)
     assert fit.significance > 5
-    assert fit.verdict == "resolved"
+    assert fit.verdict is PairVerdict.RESOLVED
     assert fit.explained
     assert not fit.detected
     assert abs(fit.disc.diameter - size) < 4 * fit.disc.error
@@ -50,7 +50,7 @@ def test_companions_are_found_from_half_the_finest_fringe_on(contrast, separatio
     for seed in range(3):
         truth, seen = pair_at(contrast, separation, seed)
         fit = search(seen)
-        assert fit.verdict == "companion"
+        assert fit.verdict is PairVerdict.COMPANION
         assert fit.disc.chi_square - fit.chi_square > 10 * RIVAL
         assert ((fit.companion - truth).abs() < 4 * fit.covariance.diagonal().sqrt()).all()
 
@@ -58,23 +58,23 @@ def test_companions_are_found_from_half_the_finest_fringe_on(contrast, separatio
 def test_closer_pairs_are_companions_if_their_contrast_is_known_and_else_told_as_such(pair_at):
     truth, seen = pair_at(0.5, 0.75)
     fit = search(seen)
-    assert fit.verdict == "companion"
+    assert fit.verdict is PairVerdict.COMPANION
     assert fit.separation < fit.separations[0]
     assert ((fit.companion - truth).abs() < 4 * fit.covariance.diagonal().sqrt()).all()
     fit = search(pair_at(0.3, 0.2)[1])
     assert fit.companion[0] < 5 * fit.covariance[0, 0].sqrt()
     assert fit.disc.chi_square - fit.chi_square > RIVAL
-    assert fit.verdict == "outside"
+    assert fit.verdict is PairVerdict.OUTSIDE
     # a search that includes the place finds it
-    assert search(pair_at(0.3, 0.2)[1], 0.1 * seen.finest / 2).verdict == "companion"
+    assert search(pair_at(0.3, 0.2)[1], 0.1 * seen.finest / 2).verdict is PairVerdict.COMPANION
 
 
 def test_what_lies_beyond_the_search_is_not_within_it(pair_at):
     truth, seen = pair_at(0.3, 2.0)
     fit = fit_pair(seen, truth, most=0.9 * float(truth[1:].norm()))
-    assert fit.verdict == "outside"
+    assert fit.verdict is PairVerdict.OUTSIDE
     assert not fit.detected
-    assert fit_pair(seen, truth).verdict == "companion"
+    assert fit_pair(seen, truth).verdict is PairVerdict.COMPANION
 
 
 @pytest.mark.parametrize("closures", [True, False])
@@ -94,7 +94,7 @@ def test_stars_of_equal_light_are_equal_within_their_errors(closures, measure_pa
                 closure_correlation=None,
             )
         fit = fit_pair(seen, truth * torch.tensor([0.8, 1.03, 0.97], dtype=torch.float64))
-        assert fit.verdict == "companion"
+        assert fit.verdict is PairVerdict.COMPANION
         assert fit.companion[0] <= 1
         away.append(1 - float(fit.companion[0]))
         errors.append(float(fit.covariance[0, 0].sqrt()))

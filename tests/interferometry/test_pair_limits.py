@@ -11,7 +11,7 @@ from torchmask.grid import ARCSEC
 from torchmask.interferometry.companion_limits import MOSTLY
 from torchmask.interferometry.companion_map import map_companions, raster
 from torchmask.interferometry.disc_visibility import disc_visibilities
-from torchmask.interferometry.pair_fit import fit_pair
+from torchmask.interferometry.pair_fit import PairVerdict, fit_pair
 from torchmask.interferometry.pair_limits import contrast_errors, pair_limits
 from torchmask.interferometry.pair_model import PairResiduals, pair_visibilities
 
@@ -42,7 +42,7 @@ def test_the_error_of_a_limit_holds_its_scatter_and_that_of_the_errors_themselve
     seen = measure_pair(seed=0)
     places = torch.tensor([[0.0, 0.4], [-0.8, 0.0], [0.0, -1.2], [1.6, 0.0]], dtype=torch.float64) * ARCSEC / 10
     fit = fit_pair(seen, map_companions(seen).best)
-    assert fit.verdict == "none"
+    assert fit.verdict is PairVerdict.NONE
     assert fit.chi_square < 22
     first, second, third, fourth = contrast_errors(seen, fit, places).tolist()
     found = pair_limits(seen, fit, places, 0.1 * ARCSEC, 3.0)
@@ -95,7 +95,7 @@ def test_limits_beside_a_resolved_star_are_about_those_of_a_point(measure_pair):
     size = 0.4 * star.finest
     seen = replace(star, vis2=star.vis2 - 1 + disc_visibilities(star.frequencies, size) ** 2)
     fit = fit_pair(seen, map_companions(seen).best)
-    assert fit.verdict == "resolved"
+    assert fit.verdict is PairVerdict.RESOLVED
     ratio = limits_of(seen, raster(seen), star.finest).contrast / limits_of(star, raster(star), star.finest).contrast
     assert ratio.min() > 0.7
     assert ratio.max() < 2

@@ -22,7 +22,7 @@ from torchmask.interferometry.companion_limits import MOSTLY, SIGNIFICANCE, Dete
 from torchmask.interferometry.companion_map import map_companions, raster, rival_place
 from torchmask.interferometry.measurements import Measurements, join
 from torchmask.interferometry.oifits_reader import load_oifits
-from torchmask.interferometry.pair_fit import PairFit, fit_pair
+from torchmask.interferometry.pair_fit import PairFit, PairVerdict, fit_pair
 from torchmask.interferometry.pair_limits import pair_limits
 from torchmask.io import save_npz, write_json
 from torchmask.viz.companion import companion_figure
@@ -76,7 +76,7 @@ def run(options: Options) -> int:
         numbers = {
             "files": [str(path) for path in options.files],
             "stars": [str(path) for path in options.star],
-            "verdict": fit.verdict,
+            "verdict": fit.verdict.value,
             "explained": fit.explained,
             "detected": fit.detected,
             "companion": describe(fit),
@@ -203,7 +203,7 @@ def verdict_lines(fit: PairFit) -> list[str]:
     least, most = (f"{value / MAS:.4g} mas" for value in fit.separations)
     disc = f"a uniform disc of {fit.disc.diameter / MAS:.4g} +- {fit.disc.error / MAS:.2g} mas"
     rivals = f"{fit.disc.chi_square:.4g} for {disc}, {fit.star_chi_square:.4g} for the star alone"
-    if fit.verdict == "not explained":
+    if fit.verdict is PairVerdict.NOT_EXPLAINED:
         return [
             f"not explained: a star and one companion leave a chi-square of {fit.chi_square:.4g} {freedom}, and "
             f"{disc} {fit.disc.chi_square:.4g}; up to {fit.limit:.4g} counts as explained; check that the star has one "
@@ -211,19 +211,19 @@ def verdict_lines(fit: PairFit) -> list[str]:
             "same mask, and the errors in the files",
             f"the companion that fits best, which the measurements contradict, is {where}",
         ]
-    if fit.verdict == "resolved":
+    if fit.verdict is PairVerdict.RESOLVED:
         return [
             f"resolved, or a pair closer than {least}: {disc} leaves a chi-square of {fit.disc.chi_square:.4g}, the "
             f"star alone {fit.star_chi_square:.4g}",
             f"the companion that fits best leaves {fit.chi_square:.4g} {freedom}, and is {where}",
         ]
     head = {
-        "companion": "a companion",
-        "none": f"no companion above {SIGNIFICANCE:g} standard errors; the likeliest is",
-        "outside": f"a pair closer than {least}, which --least-arcsec looks for, or a star that is resolved but no "
-        "uniform disc; what fits best is a companion",
+        PairVerdict.COMPANION: "a companion",
+        PairVerdict.NONE: f"no companion above {SIGNIFICANCE:g} standard errors; the likeliest is",
+        PairVerdict.OUTSIDE: f"a pair closer than {least}, which --least-arcsec looks for, or a star that is resolved "
+        "but no uniform disc; what fits best is a companion",
     }[fit.verdict]
-    if fit.verdict == "outside" and fit.separation > fit.separations[1]:
+    if fit.verdict is PairVerdict.OUTSIDE and fit.separation > fit.separations[1]:
         head = f"no companion within {most}: --most-arcsec looks farther, where what fits best is one"
     if seen["contrast"] <= 0:
         head = "no companion; what fits best is one of negative light, as fringes stronger than a star's make it,"

@@ -101,7 +101,7 @@ def save_restored(
             "NLOST": (len(verdict.frames), "frames that are not explained"),
         }
     clouded = clouded_frames(observation)
-    cards["NCLOUD"] = (len(clouded), "frames, CLOUDED, with half the usual light")
+    cards["NCLOUD"] = (len(clouded), "frames (CLOUDED) below half the usual light")
     if clouded:
         cards["CLOUDED"] = (",".join(map(str, clouded)), "")  # many go on in CONTINUE cards, which hold no comment
     for name, (value, comment) in cards.items():

@@ -13,9 +13,8 @@ from torchmask.grid import ARCSEC
 from torchmask.record import Brief
 
 SIGNIFICANCE = 5.0  # in units of the scatter without a companion, above which a companion counts as detected
-MOSTLY = (
-    1 + 1.2816 / SIGNIFICANCE
-)  # times a limit: the contrast at which chance takes the significance below in a tenth
+# times a limit: the contrast at which chance takes the significance below it in a tenth of all cases
+MOSTLY = 1 + 1.2816 / SIGNIFICANCE
 _ANNULUS, _REACH = 0.1, 0.025  # [arcsec] width of an annulus, and margin around it in which scatter is measured
 
 

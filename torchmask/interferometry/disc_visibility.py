@@ -9,15 +9,19 @@ from __future__ import annotations
 import math
 
 import torch
-from scipy.special import j1, jv
+from scipy.special import jv
 from torch import Tensor
 
+from torchmask.optics.shapes import Disc
+
 FIRST_NULL = 1.22  # diameter, in periods of its fringe, at which a baseline sees none
-_SMALL = 1e-3  # argument below which the first two terms of the series are exact to rounding
+_TINY = torch.finfo(torch.float64).tiny
 
 
 def disc_visibilities(frequencies: Tensor, diameters: Tensor | float) -> Tensor:
     """Return visibilities (..., F) of uniform discs of `diameters` (...) [rad] at frequencies (F, 2) [cycles per rad].
+
+    They are as the amplitude that a round hole diffracts.
 
     Examples
     --------
@@ -27,18 +31,15 @@ def disc_visibilities(frequencies: Tensor, diameters: Tensor | float) -> Tensor:
     >>> bool(disc_visibilities(baseline, 1e-6).abs() < 1e-7)
     True
     """
-    x = _argument(frequencies, diameters)
-    first = torch.from_numpy(j1(x.numpy()))  # that of PyTorch is accurate to 1e-7 only
-    return torch.where(x < _SMALL, 1 - x**2 / 8, 2 * first / x.clamp(min=_SMALL))
+    return torch.from_numpy(Disc().amplitude((_sizes(diameters)[..., None] * frequencies).numpy(), 1.0))
 
 
 def disc_slopes(frequencies: Tensor, diameters: Tensor | float) -> Tensor:
     """Return derivatives (..., F) of `disc_visibilities` in the diameters [1 / rad]."""
-    x = _argument(frequencies, diameters)
-    by_x = torch.where(x < _SMALL, -x / 4, -2 * torch.from_numpy(jv(2, x.numpy())) / x.clamp(min=_SMALL))
-    return math.pi * torch.linalg.vector_norm(frequencies, dim=1) * by_x
+    turns = math.pi * torch.linalg.vector_norm(frequencies, dim=1)
+    x = turns * _sizes(diameters)
+    return -2 * turns * torch.from_numpy(jv(2, x.numpy())) / x.clamp(min=_TINY)
 
 
-def _argument(frequencies: Tensor, diameters: Tensor | float) -> Tensor:
-    sizes = torch.as_tensor(diameters, dtype=torch.float64)[..., None]
-    return math.pi * sizes * torch.linalg.vector_norm(frequencies, dim=1)
+def _sizes(diameters: Tensor | float) -> Tensor:
+    return torch.as_tensor(diameters, dtype=torch.float64)[..., None]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from enum import Enum
 
 import torch
 from torch import Tensor
@@ -27,7 +27,15 @@ _EQUAL = 0.999  # brightest contrast at which its slopes are taken
 _ERRORS_WITHIN = 1.5  # factor by which errors may be too small: 20 frames give them to 16 %, three times which is 1.5
 _CHANCE = 5.0  # standard deviations of the chi-square that are put down to chance
 
-Verdict = Literal["companion", "outside", "resolved", "none", "not explained"]
+
+class PairVerdict(Enum):
+    """What measurements of a star show, see `PairFit.verdict`."""
+
+    COMPANION = "companion"
+    OUTSIDE = "outside"
+    RESOLVED = "resolved"
+    NONE = "none"
+    NOT_EXPLAINED = "not explained"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -72,37 +80,42 @@ class PairFit(Brief):
         return _ERRORS_WITHIN**2 * (freedom + _CHANCE * math.sqrt(2 * freedom))
 
     @property
-    def verdict(self) -> Verdict:
+    def verdict(self) -> PairVerdict:
         """What the measurements show.
 
-        A "companion" is worth `SIGNIFICANCE` standard errors and gives light, no uniform disc does as well, and
-        it is in the searched annulus, or closer with a contrast that is known to as many of its errors. One
-        "outside" is all this, but elsewhere: beyond the search, or so close that contrast and separation are
-        not told apart, as of a resolved star that is no uniform disc. "resolved" is where a uniform disc does
-        as well, within a chi-square of `RIVAL`, as of a resolved star or a closer pair, and "none" where the
-        star alone does. "not explained" is what no star explains, with a companion or as a disc.
+        A `COMPANION` is worth `SIGNIFICANCE` standard errors and gives light, no uniform disc does as well, and it is
+        in the searched annulus, or closer with a contrast that is known to as many of its errors. One `OUTSIDE` is all
+        this, but elsewhere: beyond the search, or so close that contrast and separation are not told apart, as of a
+        resolved star that is no uniform disc. `RESOLVED` is where a uniform disc does as well, within a chi-square of
+        `RIVAL`, as of a resolved star or a closer pair, and `NONE` where the star alone does. `NOT_EXPLAINED` is what
+        no star explains, with a companion or as a disc.
         """
         best = min(self.chi_square, self.disc.chi_square)
         if best > self.limit:
-            return "not explained"
+            return PairVerdict.NOT_EXPLAINED
         left = unexplained(best, self.degrees_of_freedom)
         if self.star_chi_square - best < SIGNIFICANCE**2 * left:
-            return "none"
+            return PairVerdict.NONE
         if self.disc.chi_square - self.chi_square < RIVAL * left:
-            return "resolved"
+            return PairVerdict.RESOLVED
         if not float(self.companion[0]) > 0:
-            return "none"
-        return "companion" if self._located() else "outside"
+            return PairVerdict.NONE
+        return PairVerdict.COMPANION if self._located() else PairVerdict.OUTSIDE
 
     @property
     def explained(self) -> bool:
         """Whether a star explains the measurements, alone, with a companion or as a disc."""
-        return self.verdict != "not explained"
+        return self.verdict is not PairVerdict.NOT_EXPLAINED
 
     @property
     def detected(self) -> bool:
         """Whether there is a companion."""
-        return self.verdict == "companion"
+        return self.verdict is PairVerdict.COMPANION
+
+    @property
+    def shows_pair(self) -> bool:
+        """Whether a companion, in the searched annulus or elsewhere, is what fits best."""
+        return self.verdict in (PairVerdict.COMPANION, PairVerdict.OUTSIDE)
 
     def _located(self) -> bool:
         least, most = self.separations

@@ -14,7 +14,7 @@ from torchmask.interferometry.companion_limits import SIGNIFICANCE, DetectionLim
 from torchmask.interferometry.disc_model import disc_slope
 from torchmask.interferometry.disc_visibility import disc_visibilities
 from torchmask.interferometry.measurements import Measurements
-from torchmask.interferometry.pair_fit import PairFit
+from torchmask.interferometry.pair_fit import PairFit, PairVerdict
 from torchmask.interferometry.pair_model import PARAMETERS, PairResiduals, pair_visibilities, unexplained
 from torchmask.optics.phasor import phasor
 
@@ -65,7 +65,7 @@ def pair_limits(
 
 def _apart(measured: Measurements, fit: PairFit, offsets: Tensor) -> Tensor:
     """Return the offsets that are apart from the companion, if there is one."""
-    if fit.verdict not in ("companion", "outside"):
+    if not fit.shows_pair:
         return offsets
     known = torch.stack([fit.companion[1:]] + [-fit.companion[1:]] * (len(measured.closure_phases) == 0))
     return offsets[torch.cdist(offsets, known).amin(1) > measured.finest / 2]
@@ -105,15 +105,14 @@ class _Shown:
 
 def _shown(problem: PairResiduals, fit: PairFit) -> _Shown:
     places = (problem.frequencies, problem.sides)
-    if fit.verdict == "resolved":
+    if fit.verdict is PairVerdict.RESOLVED:
         seen, sides = (disc_visibilities(each, fit.disc.diameter) + 0j for each in places)
         error = math.sqrt(unexplained(fit.disc.chi_square, problem.size - 1))
         return _Shown(seen, sides, disc_slope(problem, fit.disc.diameter)[:, None], error, 1.0)
     error = math.sqrt(unexplained(fit.chi_square, fit.degrees_of_freedom))
-    paired = fit.verdict in ("companion", "outside")
-    companion = fit.companion if paired else torch.zeros_like(fit.companion)
+    companion = fit.companion if fit.shows_pair else torch.zeros_like(fit.companion)
     seen, sides = (pair_visibilities(each, companion) for each in places)
-    slopes = (problem.slopes(companion) * problem.unit)[:, : PARAMETERS * paired]
+    slopes = (problem.slopes(companion) * problem.unit)[:, : PARAMETERS * fit.shows_pair]
     return _Shown(seen, sides, slopes, error, 1 / (1 + float(companion[0])))
 
 
