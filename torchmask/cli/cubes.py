@@ -6,7 +6,7 @@ from pathlib import Path
 
 from torchmask.data.fits import read_fits
 from torchmask.observation import Observation
-from torchmask.optics.pupil import sample_holes
+from torchmask.optics.pupil import pupil_raster
 
 
 def require_one_map(path: Path | None) -> None:
@@ -27,9 +27,8 @@ def require_wide_frames(observation: Observation, path: Path) -> None:
     The message says what was read. Whatever else makes frames too narrow is refused later, by what they are used for;
     as a restoration pads them, those that would do in a field twice as wide pass here.
     """
-    aperture = observation.aperture
     try:
-        sample_holes(aperture.centers, aperture.shape, aperture.subaperture_diameter, observation.grid, 2)
+        pupil_raster(observation.aperture.subaperture_diameter, observation.grid, 2)
     except ValueError as error:
         count, rows, columns = read_fits(path).values.shape
         if columns < rows / 2 or count > min(rows, columns):

@@ -122,17 +122,7 @@ def sample_holes(
     """
     if centers.dtype not in (torch.float32, torch.float64):
         raise TypeError(f"the centres are {centers.dtype}: float32 or float64 is needed, as by aperture.float()")
-    finer = 1 if oversampling is None else whole_number("oversampling", oversampling)
-    raster = (grid.shape[0] * finer, grid.shape[1] * finer)
-    step = (grid.period / raster[0], grid.period / raster[1])
-    if diameter * (1 + 1e-9) < 2 * max(step):  # more than rounding, as of a mask that was turned
-        wider = 2 * max(step) / diameter
-        or_finer = "" if oversampling is None else f" or oversampling of at least {math.ceil(finer * wider)}"
-        raise ValueError(
-            f"a sub-aperture of {diameter:.4g} m spans {diameter / max(step):.2f} pupil samples of "
-            f"{max(step):.4g} m: at least 2 are needed, so take an image at least {math.ceil(100 * wider) / 100:g} "
-            f"times as wide{or_finer}"
-        )
+    raster, step = pupil_raster(diameter, grid, oversampling)
     cell = vector(centers, step[1], step[0])
     half = [math.ceil(shape.outer_diameter(diameter) / (2 * s)) + 1 for s in (step[1], step[0])]
     patch = torch.cartesian_prod(
@@ -144,6 +134,27 @@ def sample_holes(
     weights = shape.coverage(offsets, cell, diameter)
     index = (position[..., 1] % raster[0]) * raster[1] + position[..., 0] % raster[1]
     return PupilSamples(offsets, weights, index, raster, step)
+
+
+def pupil_raster(
+    diameter: float, grid: Grid, oversampling: int | None = None
+) -> tuple[tuple[int, int], tuple[float, float]]:
+    """Return the numbers (rows, columns) of a raster's pupil samples and their steps (y, x) [m].
+
+    Raises ValueError if a sub-aperture of this diameter [m] is narrower than two samples.
+    """
+    finer = 1 if oversampling is None else whole_number("oversampling", oversampling)
+    raster = (grid.shape[0] * finer, grid.shape[1] * finer)
+    step = (grid.period / raster[0], grid.period / raster[1])
+    if diameter * (1 + 1e-9) < 2 * max(step):  # more than rounding, as of a mask that was turned
+        wider = 2 * max(step) / diameter
+        or_finer = "" if oversampling is None else f" or oversampling of at least {math.ceil(finer * wider)}"
+        raise ValueError(
+            f"a sub-aperture of {diameter:.4g} m spans {diameter / max(step):.2f} pupil samples of "
+            f"{max(step):.4g} m: at least 2 are needed, so take an image at least {math.ceil(100 * wider) / 100:g} "
+            f"times as wide{or_finer}"
+        )
+    return raster, step
 
 
 def can_be_read(tensor: Tensor) -> bool:
