@@ -209,3 +209,22 @@ def test_a_flat_estimate_has_a_score():
     mean = float(truth.mean())
     expected = float((truth - mean).norm() / truth.norm())  # the best constant is the mean
     assert relative_error(torch.ones(16, 16), truth, 0.4) == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_scores_are_the_same_where_gradients_are_off(mode):
+    """As in every validation loop; the registration takes gradients of its own."""
+    truth = smooth_scene(20, 24, 0.4)
+    estimate = moved(truth, 0.3, -1.6) + 0.1
+    expected = relative_error(estimate, truth, 0.4), ssim(estimate, truth, 0.4)
+    with mode():
+        inside = truth.clone()  # which inference mode lets take part in no gradient
+        assert (relative_error(estimate, inside, 0.4), ssim(estimate, inside, 0.4)) == expected
+
+
+def test_images_of_whole_numbers_are_taken_as_they_are_and_half_precision_is_refused():
+    image = np.arange(30).reshape(5, 6) ** 2 % 17
+    for changed in (lambda x: lowpass(x, 0.3), lambda x: shift(x, (0.4, -1.2))):
+        assert torch.equal(changed(image), changed(torch.from_numpy(image).double()))
+        with pytest.raises(TypeError, match=r"image is torch.float16: float32 or float64 is needed"):
+            changed(torch.ones(4, 4, dtype=torch.float16))

@@ -24,26 +24,27 @@ _PEAK_PERCENTILE = 99.5  # glints above it would set the range of the structural
 def lowpass(image: Any, cutoff: float) -> Tensor:
     """Remove all frequencies above `cutoff` [cycles/pixel] from images (..., H, W) by a sharp circular cut.
 
-    `image` is a tensor or an array. The result is differentiable and keeps dtype and device. Raises ValueError if
-    `cutoff` is not finite and positive.
+    `image` is a tensor or an array; whole numbers become float64. The result is differentiable and keeps any other
+    dtype, and the device. Raises ValueError if `cutoff` is not finite and positive, and TypeError if `image` is in half
+    precision, which FFTs do not know.
     """
     if not (math.isfinite(cutoff) and cutoff > 0):
         raise ValueError(
             f"cutoff is {cutoff}: it must be positive, in cycles/pixel (diameter * pixel_scale / wavelength)"
         )
-    image = as_tensor(image)
+    image = _real(image)
     nu_y, nu_x = _frequencies(image.shape, torch.float64, image.device)
     kept = torch.hypot(nu_y, nu_x) <= cutoff * (1 + _ROUNDING)
     return torch.fft.irfft2(torch.fft.rfft2(image) * kept, s=image.shape[-2:])
 
 
-def shift(image: Tensor, offset: Tensor | tuple[float, float]) -> Tensor:
+def shift(image: Any, offset: Tensor | tuple[float, float]) -> Tensor:
     """Shift images by any fraction of a pixel, with wrap-around, by the shift theorem, exact for band-limited images.
 
     Parameters
     ----------
-    image : (..., H, W) tensor
-        Images to shift.
+    image : (..., H, W) tensor or array
+        Images to shift; whole numbers become float64.
     offset : (..., 2) tensor or (dy, dx)
         Shift of each image along rows and columns [pixels]; leading axes broadcast against those of `image`.
 
@@ -56,6 +57,8 @@ def shift(image: Tensor, offset: Tensor | tuple[float, float]) -> Tensor:
     ------
     ValueError
         If the last axis of `offset` is not (dy, dx).
+    TypeError
+        If `image` is in half precision, which FFTs do not know.
 
     Notes
     -----
@@ -68,6 +71,7 @@ def shift(image: Tensor, offset: Tensor | tuple[float, float]) -> Tensor:
     >>> shift(image, (1.0, -2.0)).round().nonzero().tolist()
     [[2, 0]]
     """
+    image = _real(image)
     move = torch.as_tensor(offset, dtype=image.dtype, device=image.device)
     return torch.fft.irfft2(torch.fft.rfft2(image) * shift_transfer(image.shape, move), s=image.shape[-2:])
 
@@ -169,12 +173,22 @@ def _checked(estimate: Any, truth: Any) -> tuple[Tensor, Tensor]:
     return images[0], images[1]
 
 
+def _real(values: Any) -> Tensor:
+    image = as_tensor(values)
+    image = image if image.is_floating_point() or image.is_complex() else image.double()
+    if image.dtype not in (torch.float32, torch.float64):
+        raise TypeError(f"image is {image.dtype}: float32 or float64 is needed, as FFTs know no half precision")
+    return image
+
+
 def _frequencies(shape: Sequence[int], dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
     nu_y = torch.fft.fftfreq(shape[-2], dtype=dtype, device=device)
     nu_x = torch.fft.rfftfreq(shape[-1], dtype=dtype, device=device)
     return nu_y[:, None], nu_x
 
 
+@torch.inference_mode(False)
+@torch.enable_grad()
 def registration(image: Tensor, reference: Tensor) -> Tensor:
     """Return the shift (dy, dx) of `image` that correlates best with `reference`.
 
@@ -182,6 +196,7 @@ def registration(image: Tensor, reference: Tensor) -> Tensor:
     trigonometric polynomial of the shift whose derivatives come from autograd. (scikit-image's phase_cross_correlation
     takes the largest modulus, so a negative image would match too, and finds 1e-3 pixels by brute force.)
     """
+    image, reference = image.detach().clone(), reference.detach().clone()  # of inference mode, they know no gradients
     norm = float(image.norm() * reference.norm())
     rows, columns = image.shape
     correlation = torch.fft.irfft2(torch.fft.rfft2(reference) * torch.fft.rfft2(image).conj(), s=image.shape)

@@ -53,6 +53,18 @@ def test_a_mask_sees_alone_what_it_sees_in_a_population(turbulence):
 
 
 @pytest.mark.parametrize("turbulence", KINDS.values(), ids=KINDS.keys())
+def test_single_precision_sees_the_screens_of_double_precision(turbulence):
+    """But for rounding: of the phasors and sums that make the screens, a few units in the last place of the largest."""
+    double, single = (
+        turbulence(mask_of(CENTERS.to(dtype)).samples(GRID), 2, torch.Generator().manual_seed(0))
+        for dtype in (torch.float64, torch.float32)
+    )
+    assert single.dtype == torch.float32
+    few = 64 * torch.finfo(torch.float32).eps
+    torch.testing.assert_close(single.double(), double, rtol=0, atol=few * float(double.abs().max()))
+
+
+@pytest.mark.parametrize("turbulence", KINDS.values(), ids=KINDS.keys())
 def test_psfs_do_not_jump_as_a_hole_moves(turbulence):
     """Where the outermost hole begins to be sampled from the next cell on; the screens themselves were others then.
 

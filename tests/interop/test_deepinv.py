@@ -12,6 +12,7 @@ from torchmask.observation import Observation
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.detector import Detector, image_formation
 from torchmask.restoration.myopic import MyopicDeconvolution
+from torchmask.simulation.conditions import Conditions
 from torchmask.simulation.exposures import simulate_observation
 
 if importlib.util.find_spec("deepinv") is None:
@@ -110,6 +111,18 @@ def test_an_observation_becomes_physics_and_measurements(observation):
     assert float((observation.frames - expected[0]).norm() / observation.frames.norm()) < 0.03
     torch.testing.assert_close(y[0] * 500.0, observation.frames)
     assert torch.equal(physics.measured(observation.frames[None]), y)
+
+
+@pytest.mark.parametrize("conditions", [Conditions(transparency_scatter=0.3), Conditions(sky=500.0)])
+def test_transmissions_and_sky_of_an_observation_are_known(observation, conditions):
+    """The truth explains the frames as well as it does without them: but for their noise, and light beyond the PSFs."""
+    scene, turbulence = observation.object, TurbulencePhase(0.2, 20.0)
+    seen = simulate_observation(scene, MASK, GRID, turbulence, Detector(1.5), 6, seeded(), conditions=conditions)
+    physics, y = StackPhysics.from_observation(seen)
+    rest = (y - physics.A(seen.object[None, None] / physics.unit)) * physics.unit
+    assert float(rest.norm() / seen.frames.norm()) < 0.03
+    noise = physics.noise_model.sigma * physics.unit
+    assert float(noise) == pytest.approx((1.5**2 + conditions.sky) ** 0.5)
 
 
 @pytest.mark.parametrize("solver", ["FISTA", "ADMM"])

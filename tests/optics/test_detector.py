@@ -213,3 +213,11 @@ def test_no_frames_are_formed_from_no_psfs():
     assert image_formation_adjoint(frames, psfs).shape == (0, 4, 4)
     frames.sum().backward()
     assert not bool(scene.grad.any())
+
+
+@pytest.mark.parametrize("noise", ["poisson", "gaussian"])
+def test_single_precision_draws_the_noise_of_double_precision(noise):
+    light = torch.arange(1.0, 61.0).view(6, 10)
+    single, double = (Detector(2.0, noise)(light.to(dtype), generator(3)) for dtype in (torch.float32, torch.float64))
+    assert single.dtype == torch.float32
+    torch.testing.assert_close(single, double.float(), rtol=4 * torch.finfo(torch.float32).eps, atol=1e-5)

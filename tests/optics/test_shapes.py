@@ -504,12 +504,21 @@ def test_shapes_map_and_differentiate_under_torch_func(shape):
 
 def test_disc_otf_gradient_includes_the_degenerate_points():
     x = torch.tensor([0.01, 0.3, 0.99, 1.5], dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(disc_otf, x)
+    assert torch.autograd.gradcheck(disc_otf, x, check_forward_ad=True)
     assert torch.autograd.gradgradcheck(disc_otf, x)
     edge = torch.tensor([0.0, 1.0], dtype=torch.float64, requires_grad=True)
     disc_otf(edge).sum().backward()
     assert edge.grad is not None
     assert edge.grad.tolist() == pytest.approx([-4 / math.pi, 0.0])
+
+
+@pytest.mark.parametrize("hessian", [torch.autograd.functional.hessian, lambda f, x: torch.func.hessian(f)(x)])
+def test_the_curvature_of_a_disc_otf_is_finite_at_its_edge(hessian):
+    """The second derivative of T at 0 < x < 1 is (4 / pi) x / (1 - x^2)^(1/2), and 0 is taken where it is infinite."""
+    x = torch.tensor([0.3, 0.8, 1.0, 1.5], dtype=torch.float64)
+    expected = torch.where(x < 1, 4 / math.pi * x / (1 - x**2).abs().clamp(min=1e-9).sqrt(), 0)
+    found = hessian(lambda x: disc_otf(x).sum(), x)
+    torch.testing.assert_close(found, expected.diag(), rtol=1e-12, atol=0)
 
 
 def test_a_thin_obstruction_changes_little_and_a_wide_one_leaves_a_ring():

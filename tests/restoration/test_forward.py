@@ -175,7 +175,7 @@ def test_an_object_and_aberrations_of_another_model_are_refused():
     assert model(image, z).shape == (2, *GRID.shape)
     with pytest.raises(ValueError, match=r"the object has shape .*into which model\.window\.embed puts an object"):
         model(model.window.crop(image), z)
-    for other in (z[:, :-1], z[0]):
+    for other in (z[:, :-1], z[0], z[None]):
         with pytest.raises(ValueError, match=r"z has shape .*: \(T, 12\) is needed"):
             model(image, other)
 

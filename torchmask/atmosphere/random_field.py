@@ -133,12 +133,16 @@ class RandomField:
         ]
 
     def draw(self, generator: torch.Generator | None) -> list[Tensor]:
-        """Draw random coefficients; the real and the imaginary part of their sum are two independent screens."""
-        source = self.kind["device"] if generator is None else generator.device
-        noise = [
-            torch.randn(a.shape, generator=generator, dtype=self.kind["dtype"], device=source) for a in self.amplitudes
-        ]
-        return [n.to(a.device) * a for n, a in zip(noise, self.amplitudes, strict=True)]
+        """Draw random coefficients; the real and the imaginary part of their sum are two independent screens.
+
+        Those of a generator are drawn in double precision, so that they are the same whatever the data type.
+        """
+        if generator is None:
+            like = self.kind
+        else:
+            like = {"dtype": torch.complex128, "device": generator.device, "generator": generator}
+        noise = [torch.randn(a.shape, **like).to(**self.kind) for a in self.amplitudes]
+        return [n * a for n, a in zip(noise, self.amplitudes, strict=True)]
 
     def sum(self, coefficients: list[Tensor]) -> Tensor:
         """Return the field on the raster, complex (rows, columns)."""

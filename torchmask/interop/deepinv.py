@@ -35,12 +35,15 @@ class StackPhysics(LinearPhysics):
         Read-out noise [electrons rms per pixel and frame].
     generator : torch.Generator, optional
         Source of the random noise.
+    sky : float
+        Light that does not come from the object [electrons per pixel and frame]. `measured` takes it off, and its
+        photon noise is part of the read-out noise.
 
     Raises
     ------
     ValueError
-        If `psfs` has neither 3 nor 4 axes, `unit` is not finite and positive, `readout_noise` is negative or not
-        finite, or an image or a stack does not have the axes below.
+        If `psfs` has neither 3 nor 4 axes, `unit` is not finite and positive, `readout_noise` or `sky` is negative
+        or not finite, or an image or a stack does not have the axes below.
 
     Notes
     -----
@@ -66,6 +69,7 @@ class StackPhysics(LinearPhysics):
         unit: float = 1.0,
         readout_noise: float = 0.0,
         generator: torch.Generator | None = None,
+        sky: float = 0.0,
     ) -> None:
         if psfs.ndim not in (3, 4):
             raise ValueError(f"psfs has shape {tuple(psfs.shape)}: it must be (T, rows, columns), or that for a batch")
@@ -73,9 +77,13 @@ class StackPhysics(LinearPhysics):
             raise ValueError(f"unit is {unit}: it must be finite and positive, in electrons per pixel")
         if not (math.isfinite(readout_noise) and readout_noise >= 0):
             raise ValueError(f"readout_noise is {readout_noise}: it must be finite and not negative, in electrons rms")
-        noise = PoissonGaussianNoise(1 / unit, readout_noise / unit, clip_positive=True, rng=generator)
+        if not (math.isfinite(sky) and sky >= 0):
+            raise ValueError(f"sky is {sky}: it must be finite and not negative, in electrons per pixel and frame")
+        even = math.sqrt(readout_noise**2 + sky)
+        noise = PoissonGaussianNoise(1 / unit, even / unit, clip_positive=True, rng=generator)
         super().__init__(noise_model=noise.to(psfs.dtype), device=psfs.device)  # type: ignore[arg-type]
         self.unit: float = float(unit)
+        self.sky: float = float(sky)
         self.register_buffer("psfs", psfs)
 
     @classmethod
@@ -84,7 +92,8 @@ class StackPhysics(LinearPhysics):
     ) -> tuple[StackPhysics, Tensor]:
         """Return the physics of a simulated observation with its true PSFs, and its frames (1, T, H, W) in `unit`.
 
-        Light beyond the stored PSFs is treated as lost, and unknown read-out noise as zero. By default `unit` is the
+        Its true transmissions are part of the PSFs, and its true sky is `sky`. Light beyond the stored PSFs is treated
+        as lost, and unknown read-out noise as zero. By default `unit` is the
         99.9th percentile of the mean frame, which the peak of a restored object exceeds a few times. Raises ValueError
         if the observation has no PSFs.
         """
@@ -94,14 +103,17 @@ class StackPhysics(LinearPhysics):
         psfs = observation.frames.new_zeros(len(observation.frames), 2 * height, 2 * width)
         psfs[..., :height, :width] = observation.psfs
         psfs = psfs.roll((-(height // 2), -(width // 2)), dims=(-2, -1))
+        if observation.transmission is not None:
+            psfs = psfs * observation.transmission.to(psfs)[:, None, None]
+        sky = observation.background or 0.0
         if unit is None:
-            unit = float(torch.quantile(observation.frames.mean(0), 0.999))
-        physics = cls(psfs, unit, observation.readout_noise or 0.0, generator)
+            unit = float(torch.quantile(observation.frames.mean(0) - sky, 0.999))
+        physics = cls(psfs, unit, observation.readout_noise or 0.0, generator, sky)
         return physics, physics.measured(observation.frames)
 
     def measured(self, frames: Tensor) -> Tensor:
-        """Convert frames (T, H, W) or (B, T, H, W) [electrons] to measurements (B, T, H, W) of this physics."""
-        return (frames if frames.ndim == 4 else frames[None]).to(self.psfs) / self.unit
+        """Convert frames (T, H, W) or (B, T, H, W) [electrons] to measurements (B, T, H, W) without sky."""
+        return ((frames if frames.ndim == 4 else frames[None]).to(self.psfs) - self.sky) / self.unit
 
     def A(self, x: Tensor, **kwargs: object) -> Tensor:
         """Return the expected frames (B, T, H, W) of images (B, 1, H, W)."""

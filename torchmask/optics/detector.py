@@ -142,7 +142,8 @@ class Detector(nn.Module):
     def forward(self, expected: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Draw frames (..., H, W) [electrons] whose mean is `expected` (..., H, W) [electrons].
 
-        A `generator` on the CPU works for any device of `expected`, and gives the same noise on all of them.
+        A `generator` on the CPU works for any device of `expected`, and gives the same noise on all of them. Noise is
+        drawn in float64 with any generator, so that float32 sees that of float64.
 
         Raises TypeError if `expected` is no tensor of float32 or float64, and ValueError if a value is not finite, or
         is negative beyond the rounding error of the FFTs that formed its image (values are not checked under
@@ -154,13 +155,16 @@ class Detector(nn.Module):
         rounding = 32 * torch.finfo(expected.dtype).eps * norm
         if can_be_read(expected):
             _require_light(expected, rounding)
-        device = expected.device if generator is None else generator.device
-        normal = torch.randn(expected.shape, generator=generator, dtype=expected.dtype, device=device)
+        if generator is None:
+            device, dtype = expected.device, expected.dtype
+        else:
+            device, dtype = generator.device, torch.float64
+        normal = torch.randn(expected.shape, generator=generator, dtype=dtype, device=device)
         if self.noise == "gaussian":
             variance = expected.clamp(min=0) + self.readout_noise**2
-            return expected + _root(variance, rounding) * normal.to(expected.device)
-        counts = torch.poisson(expected.detach().clamp(min=0).to(device), generator=generator)
-        return (counts + self.readout_noise * normal).to(expected.device)
+            return expected + _root(variance, rounding) * normal.to(expected)
+        counts = torch.poisson(expected.detach().clamp(min=0).to(device, dtype), generator=generator)
+        return (counts + self.readout_noise * normal).to(expected)
 
     def extra_repr(self) -> str:
         pixel = "" if self.pixel is None else f", pixel={self.pixel}"

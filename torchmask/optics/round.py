@@ -199,11 +199,16 @@ class _CircleOverlap(torch.autograd.Function):
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
         distance, ctx.one, ctx.other = inputs
         ctx.save_for_backward(distance)
+        ctx.save_for_forward(distance)
 
     @staticmethod
     def backward(ctx: Any, *grad: Tensor) -> tuple[Tensor, None, None]:
+        return _CircleOverlap.jvp(ctx, *grad), None, None
+
+    @staticmethod
+    def jvp(ctx: Any, *change: Tensor) -> Tensor:
         (distance,) = ctx.saved_tensors
-        return -2 * ctx.one * _CircleOverlap._half_angle(distance, ctx.one, ctx.other)[1] * grad[0], None, None
+        return -2 * ctx.one * _CircleOverlap._half_angle(distance, ctx.one, ctx.other)[1] * change[0]
 
     @staticmethod
     def _segment(distance: Tensor, radius: float, rest: float) -> Tensor:
@@ -216,7 +221,9 @@ class _CircleOverlap(torch.autograd.Function):
         """Return cosine and sine of half the angle that the common chord subtends at the centre of one circle."""
         distance = distance.clamp(min=1e-18)
         cosine = ((distance**2 + (radius**2 - rest**2)) / (2 * radius * distance)).clamp(-1, 1)
-        return cosine, torch.sqrt((1 - cosine) * (1 + cosine))
+        squared = (1 - cosine) * (1 + cosine)
+        # where the circles touch, the slope of the root is infinite on one side and zero on the other, which is taken
+        return cosine, torch.where(squared > 0, squared, 1).sqrt() * (squared > 0)
 
 
 def _distance(shift: Tensor) -> Tensor:

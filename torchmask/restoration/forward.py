@@ -224,10 +224,11 @@ class ExposureModel(nn.Module):
                 f"the object has shape {tuple(image.shape)}: (..., *{self.window.field.shape}) is needed, that of the "
                 "field, into which model.window.embed puts an object on the pixels of the frames"
             )
-        if z.ndim < 2 or z.shape[-1] != self.aberrations.n_parameters:
+        if z.ndim != 2 or z.shape[-1] != self.aberrations.n_parameters:
             raise ValueError(
                 f"z has shape {tuple(z.shape)}: (T, {self.aberrations.n_parameters}) is needed, the parameters of all "
-                "sub-apertures in each frame, as model.aberrations.parameters_of(coefficients) returns"
+                "sub-apertures in each frame, as model.aberrations.parameters_of(coefficients) returns; "
+                "torch.func.vmap(model) takes batches of stacks"
             )
 
 
