@@ -74,7 +74,10 @@ def test_errors_of_places_are_their_scatter(electrons):
     valid, columns = torch.ones_like(frames, dtype=torch.bool), model.columns(0.0, 0.0)
     noise = PixelNoise(frames + READOUT**2, is_own=True, light=frames)
     light, errors = _light_and_errors(frames, valid, noise, model, torch.zeros(2, dtype=torch.float64))
-    found = torch.tensor([model.place_beside_fringes(frame, valid[0].double(), columns) for frame in frames])
+    seen = valid[0].double()
+    found = torch.tensor(
+        [model.place_beside_fringes(frame, seen, model.norm(seen), columns) for frame in frames], dtype=torch.float64
+    )
     scatter = float(found.square().mean(0).amax().sqrt())
     assert 0.7 < scatter / float(errors.mean()) < 1.8
     assert abs(float(light.mean()) / electrons - 1) < 0.1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -92,11 +93,14 @@ class FringeModel:
         self._transfer = aperture.shape.otf(shift, aperture.subaperture_diameter)
         self._seen = None if pixel is None else pixel.transfer(self._nu_y, self._nu_x)
 
+    @cached_property
+    def points(self) -> FringeModel:
+        """The model of light that pixels do not blur, which does not move it."""
+        return self if self._seen is None else FringeModel(self.aperture, self.grid)
+
     def blur(self, image: Tensor) -> Tensor:
         """Blur an image (H, W), dark outside, by the diffraction pattern of one hole."""
-        height, width = self.grid.shape
-        wide = torch.fft.ifft2(torch.fft.fft2(image, s=self._wide.shape) * self._transfer).real
-        return wide[:height, :width]
+        return self._around(image, self._halves[0])[: self.grid.shape[0], : self.grid.shape[1]]
 
     def centre(self, frames: Tensor, valid: Tensor) -> tuple[float, float]:
         """Return the place (x, y) of the light in frames (T, H, W), relative to [H // 2, W // 2] [pixel].
@@ -106,32 +110,42 @@ class FringeModel:
         each place and taken off before the next.
         """
         light, counted = torch.where(valid, frames, 0.0).sum(0), valid.double().sum(0)
-        points = FringeModel(self.aperture, self.grid)  # the blur by pixels does not move light
-        place = self._likeliest(light, counted)
+        points, norm = self.points, self.norm(counted)
+        place = self._likeliest(light, norm)
         for _ in range(_PLACES):
-            before, place = place, points.place_beside_fringes(light, counted, points.columns(*place))
+            before, place = place, points.place_beside_fringes(light, counted, norm, points.columns(*place))
             if math.dist(before, place) < _SETTLED:
                 break
         return place
 
-    def place_beside_fringes(self, light: Tensor, counted: Tensor, columns: Tensor) -> tuple[float, float]:
+    def place_beside_fringes(
+        self, light: Tensor, counted: Tensor, norm: Tensor, columns: Tensor
+    ) -> tuple[float, float]:
         """Return the place (x, y) of `light` (H, W), a sum over `counted` frames, without the fringes in `columns`."""
         normal, seen = (columns * counted.flatten()) @ columns.T, columns @ light.flatten()
         values = torch.linalg.lstsq(normal, seen[:, None], driver="gelsd").solution[1:, 0]
-        return self._likeliest(light - counted * (values @ columns[1:]).view_as(counted), counted)
+        return self._likeliest(light - counted * (values @ columns[1:]).view_as(counted), norm)
 
-    def _likeliest(self, light: Tensor, counted: Tensor) -> tuple[float, float]:
+    @cached_property
+    def _halves(self) -> tuple[Tensor, Tensor]:
+        """Transforms of the envelope and of its square for the frequencies of `rfft2`; the envelope is real."""
+        squared = torch.fft.rfft2(torch.fft.ifft2(self._transfer).real ** 2)
+        return self._transfer[:, : squared.shape[1]], squared
+
+    def norm(self, counted: Tensor) -> Tensor:
+        """Return the square of the envelope around each place, summed over `counted` frames (H, W)."""
+        return self._around(counted, self._halves[1])
+
+    def _around(self, image: Tensor, transfer: Tensor) -> Tensor:
+        return torch.fft.irfft2(torch.fft.rfft2(image, s=self._wide.shape) * transfer, s=self._wide.shape)
+
+    def _likeliest(self, light: Tensor, norm: Tensor) -> tuple[float, float]:
         """Return the place (x, y) where the envelope explains most of `light` (H, W), a sum over `counted` frames.
 
-        Envelope e of the best brightness explains (e . light)^2 / (e^2 . counted). A parabola through the root of that
-        gives its peak to a fraction of a pixel; it may lie up to one pixel outside the field.
+        Envelope e of the best brightness explains (e . light)^2 / (e^2 . counted), whose lower part is `norm`. A
+        parabola through the root of that gives its peak to a fraction of a pixel; it may lie up to one pixel outside.
         """
-        squared = torch.fft.fft2(torch.fft.ifft2(self._transfer).real ** 2)
-        along, norm = (
-            torch.fft.ifft2(torch.fft.fft2(image, s=self._wide.shape) * transfer).real
-            for image, transfer in ((light, self._transfer), (counted, squared))
-        )
-        share = along / norm.clamp(min=_LEAST_SEEN * float(norm.max())).sqrt()
+        share = self._around(light, self._halves[0]) / norm.clamp(min=_LEAST_SEEN * float(norm.max())).sqrt()
         height, width = self.grid.shape
         row, column = divmod(int(share[:height, :width].argmax()), width)
         offsets = []
@@ -150,14 +164,18 @@ class FringeModel:
         height, width = self.grid.shape
         ramp = -2 * math.pi * (self._nu_x * (x + width // 2) + self._nu_y * (y + height // 2))
         envelope = torch.fft.ifft2(self._transfer * phasor(ramp)).real
-        waves = fringe_waves(self.aperture, self.grid, self.pairs)
         if self._seen is None:
-            light, fringes = envelope[:height, :width].flatten(), waves * envelope[:height, :width].flatten()
+            light = envelope[:height, :width].flatten()
+            fringes = self._waves * light
         else:
             light = self._through_pixels(envelope).real
             wide = self._wide_waves()
             fringes = torch.stack([self._through_pixels(envelope * row[:, None] * column) for row, column in wide])
         return torch.cat([light[None], 2 * fringes.real, -2 * fringes.imag])
+
+    @cached_property
+    def _waves(self) -> Tensor:
+        return fringe_waves(self.aperture, self.grid, self.pairs)
 
     def _wide_waves(self) -> list[tuple[Tensor, Tensor]]:
         """Return exp(2 pi i nu . x) of every baseline on the wide field, factored into rows and columns."""
@@ -214,18 +232,6 @@ def as_complex(parts: Tensor) -> Tensor:
     """Return complex numbers (..., B) from real and imaginary parts (..., 2 B)."""
     real, imaginary = parts.chunk(2, -1)
     return torch.complex(real, imaginary)
-
-
-def complex_covariances(covariance: Tensor, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """Return E(f g) and E(f g*), both (T, M), of the noise of fringes `first` and `second` (M,).
-
-    `covariance` (T, K, K) is that of the parameters.
-    """
-    size = covariance.shape[-1] // 2
-    real, imaginary = slice(1, 1 + size), slice(1 + size, None)
-    rr, ii = covariance[:, real, real][:, first, second], covariance[:, imaginary, imaginary][:, first, second]
-    ri, ir = covariance[:, real, imaginary][:, first, second], covariance[:, imaginary, real][:, first, second]
-    return torch.complex(rr - ii, ri + ir), torch.complex(rr + ii, ir - ri)
 
 
 def _variance_of_valid(noise: PixelNoise, valid: Tensor) -> Tensor:

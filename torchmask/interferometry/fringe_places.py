@@ -29,7 +29,7 @@ def find_places(frames: Tensor, valid: Tensor, noise: PixelNoise, model: FringeM
     common = torch.tensor(model.centre(frames, valid), dtype=torch.float64)
     unit = model.grid.period / model.aperture.subaperture_diameter
     places = common.repeat(len(frames), 1)
-    points = FringeModel(model.aperture, model.grid)  # the blur by pixels does not move light
+    points = model.points
     light, errors = _light_and_errors(frames, valid, noise, points, common)
     sharp = errors < _ACCURATE * unit
     if 2 * float(light[sharp].sum()) <= float(light.sum()):
@@ -73,7 +73,7 @@ def _own_places(frames: Tensor, valid: Tensor, model: FringeModel, places: Tenso
         columns = model.columns(*place.tolist())
         for frame in (group == number).nonzero().flatten().tolist():
             light, counted = torch.where(valid[frame], frames[frame], 0.0), valid[frame].double()
-            found[frame] = torch.tensor(model.place_beside_fringes(light, counted, columns))
+            found[frame] = torch.tensor(model.place_beside_fringes(light, counted, model.norm(counted), columns))
     return found
 
 

@@ -88,15 +88,16 @@ class FringePower:
         rings = (radius[chosen] * (max(grid.shape) / _RING)).round().long()
         return cls(power[chosen], float(power[beyond].mean()), grid, chosen, rings, wavelengths)
 
-    def match(self, aperture: SparseAperture) -> Match:
-        """Return how much of the pattern of a mask the power shows.
+    def match(self, aperture: SparseAperture, pattern: Tensor | None = None) -> Match:
+        """Return how much of the pattern of a mask the power shows; it is its `expected_power`, if that is known.
 
         The share is the slope of the logarithm of the power over that of a point source behind the mask, within rings
         of similar frequencies: an object and turbulence change the power from ring to ring. It scatters as if each of
         the N (N - 1) baselines were one independent measurement, and by `wider` times that where light
         lies in few rings.
         """
-        pattern = _smoothed(expected_power(aperture, self.grid, self.wavelengths))[self.chosen].clamp(min=0)
+        pattern = expected_power(aperture, self.grid, self.wavelengths) if pattern is None else pattern
+        pattern = _smoothed(pattern)[self.chosen].clamp(min=0)
         light = self._means(self.power - self.noise).clamp(min=0)
         floor = _FLOOR * light + 1e-12 * float(self.power.max())
         expected = light / self._means(pattern).clamp(min=1e-12) * pattern + self.noise + floor
@@ -158,10 +159,10 @@ def fringe_wavelengths(aperture: SparseAperture, grid: Grid, band: Band) -> list
     return [1 / (min(lit) + (number + 0.5) / n * (max(lit) - min(lit))) for number in range(n)]
 
 
-def likeness(one: SparseAperture, other: SparseAperture, grid: Grid, wavelengths: Sequence[float] = ()) -> float:
-    """Return the correlation of the fringe power of two masks; 1 if frames cannot tell them apart."""
-    patterns = [expected_power(aperture, grid, wavelengths).flatten() for aperture in (one, other)]
-    return float(torch.nn.functional.cosine_similarity(*(pattern - pattern.mean() for pattern in patterns), dim=0))
+def likeness(one: Tensor, other: Tensor) -> float:
+    """Return the correlation of the `expected_power` (H, W) of two masks; 1 if frames cannot tell them apart."""
+    patterns = [(pattern - pattern.mean()).flatten() for pattern in (one, other)]
+    return float(torch.nn.functional.cosine_similarity(*patterns, dim=0))
 
 
 def expected_power(aperture: SparseAperture, grid: Grid, wavelengths: Sequence[float] = ()) -> Tensor:

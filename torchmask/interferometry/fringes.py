@@ -9,7 +9,6 @@ from torchmask.interferometry.fringe_fit import (
     FringeFit,
     FringeModel,
     PixelNoise,
-    complex_covariances,
     fit_fringes,
 )
 from torchmask.interferometry.fringe_places import find_places
@@ -152,9 +151,9 @@ def _triples(fit: FringeFit, model: FringeModel, n_holes: int) -> tuple[Tensor, 
     sides = triangle_sides(model.pairs, model.triangles)
     first, second, third = sides
     a, b, c = fit.fringes[:, first], fit.fringes[:, second], fit.fringes[:, third].conj()
-    ab, _ = complex_covariances(fit.covariance, first, second)
-    _, ac = complex_covariances(fit.covariance, first, third)
-    _, bc = complex_covariances(fit.covariance, second, third)
+    ab, _ = _complex_covariances(fit.covariance, first, second)
+    _, ac = _complex_covariances(fit.covariance, first, third)
+    _, bc = _complex_covariances(fit.covariance, second, third)
     products = n_holes**3 * (a * b * c - a * bc - b * ac - c * ab + fit.cubes[:, 1:])
     light = fit.light**3 - 3 * fit.light * fit.covariance[:, 0, 0] + fit.cubes[:, 0].real
     triple = products.sum(0) / light.sum()
@@ -166,6 +165,18 @@ def _triples(fit: FringeFit, model: FringeModel, n_holes: int) -> tuple[Tensor, 
     )
     amplitudes = triple.abs()
     return triple, along, across / (amplitudes[:, None] * amplitudes)
+
+
+def _complex_covariances(covariance: Tensor, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
+    """Return E(f g) and E(f g*), both (T, M), of the noise of fringes `first` and `second` (M,).
+
+    `covariance` (T, K, K) is that of the parameters.
+    """
+    size = covariance.shape[-1] // 2
+    real, imaginary = slice(1, 1 + size), slice(1 + size, None)
+    rr, ii = covariance[:, real, real][:, first, second], covariance[:, imaginary, imaginary][:, first, second]
+    ri, ir = covariance[:, real, imaginary][:, first, second], covariance[:, imaginary, real][:, first, second]
+    return torch.complex(rr - ii, ri + ir), torch.complex(rr + ii, ir - ri)
 
 
 def _triple_noise(
@@ -180,16 +191,18 @@ def _triple_noise(
     rows = torch.arange(n_triangles)
     along = torch.zeros(n_triangles, n_triangles, dtype=torch.float64)
     across = torch.zeros_like(along)
+    turn, first, second, third = n_holes**3 * turn, *(1 + side for side in sides)
     for values, light, covariance in zip(fit.fringes, fit.light, fit.covariance, strict=True):
         a, b, c = (values[side] for side in sides)
+        ab, c = turn * a * b, c.conj()
+        ac, bc = turn * a * c, turn * b * c
+        # the three sides of a triangle are different baselines, so nothing is written twice
         slopes = torch.zeros(n_triangles, 1 + 2 * size, dtype=torch.complex128)
-        for side, others, sign in zip(sides, (b * c.conj(), a * c.conj(), a * b), (1, 1, -1), strict=True):
-            slopes[rows, 1 + side] += others
-            slopes[rows, 1 + size + side] += sign * 1j * others
-        slopes = n_holes**3 * turn[:, None] * slopes
-        slopes[:, 0] = -3 * n_holes**3 * (turn * a * b * c.conj()).real / light
-        along += slopes.real @ covariance @ slopes.real.T
-        across += slopes.imag @ covariance @ slopes.imag.T
+        slopes[rows, first], slopes[rows, second], slopes[rows, third] = bc, ac, ab
+        slopes[rows, size + first], slopes[rows, size + second], slopes[rows, size + third] = 1j * bc, 1j * ac, -1j * ab
+        slopes[:, 0] = -3 * (ab * c).real / light
+        for total, part in ((along, slopes.real), (across, slopes.imag)):
+            total += part @ covariance @ part.T
     noise = fit.fringe_noise.mean(0)
     power = ((fit.fringes.abs() ** 2).mean(0) - noise).clamp(min=0)
     p, e = (torch.stack([values[side] for side in sides]) for values in (power, noise))

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from torch import Tensor
 
 from torchmask.grid import Grid
-from torchmask.interferometry.fringe_power import FringePower, Match, fringe_wavelengths, likeness
+from torchmask.interferometry.fringe_power import FringePower, Match, expected_power, fringe_wavelengths, likeness
 from torchmask.optics import catalog
 from torchmask.optics.aperture import Aperture, SparseAperture
 from torchmask.optics.band import Band
@@ -67,16 +67,17 @@ def look_at_mask(
     """
     if not isinstance(aperture, SparseAperture) or aperture.n_subapertures < 3:
         return MaskLook()
-    others = {name: geometry.apply(aperture) for name, geometry in ORIENTATIONS.items()}
     light = [] if band is None else fringe_wavelengths(aperture, grid, band)
-    unseen = " or ".join(name for name, other in others.items() if likeness(aperture, other, grid, light) > _ALIKE)
+    own = expected_power(aperture, grid, light)
+    others = {name: expected_power(turn.apply(aperture), grid, light) for name, turn in ORIENTATIONS.items()}
+    unseen = " or ".join(name for name, other in others.items() if likeness(own, other) > _ALIKE)
     power = FringePower.of(frames, aperture, grid, light)
     if power is None:
         return MaskLook(unseen=unseen)
     comparisons = []
     # Rings tell most, but of a long and narrow object they accuse the right mask: their sectors have to agree.
     for each, least in ((power, _RIGHT), (power.in_sectors(), _RIGHT_IN_SECTORS)):
-        comparison = _compare(each, aperture, others)
+        comparison = _compare(each, aperture, own, others)
         if comparison.better is None and _may_be(comparison.told, least):
             return MaskLook(unseen=unseen)
         comparisons.append(comparison)
@@ -109,15 +110,16 @@ def _is_filled_in(frames: Tensor, valid: Tensor) -> bool:
     return float((frames * ~valid).sum()) > _FILLED_IN * float(frames.sum())
 
 
-def _match(power: FringePower, aperture: SparseAperture) -> Match:
+def _match(power: FringePower, aperture: SparseAperture, pattern: Tensor | None = None) -> Match:
     """Return how much of the pattern of a mask the power shows, with the error that light in few rings leaves."""
-    share, error = power.match(aperture)
+    share, error = power.match(aperture, pattern)
     return Match(share, power.wider * error)
 
 
-def _compare(power: FringePower, aperture: SparseAperture, others: dict[str, SparseAperture]) -> _Comparison:
-    told = _match(power, aperture)
-    matches = {name: _match(power, other) for name, other in others.items()}
+def _compare(power: FringePower, aperture: SparseAperture, own: Tensor, others: dict[str, Tensor]) -> _Comparison:
+    """Compare with the `expected_power` (H, W) of a mask and of its other orientations, whose holes are as many."""
+    told = _match(power, aperture, own)
+    matches = {name: _match(power, aperture, other) for name, other in others.items()}
     name = max(matches, key=lambda key: matches[key].share)
     best = matches[name]
     is_better = best.share > max(told.share + best.error, _NAMED * best.error) and _may_be(best)
