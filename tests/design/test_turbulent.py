@@ -69,7 +69,6 @@ def test_baselines_that_only_meet_at_other_wavelengths_share_their_light():
         (6, 1.5, 5.0, 0.0, 0.0, "disc"),
         pytest.param(7, 0.8, 20.0, 1.0, (8.0, 6.0), "disc", marks=pytest.mark.slow),
         (6, 0.8, math.inf, 0.0, 0.0, "hexagon"),
-        pytest.param(6, 0.8, math.inf, 1.0, 10.0, "hexagon", marks=pytest.mark.slow),
         pytest.param(7, 0.8, 20.0, 3.0, (8.0, 6.0), "hexagon", marks=pytest.mark.slow),
     ],
 )

@@ -175,10 +175,10 @@ def inside(observation, result):
 @pytest.mark.slow
 @pytest.mark.parametrize("photons", [1e5, 1e7])
 def test_about_two_thirds_of_bright_pixels_lie_within_one_sigma(photons):
-    grid, apertures = Grid.nyquist(1.0, 550e-9, 64), SparseAperture.from_catalog("golay9", 1.0, 0.15)
+    grid, apertures = Grid.nyquist(1.0, 550e-9, 48), SparseAperture.from_catalog("golay9", 1.0, 0.15)
     scene = make_scene(grid.shape, photons, SceneOptions(size=0.5))
     turbulence, generator = TurbulencePhase(1 / 7, 20.0), torch.Generator().manual_seed(0)
-    seen = simulate_observation(scene, apertures, grid, turbulence, Detector(1.5), 10, generator)
+    seen = simulate_observation(scene, apertures, grid, turbulence, Detector(1.5), 6, generator)
     once = Schedule(in_vain=0)  # in less time
     result = MyopicDeconvolution(apertures, grid, schedule=once).restore(seen.frames, n_samples=8)
     assert 0.5 < inside(seen, result) < 0.85
