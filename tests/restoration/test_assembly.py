@@ -39,7 +39,8 @@ def test_a_result_is_in_electrons_and_rad(ended):
     objective, stack, progress = ended
     state = progress.state
     result = assemble_result(objective, stack, progress, r0=0.2)
-    torch.testing.assert_close(result.extended_object, UNIT * state.image)
+    torch.testing.assert_close(result.extended_object * (1 - result.light_beyond), UNIT * state.image)
+    assert 0 < result.light_beyond < 0.3
     assert torch.equal(result.object, result.extended_object[:32, :32])
     assert torch.equal(result.coefficients, objective.model.aberrations.coefficients(state.z))
     assert torch.equal(result.transmission, state.calibration.transmission)

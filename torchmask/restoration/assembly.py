@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchmask.restoration.checkpoint import Progress, Status
 from torchmask.restoration.frames import FrameStack
+from torchmask.restoration.light_beyond import light_beyond
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.posterior import evenness, place_deviations, standard_deviations
 from torchmask.restoration.result import RestorationResult
@@ -42,9 +43,12 @@ def assemble_result(
     background = model.background.level(objective.frames - frames, objective.precision)
     frames = frames + background
     residuals = (objective.frames - frames) * objective.precision.sqrt()
+    beyond = light_beyond(model, state.image, state.z)
+    whole = state.image * (stack.unit / (1 - beyond))
     return RestorationResult(
-        object=(model.window.crop(state.image) * stack.unit).clone(),
-        extended_object=state.image * stack.unit,
+        object=model.window.crop(whole).clone(),
+        extended_object=whole,
+        light_beyond=beyond,
         coefficients=model.aberrations.coefficients(state.z)[..., :n_modes],
         transmission=transmission,
         background=(background * stack.unit + stack.known).mean((1, 2)).to(transmission),
@@ -96,13 +100,16 @@ def add_deviations(
         image = image * evenness(progress.state.image)
     spread = torch.stack([model.aberrations.coefficients(sample) for sample in z]).square().mean((0, 1)).sqrt()
     spread = spread[:, : result.coefficients.shape[-1]]
-    return replace(result, object_std=model.window.crop(image) * stack.unit, coefficients_std=spread)
+    deviations = model.window.crop(image) * (stack.unit / (1 - result.light_beyond))
+    return replace(result, object_std=deviations, coefficients_std=spread)
 
 
 def _message(progress: Progress) -> str:
     iterations = len(progress.costs)
     if progress.status is Status.CONVERGED:
         message = f"converged: the last segment lowered the cost by a fraction {progress.decrease or 0.0:.1e}"
+    elif progress.status is Status.STUCK:
+        message = f"stopped, as {Status.STUCK.value}: try smaller steps, or another minimiser"
     elif progress.status is Status.ITERATION_LIMIT:
         message = f"stopped at max_iterations = {iterations}"
     else:

@@ -26,7 +26,7 @@ _OFF = (0.1, 0.003)  # rms rotation [deg] and magnification less one found of ma
 class RestorationResult(Brief):
     """A restored object, with its aberrations and the quality of the fit.
 
-    object : (H, W) on the pixels of the frames [electrons per pixel and frame]
+    object : (H, W) on the pixels of the frames [electrons per pixel and frame], of all its light, see `light_beyond`
     extended_object : (H', W') object with a margin beyond the field, in rows and columns after H and W
     coefficients : (T, N, J) Zernike coefficients [rad rms]
     transmission : (T,) transmission of each frame, 1 on average
@@ -50,6 +50,8 @@ class RestorationResult(Brief):
     geometry_std : (2,) standard deviations of rotation and magnification due to noise, or None
     verdict : whether all this explains the frames; None in files of 0.1
     motion : (T, N, J) change of the coefficients while a frame lasts [rad rms]; None where frames are snapshots
+    light_beyond : share of the object's light that the optics spread beyond the field of the model, from which `model`
+        is computed; 0 in files of before
     frame_numbers : number of each frame, by which summary and verdict name it; 0 to T - 1 by default
 
     Model, residuals and chi_square have the data type of the method's model, all else is float64.
@@ -92,6 +94,7 @@ class RestorationResult(Brief):
     geometry_std: Tensor | None = None
     verdict: Verdict | None = None
     motion: Tensor | None = None
+    light_beyond: float = 0.0
     frame_numbers: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:

@@ -181,12 +181,13 @@ def start_from_result(
             f"start is of frames of {rows} x {columns} pixels: those of this restoration have {own[0]} x {own[1]}"
         )
     image, z = state.image, state.z.clone()
+    kept = (1 - start.light_beyond) / unit
     if Free.OBJECT in objective.free:
         if start.extended_object.shape == image.shape:
-            image = start.extended_object.to(image) / unit
+            image = start.extended_object.to(image) * kept
         else:  # its margin was another, as the object filled the field and did not, or the reverse
             image = image.clone()
-            objective.model.window.crop(image).copy_(start.object / unit)
+            objective.model.window.crop(image).copy_(start.object * kept)
     if Free.ABERRATIONS in objective.free:
         z[:known] = basis.parameters_of(start.coefficients)
         z[known:] = basis.with_common_of(z[known:], z[:1])
