@@ -197,6 +197,8 @@ PRIORS = {
     "smoothed TV": lambda: deepinv.optim.SmoothedTVPrior(),
     "Tikhonov": lambda: deepinv.optim.Tikhonov(),
     "relative differences": lambda: deepinv.optim.RDP(),
+    "TV": lambda: deepinv.optim.TVPrior(),
+    "L12": lambda: deepinv.optim.L12Prior(),
 }
 
 
@@ -213,14 +215,25 @@ def test_a_prior_of_deepinv_has_its_value_gradient_and_curvature(make):
     assert float(prior.curvature(image).min()) >= 0
 
 
-def test_a_restoration_takes_it(observation):
-    prior = DeepinvPrior(deepinv.optim.SmoothedTVPrior())
+@pytest.mark.parametrize("name", ["TVPrior", "L12Prior"])
+def test_a_prior_with_kinks_has_a_curvature_in_flat_and_dark_parts(name):
+    image = 1 + torch.rand(12, 10, dtype=torch.float64, generator=seeded())
+    image[:4], image[4:8] = 0.0, 1.5
+    curvature = DeepinvPrior(getattr(deepinv.optim, name)()).curvature(image)
+    assert bool(torch.isfinite(curvature).all())
+    assert float(curvature.min()) >= 0
+    assert float(curvature[:3].mean()) > 1
+
+
+@pytest.mark.parametrize("name", ["SmoothedTVPrior", "TVPrior"])
+def test_a_restoration_takes_it(name, observation):
+    prior = DeepinvPrior(getattr(deepinv.optim, name)())
     result = MyopicDeconvolution(MASK, GRID, 3, prior=prior, max_iterations=100).restore(observation.frames)
     ours, mean = (
         relative_error(image, observation.object, 0.5) for image in (result.object, observation.frames.mean(0))
     )
     assert ours < mean
-    assert "SmoothedTVPrior" in result.prior
+    assert name in result.prior
 
 
 def test_a_prior_without_a_value_is_refused():

@@ -14,7 +14,8 @@ from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.geometry import MaskGeometry
 from torchmask.record import Record
 from torchmask.restoration.candidates import several
-from torchmask.restoration.checkpoint import Checkpoint, Ending, Progress, Status, fingerprint_of
+from torchmask.restoration.checkpoint import Checkpoint, Ending, Progress, Status
+from torchmask.restoration.fingerprint import fingerprint_of
 from torchmask.restoration.forward import ExposureModel
 from torchmask.restoration.given_prior import as_prior
 from torchmask.restoration.minimizers import TorchMinimizer
@@ -187,7 +188,9 @@ def fingerprint(centers=CENTRES, frames=None, prior=None, free=Free.OBJECT, sett
     model = ExposureModel(SparseAperture(centers, 0.25, 1.0), GRID, 3)
     frames = torch.ones(2, 25, 25, dtype=torch.float64) if frames is None else frames
     precision = torch.ones(1, 1, 1, dtype=torch.float64)
-    objective = MyopicObjective(model, frames, precision, as_prior(prior or TotalVariation()), free=free)
+    objective = MyopicObjective(
+        model, frames, precision, as_prior(TotalVariation() if prior is None else prior), free=free
+    )
     return fingerprint_of(objective, settings, known)
 
 
@@ -252,20 +255,129 @@ def test_a_function_is_known_by_its_name_and_not_by_where_it_lies():
     assert fingerprint(prior=partial(penalty, weight=3.0)) != twice
 
 
+def entropy(weight):
+    return lambda image: weight * (image.clamp(min=1e-6) * image.clamp(min=1e-6).log()).sum()
+
+
+def network(weight):
+    made = nn.Linear(25, 1, bias=False)
+    nn.init.constant_(made.weight, weight)
+    return made
+
+
+def with_default(weight):
+    def prior(image, *, weight=weight):
+        return weight * image.sum()
+
+    return prior
+
+
+def descending(rate):
+    return TorchMinimizer(lambda z: torch.optim.SGD(z, lr=rate))
+
+
+class Plain(nn.Module):
+    """Its number is no tensor and stands in no repr."""
+
+    def __init__(self, weight):
+        super().__init__()
+        self.weight = weight
+
+    def forward(self, image):
+        return self.weight * image.sum()
+
+
+def around(made):
+    return lambda image: made(image).square().mean()
+
+
+ENCLOSING = {
+    "a number": entropy,
+    "a network": lambda weight: around(network(weight)),
+    "a function": lambda weight: around(entropy(weight)),
+    "a method of a network": lambda weight: network(weight).forward,
+    "a network in a partial": lambda weight: partial(penalty, weight=network(weight)),
+    "an array in a dictionary": lambda weight: (lambda held: lambda image: held["of it"])(
+        {"of it": np.ones(3) * weight}
+    ),
+    "a default": with_default,
+    "a constant": lambda weight: (lambda image: 0.1 * image.sum()) if weight == 0.1 else (lambda image: image.sum()),
+    "an attribute": Plain,
+    "a compiled function": lambda weight: torch.compile(entropy(weight), backend="eager"),
+    "a compiled network": lambda weight: torch.compile(network(weight), backend="eager"),
+    "a traced network": lambda weight: torch.fx.symbolic_trace(network(weight)),
+}
+
+
+@pytest.mark.parametrize("make", ENCLOSING.values(), ids=ENCLOSING)
+def test_a_function_is_known_by_what_it_holds(make):
+    assert fingerprint(prior=make(0.1)) == fingerprint(prior=make(0.1))
+    assert fingerprint(prior=make(0.1)) != fingerprint(prior=make(50.0))
+
+
+WEIGHT = 0.1
+
+
+def of_this_file(image):
+    return own_weight() * image.sum()
+
+
+def own_weight():
+    return WEIGHT
+
+
+def endless(image):
+    return endless(image) if image is None else image.sum()
+
+
+def test_a_function_is_known_by_what_it_reads_in_its_file(monkeypatch):
+    """Through another function of the file too; one that calls itself comes to an end."""
+    before = fingerprint(prior=of_this_file)
+    monkeypatch.setitem(globals(), "WEIGHT", 50.0)
+    assert fingerprint(prior=of_this_file) != before
+    assert fingerprint(prior=endless) == fingerprint(prior=endless)
+
+
+def test_an_optimiser_is_known_by_what_its_function_holds():
+    assert fingerprint(settings=(descending(1.0),)) == fingerprint(settings=(descending(1.0),))
+    assert fingerprint(settings=(descending(1.0),)) != fingerprint(settings=(descending(2.0),))
+
+
 @pytest.mark.parametrize(
-    ("options", "name"),
+    "options",
     [
-        ({"prior": Anonymous()}, r"<\S*Anonymous object at 0x\w+>"),
-        ({"prior": partial(lambda image: image.sum())}, r"<function <lambda> at 0x\w+>"),
-        ({"settings": (TorchMinimizer(lambda z: torch.optim.SGD(z, lr=1.0)),)}, r"<function <lambda> at 0x\w+>"),
+        {"prior": Anonymous()},
+        {"prior": partial(penalty, weight=Anonymous())},
+        {"prior": around(Anonymous())},
+        {"prior": Plain(Anonymous())},
+        {"settings": (partial(adam, Anonymous()),)},
     ],
 )
-def test_what_has_only_an_address_in_memory_has_no_checkpoint(options, name):
-    with pytest.raises(ValueError, match=rf"a checkpoint cannot know (?:{name}) again, which has no name"):
+def test_what_has_only_an_address_in_memory_has_no_checkpoint(options):
+    with pytest.raises(ValueError, match=r"cannot know <\S*Anonymous object at 0x\w+> again, which has no name"):
         fingerprint(**options)
 
 
 # --- whole restorations
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("state", r"state, which does not end in \.npz: give"), ("none/state.npz", "there is no folder .*none: create")],
+)
+def test_what_cannot_be_written_is_told_before_any_work(name, words, observation, restoring, tmp_path):
+    steps = []
+    with pytest.raises(ValueError, match=words):
+        restoring(3, max_iterations=2).restore(observation.frames, checkpoint=tmp_path / name, callback=steps.append)
+    assert not steps
+
+
+def test_a_checkpoint_belongs_to_what_its_prior_encloses(observation, restoring, tmp_path):
+    path = tmp_path / "state.npz"
+    restoring(3, max_iterations=2, prior=entropy(0.1)).restore(observation.frames, checkpoint=path)
+    restoring(3, max_iterations=2, prior=entropy(0.1)).restore(observation.frames, checkpoint=path)
+    with pytest.raises(ValueError, match="other frames or settings"):
+        restoring(3, max_iterations=2, prior=entropy(50.0)).restore(observation.frames, checkpoint=path)
 
 
 def test_interrupted_and_resumed_is_the_same(observation, restoring, tmp_path):

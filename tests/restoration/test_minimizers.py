@@ -1,6 +1,7 @@
 """Optimisers of `torch.optim` under bounds: within them, never worse than what was seen, every evaluation counted."""
 
 import math
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -11,9 +12,11 @@ from torchmask.grid import Grid
 from torchmask.metrics import relative_error
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.detector import Detector
+from torchmask.restoration.descent import Watched
 from torchmask.restoration.minimizers import TorchMinimizer
 from torchmask.restoration.myopic import MyopicDeconvolution
-from torchmask.restoration.projected_lbfgs import minimize_bounded
+from torchmask.restoration.projected_lbfgs import Minimum, ProjectedLBFGS, minimize_bounded
+from torchmask.restoration.schedule import Schedule
 from torchmask.simulation.exposures import simulate_observation
 from torchmask.simulation.scene import SceneOptions, make_scene
 
@@ -116,6 +119,47 @@ def test_refuses_nonsense():
         TorchMinimizer(OPTIMIZERS["Adam"])(bowl, bowl.start, bowl.lower[:-1], max_iterations=1)
     with pytest.raises(ValueError, match="the cost at the start is nan: it must be finite"):
         TorchMinimizer(OPTIMIZERS["Adam"])(lambda x: (math.nan, x), bowl.start, bowl.lower, max_iterations=1)
+
+
+class Halving:
+    """A minimiser that halves the vector and says what it is told to."""
+
+    def __init__(self, *, factor, converged, n_iterations=1):
+        self.factor, self.converged, self.n_iterations = factor, converged, n_iterations
+
+    def __call__(self, cost, start, lower, *, max_iterations, callback=None):
+        x = self.factor * torch.maximum(start, lower)
+        return Minimum(x, cost(x)[0], self.n_iterations, 1, self.converged, "")
+
+
+@pytest.mark.parametrize(
+    ("minimizer", "stuck"),
+    [
+        (Halving(factor=1.0, converged=False), True),
+        (Halving(factor=1.0, converged=True), False),
+        (Halving(factor=0.5, converged=False), False),
+        (Halving(factor=1.0, converged=False, n_iterations=0), False),
+        (TorchMinimizer(partial(torch.optim.SGD, lr=1e6)), True),
+        (TorchMinimizer(OPTIMIZERS["SGD"]), False),
+        (ProjectedLBFGS(), False),
+    ],
+)
+def test_a_minimiser_is_stuck_where_it_comes_back_to_its_start_without_a_minimum(minimizer, stuck):
+    bowl = Bowl()
+    watched = Watched(minimizer)
+    start = torch.full((6,), -0.5).double()  # below the bounds of most
+    found = watched(bowl, start, bowl.lower, max_iterations=5)
+    assert torch.equal(found.x, minimizer(bowl, start, bowl.lower, max_iterations=5).x)
+    assert watched.is_stuck is stuck
+
+
+def test_an_optimiser_that_diverges_has_not_converged(observation, restoring):
+    diverging = TorchMinimizer(partial(torch.optim.SGD, lr=1e6))
+    method = restoring(3, max_iterations=100, minimizer=diverging, schedule=replace(Schedule.plain(), segment=10))
+    result = method.restore(observation.frames)
+    assert not result.converged
+    assert "no step of the last segment lowered the cost: try smaller steps" in result.message
+    assert len(result.cost) == 10
 
 
 @pytest.mark.slow

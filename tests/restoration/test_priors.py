@@ -297,6 +297,59 @@ def test_a_concave_prior_has_no_negative_curvature():
     assert float(as_prior(lambda image: -(image**2).sum()).curvature(rough()).abs().max()) == 0
 
 
+def convex(image):
+    """Each pixel with its neighbours, so that the diagonal of the Hessian has to be told from the rest."""
+    return torch.log1p(image**2).sum() + 0.1 * ((image - image.roll(1, 0)) ** 2).sum()
+
+
+@pytest.mark.parametrize("compiled", [lambda: torch.compile(convex, backend="aot_eager"), lambda: compiled_module()])
+def test_a_compiled_prior_has_a_curvature(compiled):
+    """By differences of gradients, whose error grows with the square of their step: it is not differentiated twice.
+
+    Dark pixels count as a little brighter than they are.
+    """
+    image = 0.1 + rough()
+    found = as_prior(compiled()).curvature(image)
+    torch.testing.assert_close(found, as_prior(convex).curvature(image), rtol=1e-3, atol=1e-3)
+    image[:3] = 0
+    check_prior(as_prior(compiled()), image)
+
+
+def compiled_module():
+    class Convex(nn.Module):
+        def forward(self, image):
+            return convex(image)
+
+    return torch.compile(Convex(), backend="aot_eager")
+
+
+def sharp(image):
+    """Total variation with kinks, to which autograd gives a gradient where it is flat, but no second derivative."""
+    return torch.linalg.vector_norm(torch.stack(gradient(image)), dim=0).sum()
+
+
+def test_a_prior_with_kinks_has_a_curvature_where_it_is_flat():
+    image = rough()
+    image[:4] = 0.3
+    check_prior(as_prior(sharp), image)
+    found = as_prior(sharp).curvature(image)
+    assert bool(torch.isfinite(found).all())
+    # where it is flat by two neighbours at least, which probes of other signs move by 0.02 in all
+    assert float(found[1:3].min()) > 10
+    assert float(found[1:3].max()) < 1000
+
+
+def test_differences_keep_to_images_that_are_not_negative():
+    """Below zero this prior has no value; at zero it has a kink, which autograd differentiates once."""
+
+    def roots(image):
+        return torch.linalg.vector_norm(image[..., None], dim=-1).sum() + ((image + 1e-9) ** 1.5).sum()
+
+    image = torch.zeros(6, 7, dtype=torch.float64)
+    check_prior(as_prior(roots), image)
+    assert bool(torch.isfinite(as_prior(roots).curvature(image)).all())
+
+
 def test_own_gradient_and_curvature_are_used():
     """They are known to be used by being wrong."""
 
@@ -399,6 +452,56 @@ class OfCurvature:
 def test_refuses_what_is_no_prior(prior, words):
     with pytest.raises(ValueError, match=words):
         check_prior(as_prior(prior), rough())
+
+
+def training(layer):
+    """A network of float64 in training, where its layer is random or changes itself."""
+    return nn.Sequential(nn.Unflatten(0, (1, 1, -1)), nn.Conv2d(1, 2, 3, padding=1), layer).double().train()
+
+
+def mean_square(image, network):
+    return network(image).square().mean()
+
+
+class OfNetwork(nn.Module):
+    def __init__(self, network):
+        super().__init__()
+        self.network = network
+
+    def forward(self, image):
+        return mean_square(image, self.network)
+
+
+HOLDERS = {
+    "function": lambda network: lambda image: mean_square(image, network),
+    "partial": lambda network: partial(mean_square, network=network),
+    "module": OfNetwork,
+    "method": lambda network: OfNetwork(network).forward,
+    "compiled": lambda network: torch.compile(OfNetwork(network), backend="aot_eager"),
+}
+each_holder = pytest.mark.parametrize("held_by", HOLDERS.values(), ids=HOLDERS)
+
+
+@each_holder
+def test_a_random_prior_is_refused(held_by):
+    network = training(nn.Dropout(0.5))
+    with pytest.raises(ValueError, match=r"is random: its gradient .* under dropout in training. Call eval\(\)"):
+        check_prior(as_prior(held_by(network)), rough())
+    network.eval()
+    check_prior(as_prior(held_by(network)), rough())
+
+
+@each_holder
+def test_a_prior_that_changes_its_network_is_refused_and_the_network_is_as_it_was(held_by):
+    network = training(nn.BatchNorm2d(2))
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    with pytest.raises(
+        ValueError, match=r"changes \S*2.running_mean, one of 3 such buffers, whenever .* Call eval\(\)"
+    ):
+        check_prior(as_prior(held_by(network)), rough())
+    assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items())
+    network.eval()
+    check_prior(as_prior(held_by(network)), rough())
 
 
 @each_prior

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import itertools
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from enum import Enum
@@ -15,11 +13,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchmask.io import as_array, load_npz, save_npz
+from torchmask.io import load_npz, save_npz
 from torchmask.optics.geometry import MaskGeometry
 from torchmask.record import Callback, Record
 from torchmask.restoration.candidates import Candidates
 from torchmask.restoration.descent import Listener, Variables
+from torchmask.restoration.fingerprint import fingerprint_of
 from torchmask.restoration.objective import MyopicObjective
 from torchmask.restoration.state import Calibration, Modes, State
 from torchmask.restoration.traits import Refinement
@@ -30,6 +29,7 @@ class Status(Enum):
 
     RUNNING = "running"
     CONVERGED = "converged"
+    STUCK = "no step of the last segment lowered the cost"
     GIVEN_UP = "an earlier start had a better fit"
     START_LIMIT = "the iterations of a start were spent"
     ITERATION_LIMIT = "max_iterations was reached"
@@ -192,8 +192,18 @@ class Checkpoint:
         settings: Sequence[object],
         known: Sequence[Tensor | None],
     ) -> Checkpoint | None:
-        """Return the file at `path`, if there is to be one, of a restoration with these settings."""
-        return None if path is None else cls(Path(path), fingerprint_of(objective, settings, known))
+        """Return the file at `path`, if there is to be one, of a restoration with these settings.
+
+        Raises ValueError if it could not be written there, or a setting cannot be known again.
+        """
+        if path is None:
+            return None
+        path = Path(path)
+        if path.suffix != ".npz":
+            raise ValueError(f"checkpoint is {path}, which does not end in .npz: give a name that does")
+        if not path.parent.is_dir():
+            raise ValueError(f"checkpoint is {path}, but there is no folder {path.parent}: create it first")
+        return cls(path, fingerprint_of(objective, settings, known))
 
     def save(self, progress: Progress) -> None:
         """Write or replace the file."""
@@ -242,28 +252,6 @@ class Checkpoint:
 
 def save_nothing(progress: Progress) -> None:
     """Stand in for `Checkpoint.save` where no file is to be written."""
-
-
-def fingerprint_of(objective: MyopicObjective, settings: Sequence[object], known: Sequence[Tensor | None]) -> str:
-    """Return a hash of the frames, priors, settings and further known tensors, to recognise their checkpoint.
-
-    Functions are known by their names. Raises ValueError if a prior or a setting has none, but only an address in
-    memory, which would be another one in the process that resumes.
-    """
-    prior, model = objective.prior, objective.model
-    told = repr((*settings, objective.free, model.background, repr(prior)))
-    told = re.sub(r"(<function [\w.]+) at 0x[0-9a-fA-F]+>", r"\1>", told)
-    if nameless := re.search(r"<[^(),=]+ at 0x[0-9a-fA-F]+>", told):
-        raise ValueError(
-            f"a checkpoint cannot know {nameless[0]} again, which has no name but an address in memory: give a "
-            "function that a module defines, no lambda, or an object whose __repr__ tells its numbers, or no checkpoint"
-        )
-    digest = hashlib.sha256(told.encode())
-    tensors = [objective.frames, objective.precision, *model.pupil.samples(), model.response]
-    tensors += prior.state_dict().values()
-    for tensor in [*tensors, *known]:
-        digest.update(b"none" if tensor is None else as_array(tensor).tobytes())
-    return digest.hexdigest()
 
 
 def _ending_arrays(prefix: str, ending: Ending) -> dict[str, Any]:

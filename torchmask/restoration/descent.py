@@ -19,7 +19,7 @@ from torchmask.restoration.placement import (
     slopes_of_frames,
     smallest_magnification,
 )
-from torchmask.restoration.projected_lbfgs import Minimizer
+from torchmask.restoration.projected_lbfgs import AfterIteration, Cost, Minimizer, Minimum
 from torchmask.restoration.state import State
 
 _OBJECT_STEP = 0.3  # factor on the object's scale relative to that of the aberrations: 3 times more or less is worse
@@ -88,6 +88,26 @@ def descend(
     # the minimiser knows no upper bound, and a mask seldom shrinks until its holes are too few samples wide
     most = -math.log(smallest_magnification(objective.model))
     return moved(state, torch.stack([turn, shrinkage.clamp(max=most)]))
+
+
+class Watched:
+    """A minimiser that tells of its last descent whether it is stuck.
+
+    It is if it has made iterations and is back where it began, though it does not say that this is a minimum, as an
+    optimiser that diverges from its first step.
+    """
+
+    def __init__(self, minimizer: Minimizer) -> None:
+        self.minimizer: Minimizer = minimizer
+        self.is_stuck: bool = False
+
+    def __call__(
+        self, cost: Cost, start: Tensor, lower: Tensor, *, max_iterations: int, callback: AfterIteration | None = None
+    ) -> Minimum:
+        found = self.minimizer(cost, start, lower, max_iterations=max_iterations, callback=callback)
+        is_back = torch.equal(found.x, torch.maximum(start, lower))
+        self.is_stuck = is_back and found.n_iterations > 0 and not found.converged
+        return found
 
 
 def place_scale(objective: MyopicObjective, state: State) -> Tensor:

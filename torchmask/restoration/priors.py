@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
 
@@ -10,6 +12,7 @@ from torchmask.restoration.slopes import divergence, gradient
 
 _PROBES = 8  # random vectors that estimate the diagonal of a Hessian
 _SEED = 0
+_STEP = 0.01  # of differences of gradients, in mean pixels: as far as total variation rounds its kinks by default
 
 
 class ObjectPrior(nn.Module):
@@ -35,20 +38,45 @@ class ObjectPrior(nn.Module):
         """Return the approximate diagonal (H', W') of the Hessian at `image`, or of a majorising quadratic, at least 0.
 
         It is estimated from Hessian-vector products with random signs (Bekas, Kokiopoulou & Saad, Appl. Numer.
-        Math. 57, 1214, 2007).
+        Math. 57, 1214, 2007). These are differences of gradients where autograd has no second derivatives: in compiled
+        code, and at kinks such as those of a norm at zero.
         """
-        generator = torch.Generator().manual_seed(_SEED)
-        diagonal = torch.zeros_like(image)
+        try:
+            found = self._diagonal(image, self._products(image))
+        except RuntimeError:  # compiled code is not differentiated twice
+            found = None
+        if found is None or not bool(torch.isfinite(found).all()):
+            found = self._diagonal(image, self._differences(image))
+        return found.clamp(min=0)
+
+    def _products(self, image: Tensor) -> Callable[[Tensor], Tensor]:
+        """Return the function of a vector (H', W') that multiplies it by the Hessian at `image`."""
         with torch.enable_grad():
             leaf = image.detach().requires_grad_()
             (slope,) = torch.autograd.grad(self(leaf), leaf, create_graph=True)
-            if not slope.requires_grad:  # a linear penalty has no curvature
-                return diagonal
-            for _ in range(_PROBES):
-                signs = torch.randint(2, image.shape, generator=generator, device="cpu").to(image) * 2 - 1
-                (curved,) = torch.autograd.grad(slope, leaf, signs, retain_graph=True, materialize_grads=True)
-                diagonal += signs * curved / _PROBES
-        return diagonal.clamp(min=0)
+        if not slope.requires_grad:  # a linear penalty has no curvature
+            return torch.zeros_like
+        return lambda along: torch.autograd.grad(slope, leaf, along, retain_graph=True, materialize_grads=True)[0]
+
+    def _differences(self, image: Tensor) -> Callable[[Tensor], Tensor]:
+        """Return `_products` by differences of gradients; pixels stay above zero, below which a penalty may end."""
+        middle = image.detach().clamp(min=2 * _STEP)
+
+        def product(along: Tensor) -> Tensor:
+            after, before = (self.value_and_gradient(middle + sign * _STEP * along)[1] for sign in (1, -1))
+            return (after - before) / (2 * _STEP)
+
+        return product
+
+    @staticmethod
+    def _diagonal(image: Tensor, product: Callable[[Tensor], Tensor]) -> Tensor:
+        """Estimate the diagonal (H', W') of the matrix that `product` multiplies by."""
+        generator = torch.Generator().manual_seed(_SEED)
+        diagonal = torch.zeros_like(image)
+        for _ in range(_PROBES):
+            signs = torch.randint(2, image.shape, generator=generator, device="cpu").to(image) * 2 - 1
+            diagonal += signs * product(signs) / _PROBES
+        return diagonal
 
     def in_search(self, rate: float) -> ObjectPrior:
         """Return the prior of a search in faint light for an object whose slopes have a rate between 0 and 2.

@@ -23,7 +23,7 @@ from torchmask.restoration.calibration import recalibrate
 from torchmask.restoration.candidates import Candidates, play_stage
 from torchmask.restoration.checkpoint import Checkpoint, Progress, Status, save_nothing
 from torchmask.restoration.consensus import average_starts
-from torchmask.restoration.descent import Variables, descend
+from torchmask.restoration.descent import Variables, Watched, descend
 from torchmask.restoration.escapes import escape
 from torchmask.restoration.finish import Finisher
 from torchmask.restoration.frames import FrameStack
@@ -207,7 +207,7 @@ class Solver:
             self.objective,
             progress.candidates,
             n_each // 2,
-            lambda objective, state: self._descend(progress, objective, state, n_iterations),
+            lambda objective, state: self._descend(progress, objective, state, n_iterations, self.minimizer),
             lambda objective, state: self._recalibrate(objective, state, sharpen=False),
         )
         progress.status = progress.limit(*self._limits)
@@ -220,7 +220,7 @@ class Solver:
         schedule, state, done = self.schedule, progress.state, progress.iterations
         objective = self._place(state)
         before, place = float(objective.evaluator(state.calibration)(state.image, state.z).value), state.geometry
-        found = self._descend(progress, objective, state, schedule.segment)
+        found = self._descend(progress, objective, state, schedule.segment, watched := Watched(self.minimizer))
         is_lost = distance(found.geometry, MaskGeometry()) > schedule.farthest  # the frames do not constrain it
         progress.refinement = Refinement.OFF if is_lost else progress.refinement
         state = state if is_lost else found
@@ -242,7 +242,7 @@ class Solver:
             if moved_nothing or Free.OBJECT not in objective.free or progress.iterations >= schedule.sharp_after:
                 self._escape(progress, may_start_again)
         elif at_rest and not self.setting.awaits_motion(progress.state):
-            progress.status, progress.decrease = Status.CONVERGED, decrease
+            progress.status, progress.decrease = Status.STUCK if watched.is_stuck else Status.CONVERGED, decrease
             return
         progress.status = limit
         if goes_on and schedule.recalibrates:
@@ -251,7 +251,9 @@ class Solver:
         if goes_on and (at_rest or progress.iterations >= schedule.sharp_after):
             progress.state = self.setting.in_motion(progress.state, self.traits.seed)
 
-    def _descend(self, progress: Progress, objective: MyopicObjective, state: State, n_iterations: int) -> State:
+    def _descend(
+        self, progress: Progress, objective: MyopicObjective, state: State, n_iterations: int, minimizer: Minimizer
+    ) -> State:
         n_each = progress.candidates.n_each
 
         def listen(cost: float, evaluations: int, variables: Variables) -> None:
@@ -262,7 +264,7 @@ class Solver:
         if progress.refinement is Refinement.ON and progress.iterations:  # the first blurred object does not show it
             objective = objective.with_changes(free=objective.free | Free.PLACE)
         left = progress.last_iteration(*self._limits) - len(progress.costs)
-        return descend(objective, state, min(n_iterations, left), self.minimizer, listen)
+        return descend(objective, state, min(n_iterations, left), minimizer, listen)
 
     def _recalibrate(self, objective: MyopicObjective, state: State, *, sharpen: bool) -> State:
         power = self.traits.fit_power if sharpen else None
