@@ -33,6 +33,7 @@ _BASELINES = (16, 16)  # the same for the baselines b
 _SHARED_BASELINES = (9, 12)  # the same for baselines within a hole, of lenses of holes with themselves
 _SEPARATIONS = (28, 12)  # the same for the separations of these holes
 _TOLERANCE = 1e-3  # of the table of lenses of holes with themselves, in its norm
+_NOTHING = 1e-14  # of the density of separations, less than what rounding leaves of it
 _FAINT = 0.05  # errors of c^(1/2) are weighted by T^(1/2) plus this: thin lenses transmit little
 
 
@@ -104,11 +105,13 @@ def lens_amplitude(
     drift, shares = lens_drift(seeing)
     fewest = _PER_HOLE if len(drift) == 1 else _PER_HOLE * 3 // 5  # fewer, as the drift smooths
     per_hole = max(fewest, math.ceil(_PER_R0 * diameter / seeing.r0))
-    separations, densities = lens_densities(shape, diameter, places, per_hole)
     structure = seeing.structure(longest + 2 * reach + float(drift.norm(dim=-1).max()))
     baselines = PolarTable.nodes(_BASELINES, longest, 2.0)
 
-    def amplitude(baselines: Tensor) -> Tensor:
+    def amplitude(baselines: Tensor, places: Tensor) -> Tensor:
+        separations, densities = lens_densities(shape, diameter, places, per_hole)
+        reached = (densities > _NOTHING).any(0)
+        separations, densities = separations[reached], densities[:, reached]
         total = torch.zeros(len(baselines), len(separations), dtype=torch.float64)
         for step, share in zip(drift, shares, strict=True):
             exponent = scale**2 * _exponent(structure, baselines[:, None], separations + step)
@@ -119,7 +122,7 @@ def lens_amplitude(
     root = shape.otf(places, diameter).sqrt()
     weight = root + _FAINT
     functions = torch.stack([lens_sum(one, root, *(places / reach).unbind(-1)) for one in torch.eye(5).double()], -1)
-    table = _table(amplitude, baselines, _PLACES, shape.is_round and seeing.is_isotropic) * weight
+    table = _table(amplitude, baselines, nodes, shape, seeing) * weight
     factors = torch.linalg.lstsq(functions * weight[:, None], table.T, driver="gelsd").solution
     return PolarTable(factors.unflatten(-1, _BASELINES), longest, 2.0)
 
@@ -131,37 +134,57 @@ def shared_coherence(shape: Shape, diameter: float, seeing: Seeing, longest: flo
     mean is over the separation t of two points of one lens.
     """
     reach = shape.outer_diameter(diameter)
-    between = PolarTable.nodes(_SEPARATIONS, longest, 1.5).flatten(0, 1)[:, None]
+    nodes = PolarTable.nodes(_SEPARATIONS, longest, 1.5)
     drift, shares = lens_drift(seeing)
     per_hole = _PER_SHARED if len(drift) == 1 else _PER_SHARED * 3 // 5
     structure = seeing.structure(longest + 4 * reach + float(drift.norm(dim=-1).max()))
 
-    def coherence(baselines: Tensor) -> Tensor:
+    def coherence(baselines: Tensor, between: Tensor) -> Tensor:
         separations, densities = lens_densities(shape, diameter, baselines, per_hole)
+        reached = (densities > _NOTHING).any(0)
+        separations, densities = torch.cat([separations, -separations], 0)[reached.repeat(2)], densities[:, reached]
+        rows = [(density > _NOTHING).repeat(2).nonzero()[:, 0] for density in densities]
+        densities = densities.repeat(1, 2) / 2
         total = torch.zeros(len(baselines), len(between), dtype=torch.float64)
         for step, share in zip(drift, shares, strict=True):
-            for points in (between + step + separations, between + step - separations):
-                own = structure(points)
-                for row, (baseline, density) in enumerate(zip(baselines, densities, strict=True)):
-                    total[row] += share / 2 * (_exponent(structure, baseline, points, own).exp() @ density)
+            points = between[:, None] + step + separations
+            own = structure(points)
+            for row, chosen in enumerate(rows):
+                exponent = _exponent(structure, baselines[row], points[:, chosen], own[:, chosen])
+                total[row] += share * (exponent.exp() @ densities[row, chosen])
         return total
 
     baselines = PolarTable.nodes(_SHARED_BASELINES, reach, 1.5)
-    rows, columns = _factors(_table(coherence, baselines, _SEPARATIONS, shape.is_round and seeing.is_isotropic))
+    rows, columns = _factors(_table(coherence, baselines, nodes, shape, seeing))
     by_baseline = PolarTable(rows.unflatten(-1, _SHARED_BASELINES), reach, 1.5)
     return SharedCoherence(by_baseline, PolarTable(columns.unflatten(-1, _SEPARATIONS), longest, 1.5))
 
 
-def _table(function: Callable[[Tensor], Tensor], baselines: Tensor, others: tuple[int, int], isotropic: bool) -> Tensor:
-    """Return `function` of all polar baselines (n, m, 2), with values for all other points, as (n m, ...).
+def _table(
+    function: Callable[[Tensor, Tensor], Tensor], baselines: Tensor, others: Tensor, shape: Shape, seeing: Seeing
+) -> Tensor:
+    """Return `function` of all polar baselines (n, m, 2) and other points (k, l, 2), as (n m, k l).
 
-    If it is isotropic, all directions follow from the first, as only the angle between both arguments matters.
+    In turbulence that is the same in all directions, what is mirrored about x is so too if the shape is, and if it is
+    round all directions of the baseline follow from the first, as only the angle between both arguments matters.
     """
-    if not isotropic:
-        return function(baselines.flatten(0, 1))
-    first = function(baselines[:, 0]).unflatten(-1, others)
-    turned = [first.roll(turn, -1) for turn in range(baselines.shape[1])]
-    return torch.stack(turned, 1).flatten(2).flatten(0, 1)
+
+    def values(baselines: Tensor, others: Tensor) -> Tensor:
+        found = function(baselines.flatten(0, 1), others.flatten(0, 1))
+        return found.unflatten(-1, others.shape[:2]).unflatten(0, baselines.shape[:2])
+
+    n_turns, n_others = baselines.shape[1], others.shape[1]
+    if not seeing.is_isotropic or shape.mirrored() != shape:
+        return values(baselines, others).flatten(2).flatten(0, 1)
+    if shape.is_round:
+        half = values(baselines[:, :1], others[:, : n_others // 2 + 1])[:, 0]
+        first = torch.cat([half, half[..., 1 : (n_others + 1) // 2].flip(-1)], -1)
+        found = torch.stack([first.roll(turn * n_others // n_turns, -1) for turn in range(n_turns)], 1)
+    else:
+        half = values(baselines[:, : n_turns // 2 + 1], others)
+        mirrored = half[:, 1 : (n_turns + 1) // 2].flip(1).flip(-1).roll(1, -1)
+        found = torch.cat([half, mirrored], 1)
+    return found.flatten(2).flatten(0, 1)
 
 
 def lens_drift(seeing: Seeing) -> tuple[Tensor, list[float]]:

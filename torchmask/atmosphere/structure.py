@@ -115,5 +115,5 @@ def _clenshaw(coefficients: tuple[float, ...], x: Tensor) -> Tensor:
     """Evaluate the Chebyshev series at x (...)."""
     after, current, twice = torch.zeros_like(x), torch.full_like(x, coefficients[-1]), 2 * x
     for coefficient in coefficients[-2:0:-1]:
-        current, after = torch.addcmul(coefficient - after, twice, current), current
-    return torch.addcmul(coefficients[0] - after, x, current)
+        current, after = (coefficient - after).addcmul_(twice, current), current
+    return (coefficients[0] - after).addcmul_(x, current)
