@@ -259,6 +259,16 @@ def test_the_sky_matrix_leads_from_pixels_to_east_and_north(mask, sky_cards, mir
     torch.testing.assert_close(observation.sky_matrix, expected, rtol=1e-12, atol=0)  # a card holds 13 digits
 
 
+def test_a_header_of_another_scale_tells_only_how_the_sky_lies(mask, sky_cards, sky_matrix):
+    """As after `dataclasses.replace(observation, grid=...)`; up to 1 % it is taken as it is, with all its skew."""
+    pytest.importorskip("astropy")
+    for ratio, scale in ((2.0, 1.0), (0.5, 1.0), (1.02, 1.0), (1.009, 1.009)):
+        header = sky_cards(0.3, ratio * GRID.pixel_scale)
+        seen = Observation(frames_of(1), mask, GRID, None, header=header).sky_matrix
+        expected = torch.from_numpy(sky_matrix(0.3, scale * GRID.pixel_scale))
+        torch.testing.assert_close(seen, expected, rtol=1e-12, atol=0)
+
+
 def test_declination_may_come_first(mask, sky_cards):
     pytest.importorskip("astropy")
     cards = sky_cards(0.3, GRID.pixel_scale)

@@ -21,8 +21,8 @@ from torchmask.optics.bad_pixels import fill_bad_pixels
 from torchmask.optics.copies import copies_among
 from torchmask.optics.pixel import PixelResponse, pixel_record, read_pixel
 from torchmask.optics.records import aperture_record, read_aperture
-from torchmask.optics.sky import pixel_matrix
 from torchmask.record import Brief
+from torchmask.sky_scale import matrix_at
 
 _NEEDED_NUMBERS = ("subaperture_diameter", "mask_diameter", "pixel_scale", "wavelength")
 
@@ -128,9 +128,10 @@ class Observation(Brief):
     def sky_matrix(self) -> Tensor | None:
         """Matrix (2, 2) that converts pixels (x, y) to angles (east, north) on the sky [rad].
 
-        It is None if the header has no sky coordinates. Needs astropy (extra `data`).
+        It is None if the header has no sky coordinates. Where their scale contradicts that of `grid` by more than 1 %,
+        only their orientation counts. Needs astropy (extra `data`).
         """
-        matrix = pixel_matrix(self.header) if self.header else None
+        matrix = matrix_at(self.header, self.grid.pixel_scale) if self.header else None
         return None if matrix is None else torch.from_numpy(matrix)
 
     @property

@@ -50,7 +50,9 @@ def test_options_stand_for_missing_cards_and_win_over_present_ones(write_fits, m
     options = {"wavelength": 2e-6, "pixel_scale": 1e-7, "readout_noise": 0.5, "gain": 2.0, "unit": "adu"}
     bare = dict.fromkeys(("PIXELSCL", "WAVELEN", "BUNIT", "RDNOISE"))
     for name, cards in (("bare.fits", bare), ("full.fits", {"GAIN": 7.0})):
-        observation = read_observation(write_fits(name, cube, **cards), mask, **options)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", r".*full\.fits: the pixel scale that is given")
+            observation = read_observation(write_fits(name, cube, **cards), mask, **options)
         assert observation.grid == Grid((16, 20), 1e-7, 2e-6)
         assert observation.readout_noise == 0.5
         assert torch.equal(observation.frames, 2 * torch.from_numpy(cube).double())

@@ -90,6 +90,11 @@ def test_what_did_not_converge_or_is_not_explained_says_so(tmp_path, result, obs
     assert (cards["CONVERGD"], cards["EXPLAIND"], cards["VERDICT"]) == (False, False, doubtful.value)
 
 
+def test_a_sky_that_was_not_fitted_is_no_measurement_of_0(tmp_path, result, observation):
+    bare = dataclasses.replace(result, background=torch.zeros(5, dtype=torch.float64))
+    assert "SKY" not in cards_of(tmp_path / "r.fits", bare, observation)
+
+
 def test_the_numbers_of_many_clouded_frames_are_whole(tmp_path, result):
     """They fill more than one card."""
     frames = torch.ones(60, 8, 8, dtype=torch.float64)

@@ -32,6 +32,7 @@ from torchmask.numbers import require_wavelength
 from torchmask.observation import Observation, check_frames
 from torchmask.optics.pixel import jittered, square_pixel
 from torchmask.restoration.noise import check_errors
+from torchmask.sky_scale import MATRIX, cards_at, stated_side, warn_of_other_scales
 
 STACK = "stack.npz"  # its name in the folder of a run
 
@@ -168,17 +169,20 @@ def _read(files: Sequence[Path], options: StackOptions, known: Instrument | None
         _refuse(options, MaskOptions, f"is for --mask, which is not given: {files[0]} has a mask of its own")
     observation = _from_npz(files[0], options, known)
     grid, scale = observation.grid, pixel_angle(options.pixel_scale_arcsec)
-    changes: dict[str, Any] = {
-        "grid": Grid(grid.n_pixels, scale or grid.pixel_scale, options.wavelength or grid.wavelength)
-    }
+    if scale is not None:
+        stated = {"the file": grid.pixel_scale, MATRIX: stated_side(observation.header)}
+        warn_of_other_scales(files[0], scale, stated, stacklevel=2)
+    scale = scale or grid.pixel_scale
+    header = cards_at(observation.header, scale)
+    changes: dict[str, Any] = {"grid": Grid(grid.n_pixels, scale, options.wavelength or grid.wavelength)}
     if options.mask is not None:
         changes["aperture"] = load_aperture(options, telescope)
     if options.exposure_time is not None:
         require_time(options.exposure_time)
-        changes["header"] = {**observation.header, "XPOSURE": options.exposure_time}
+        header["XPOSURE"] = options.exposure_time
     if options.readout_noise is not None:
         changes["readout_noise"] = options.readout_noise
-    return _usable(dataclasses.replace(observation, **changes), files[0], options)
+    return _usable(dataclasses.replace(observation, header=header, **changes), files[0], options)
 
 
 def _from_npz(path: Path, options: StackOptions, known: Instrument | None) -> Observation:
@@ -214,7 +218,7 @@ def _from_frames(
             raise ValueError(f"{path}: {name} has shape {value.shape}: one number is needed")
     told = {name: value.item() for name, value in told.items()}
     wavelength = options.wavelength or told.get("wavelength") or planned[0]
-    scale = pixel_angle(options.pixel_scale_arcsec) or told.get("pixel_scale") or planned[1]
+    scale = told.get("pixel_scale") or pixel_angle(options.pixel_scale_arcsec) or planned[1]  # an option has its turn
     if wavelength is None:
         raise missing(path, "wavelength", "--wavelength [m]")
     if scale is None:

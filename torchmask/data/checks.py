@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from torchmask.data import keywords
 from torchmask.data.calibration import SELECTIONS
 from torchmask.data.fits import FITSImages
 from torchmask.grid import ARCSEC
 from torchmask.numbers import require_wavelength
 from torchmask.optics.sky import pixel_matrix
 from torchmask.plain import require_plain
+from torchmask.sky_scale import is_same, warn_of_other_scales
 
 _WIDEST = 0.01  # [rad], above the pixels of any image, and below most numbers of arcseconds
+
+# Cards of the parallactic angle [degrees]: of Keck and many others, and of ESO at the start and the end of a file.
+_PARALLACTIC = ("PARANG", "ESO TEL PARANG START", "ESO TEL PARANG END")
 
 _POSITIVE = {
     "wavelength": "m",
@@ -81,16 +87,68 @@ def check_alike(files: Sequence[FITSImages], wavelengths: Sequence[float], scale
                 )
 
 
+def check_given_scale(files: Sequence[FITSImages], given: float | None) -> None:
+    """Warn of the first file whose header contradicts the pixel scale [rad] that is given, and how many others do."""
+    if given is None:
+        return
+    stated = [keywords.stated_scales(file.header) for file in files]
+    wrong = [any(scale and not is_same(scale, given) for scale in scales.values()) for scales in stated]
+    if any(wrong):
+        first, rest = wrong.index(True), sum(wrong) - 1
+        also = f" (and {rest} other files)" if rest else ""
+        warn_of_other_scales(files[first].path, given, stated[first], also, stacklevel=4)
+
+
 def check_rotation(files: Sequence[FITSImages], size: int) -> None:
-    """Raise ValueError if a file is rotated or mirrored relative to the first by more than half a pixel at a corner."""
+    """Raise ValueError if a file is rotated or mirrored relative to the first by more than half a pixel at a corner.
+
+    The first is the first with sky coordinates. Warns if some have none.
+    """
     matrices = [pixel_matrix(file.header) for file in files]
-    first = matrices[0]
-    for file, matrix in zip(files, matrices, strict=True):
-        if first is None or matrix is None:
-            continue
-        moved = np.abs((np.linalg.inv(first) @ matrix - np.eye(2)) @ [[1, 1], [1, -1]]).max() * size / 2
+    placed = [(file, matrix) for file, matrix in zip(files, matrices, strict=True) if matrix is not None]
+    for file, matrix in placed[1:]:
+        first, reference = placed[0]
+        moved = np.abs((np.linalg.inv(reference) @ matrix - np.eye(2)) @ [[1, 1], [1, -1]]).max() * size / 2
         if moved > 0.5:
             raise ValueError(
                 f"the files mix orientations: the corner of {file.path} lies {moved:.1f} pixels from that of "
-                f"{files[0].path} on the sky; read files of different orientations separately"
+                f"{first.path} on the sky; read files of different orientations separately"
             )
+    if 0 < len(placed) < len(files):
+        lacking = [file.path.name for file, matrix in zip(files, matrices, strict=True) if matrix is None]
+        warnings.warn(
+            f"only {len(placed)} of {len(files)} files have sky coordinates: those of {placed[0][0].path.name} are "
+            f"taken for all, so see that {', '.join(lacking[:4])}{' and others' * (len(lacking) > 4)} lie on the sky "
+            "as it does",
+            stacklevel=3,
+        )
+
+
+def check_field_rotation(files: Sequence[FITSImages], shape: tuple[int, int], resolution: float) -> None:
+    """Warn if the sky may have turned in the field (H, W): if the parallactic angle moves a corner by half a
+    `resolution` [pixels]."""
+    angles = {name: [file.header.get(name) for file in files] for name in _PARALLACTIC}
+    told = [a for values in angles.values() for a in values if isinstance(a, int | float) and math.isfinite(a)]
+    turned, radius = _arc(told), math.hypot(*shape) / 2
+    moved = 2 * radius * math.sin(math.radians(turned) / 2)
+    if moved <= resolution / 2:
+        return
+    most = 2 * math.degrees(math.asin(min(1.0, resolution / 4 / radius)))
+    names = ", ".join(name for name, values in angles.items() if any(value is not None for value in values))
+    warnings.warn(
+        f"the parallactic angle ({names}) changes by {turned:.1f} degrees among these frames: unless a derotator or an "
+        f"equatorial mount held the sky still, it turned by as much, the corner of the field by {moved:.1f} pixels, "
+        f"and the restoration is blurred. Restore shorter runs by themselves then, each of up to {most:.1f} degrees; "
+        "frames of a full pupil may be turned to one orientation instead, those of a mask not, as its pattern would "
+        "turn with them",
+        stacklevel=3,
+    )
+
+
+def _arc(angles: Sequence[float]) -> float:
+    """Return the shortest arc that holds all angles [degrees], at most half a turn; 0 if there are none."""
+    around = np.sort(np.mod(angles, 360.0))
+    if not around.size:
+        return 0.0
+    gaps = np.diff(around, append=around[0] + 360)
+    return min(180.0, 360.0 - float(gaps.max()))

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import re
 import warnings
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,13 +19,14 @@ from torchmask.numbers import require_wavelength
 from torchmask.optics.band import FILTERS, filter_of_header
 from torchmask.optics.pixel import PixelResponse, square_pixel
 from torchmask.optics.sky import celestial_cards, pixel_matrix
+from torchmask.sky_scale import MATRIX, difference, is_same, side_of, stated_side
 
 # Sensitive fraction of a pixel's area, by INSTRUME. NIRISS and NIRCam have H2RG detectors of Teledyne (Goudfrooij et
 # al., PASP 136, 2024, doi:10.1088/1538-3873/ad1c98), whose pixels of HgCdTe fill their pitch (Beletic, Laser Focus
 # World, October 2007). Charge that spreads to neighbours blurs a little more, by a share that depends on the light.
 PIXEL_FILL = {"NIRISS": 1.0, "NIRCAM": 1.0}
 
-_SAME_SCALE = 0.01  # relative difference of two statements of the pixel scale that is no contradiction
+_PIXEL_SIDES = ("PIXELSCL", "PIXSCALE")  # [arcsec]
 
 _ABOUT = ("OBJECT", "TARGNAME", "TARG_RA", "TARG_DEC", "RA", "DEC", "TELESCOP", "INSTRUME", "FILTER", "DATE-OBS")
 _ABOUT += ("TIME-OBS", "MJD-OBS", "MJD-AVG", "OBSERVER")
@@ -62,13 +64,14 @@ def pixel_scale(header: Any, path: Any, given: float | None, fallback: float | N
     """
     if given is not None:
         return given
-    names, matrix = ("PIXELSCL", "PIXSCALE"), pixel_matrix(header)
-    if arcsec := number(header, names, path):
-        side = arcsec if matrix is None else math.sqrt(abs(np.linalg.det(matrix))) / ARCSEC
-        if abs(side / arcsec - 1) > _SAME_SCALE:
+    matrix = pixel_matrix(header)
+    if arcsec := number(header, _PIXEL_SIDES, path):
+        side = arcsec * ARCSEC if matrix is None else side_of(matrix)
+        if not is_same(side, arcsec * ARCSEC):
             warnings.warn(
-                f"{path}: {first_card(header, names)} is {arcsec:.5g} arcsec, which is taken, but the CD matrix or "
-                f"CDELT says {side:.5g} arcsec: correct the wrong one, or give the pixel scale",
+                f"{path}: {first_card(header, _PIXEL_SIDES)} is {arcsec:.5g} arcsec, which is taken, but {MATRIX} says "
+                f"{difference(arcsec * ARCSEC, side)}: correct the wrong one, or give the pixel scale, which sky "
+                "coordinates get too",
                 stacklevel=3,
             )
         return arcsec * ARCSEC
@@ -79,7 +82,16 @@ def pixel_scale(header: Any, path: Any, given: float | None, fallback: float | N
     sides = np.linalg.norm(matrix, axis=0)
     if sides.max() / sides.min() > 1.02:
         raise ValueError(f"{path}: pixels of {sides[0] / ARCSEC:.4g} x {sides[1] / ARCSEC:.4g} arcsec are not square")
-    return math.sqrt(abs(np.linalg.det(matrix)))
+    return side_of(matrix)
+
+
+def stated_scales(header: Any) -> dict[str, float | None]:
+    """Return what a header says of the pixel scale [rad], by the cards that say it; None where they say nothing."""
+    name = first_card(header, _PIXEL_SIDES)
+    value = header[name] if name else None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not (math.isfinite(value) and value > 0):
+        return {MATRIX: stated_side(header)}
+    return {str(name): value * ARCSEC, MATRIX: stated_side(header)}
 
 
 def wavelength(header: Any, path: Any, given: float | None, fallback: float | None = None) -> float:
@@ -238,6 +250,14 @@ def _unknown_unit(text: str, path: Any) -> ValueError:
 def kept_cards(header: Any) -> dict[str, Any]:
     """Return the cards to keep with an observation: sky coordinates, target, telescope, filter and date."""
     return celestial_cards(header) | {name: header[name] for name in _ABOUT if name in header}
+
+
+def common_cards(headers: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the cards of the first header, with the sky coordinates of the first that has any."""
+    first = headers[0]
+    placed = next((header for header in headers if pixel_matrix(header) is not None), first)
+    own = celestial_cards(first)
+    return celestial_cards(placed) | {name: value for name, value in first.items() if name not in own}
 
 
 def shift_cards(cards: dict[str, Any], x: int, y: int) -> dict[str, Any]:

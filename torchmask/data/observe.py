@@ -14,7 +14,7 @@ import torch
 
 from torchmask.data import keywords
 from torchmask.data.calibration import best_frames, calibrate, crop_corner, find_target
-from torchmask.data.checks import check_alike, check_options, check_rotation
+from torchmask.data.checks import check_alike, check_field_rotation, check_given_scale, check_options, check_rotation
 from torchmask.data.fits import FITSImages, read_fits
 from torchmask.data.light import opened_files, usable_frames
 from torchmask.data.reference import reference_image
@@ -23,6 +23,7 @@ from torchmask.numbers import whole_number
 from torchmask.observation import Observation
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.saturation import find_saturated
+from torchmask.sky_scale import cards_at
 
 PathLike = str | Path
 _T = TypeVar("_T")
@@ -69,7 +70,8 @@ def read_observation(
     design_wavelength : float, optional
         Wavelength for which the mask was designed [m], used if there is no other.
     pixel_scale : float, optional
-        Angle of a pixel [rad]. Header: PIXELSCL [arcsec], or CD, PC or CDELT.
+        Angle of a pixel [rad]. Header: PIXELSCL [arcsec], or CD, PC or CDELT. Whatever decides, the sky coordinates of
+        the observation keep their orientation and get this scale.
     design_pixel_scale : float, optional
         Angle of a pixel for which the instrument was planned [rad], used if there is no other.
     unit : str, optional
@@ -117,8 +119,9 @@ def read_observation(
     -----
     UserWarning
         If files or frames are left out, pixels are saturated, frames are clouded, a dark has another exposure time, a
-        header states two pixel scales that differ by more than 1 %, or only some of the files have an ERR or a read-out
-        noise, which are not used then.
+        header states two pixel scales, or another than is given, that differ by more than 1 %, the parallactic angles
+        (PARANG, ESO TEL PARANG) say that the sky turned in the field, only some of the files have sky coordinates, or
+        only some have an ERR or a read-out noise, which are not used then.
 
     Examples
     --------
@@ -152,6 +155,7 @@ def read_observation(
     lengths = [keywords.wavelength(file.header, file.path, wavelength, design_wavelength) for file in files]
     scales = [keywords.pixel_scale(file.header, file.path, pixel_scale, design_pixel_scale) for file in files]
     check_alike(files, lengths, scales)
+    check_given_scale(files, pixel_scale)
     options = (unit, gain, exposure_time)
     factors = [keywords.electrons_per_unit(f.header, f.path, f.is_cube, *options) for f in files]
     times = [keywords.exposure_seconds(file.header, file.path, file.is_cube, exposure_time) for file in files]
@@ -163,7 +167,8 @@ def read_observation(
         *map(reference_image, (flat, bad_pixels), ("flat", "bad_pixels")),
     ]
 
-    blur = max(1.0, lengths[0] / aperture.extent / scales[0] / 2)
+    resolution = lengths[0] / aperture.extent / scales[0]  # [pixels]
+    blur = max(1.0, resolution / 2)
     full = [keywords.saturation(f.header, f.path, factor, saturation) for f, factor in zip(files, factors, strict=True)]
     piled = _piled_up(files, images[2]) if None in full else None
     stacks, headers = [], []
@@ -175,6 +180,7 @@ def read_observation(
     valid = np.concatenate([stack[2] for stack in stacks])
     errors = _joined([stack[1] for stack in stacks], files)
     check_rotation(files, frames.shape[-1])
+    check_field_rotation(files, (frames.shape[-2], frames.shape[-1]), resolution)
     kept = usable_frames(frames, valid, skip, numbers)
     if keep is not None:
         kept = kept[best_frames(frames[kept], valid[kept], keep, keep_by)]
@@ -188,7 +194,7 @@ def read_observation(
         readout_noise=readout_noise,
         valid=torch.from_numpy(valid),
         errors=None if errors is None else torch.from_numpy(errors),
-        header=headers[0] | _mean_exposure(files, times),
+        header=cards_at(keywords.common_cards(headers), scales[0]) | _mean_exposure(files, times),
         pixel=keywords.pixel_response(headers[0]),
         frame_numbers=numbers,
     ).take(kept)

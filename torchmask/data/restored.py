@@ -12,6 +12,7 @@ from torchmask.grid import ARCSEC
 from torchmask.io import as_array, atomic_write, extra
 from torchmask.observation import Observation
 from torchmask.restoration.result import RestorationResult
+from torchmask.sky_scale import cards_at
 
 
 def save_restored(
@@ -28,8 +29,8 @@ def save_restored(
         Restored object with its statistics.
     observation : Observation
         Observation from which the object was restored. The cards of its header (sky coordinates, target, telescope,
-        filter) are copied. A shift common to all frames cannot be distinguished from one of the object, so the
-        coordinates are only as accurate as the mean tilt of the frames.
+        filter) are copied, at the pixel scale of its grid. A shift common to all frames cannot be distinguished from
+        one of the object, so the coordinates are only as accurate as the mean tilt of the frames.
     history : str or sequence of str
         What was done, as HISTORY cards.
 
@@ -45,7 +46,8 @@ def save_restored(
     averaged over frames, and CHISQMAX that of the worst frame. CONVERGD says whether the restoration converged, and
     EXPLAIND whether object and aberrations explain the frames, that is whether CHISQRED is at most CHISQLIM. NCLOUD
     counts the frames that seem to have been taken through a cloud, and CLOUDED names them, counted from 0. If the
-    restoration computed standard deviations, they are in an extension ERR.
+    restoration computed standard deviations, they are in an extension ERR. There is no SKY where no sky was assumed,
+    or none found.
 
     Examples
     --------
@@ -72,7 +74,7 @@ def save_restored(
         )
     hdu = fits.PrimaryHDU(as_array(result.object).astype("float64"))
     hdus = fits.HDUList([hdu])
-    for name, value in observation.header.items():
+    for name, value in cards_at(observation.header, observation.grid.pixel_scale).items():
         if name not in hdu.header:
             hdu.header[name] = value
     cards = {
@@ -100,6 +102,8 @@ def save_restored(
             "CHISQLIM": (verdict.limit, "up to which the frames are explained"),
             "NLOST": (len(verdict.frames), "frames that are not explained"),
         }
+    if result.sky == 0:
+        del cards["SKY"]  # none was assumed, and 0 would read as a measurement
     clouded = clouded_frames(observation)
     cards["NCLOUD"] = (len(clouded), "frames (CLOUDED) below half the usual light")
     if clouded:
