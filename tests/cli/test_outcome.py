@@ -92,6 +92,16 @@ def test_pixels_and_clouds_are_told_where_there_are_any(outcome):
     assert clear.startswith(f"pixels: {SquarePixel(1.0)}\n")
 
 
+def test_that_no_sky_was_assumed_is_told_where_the_frames_decided_it(outcome):
+    observation, result = outcome
+    bare = dataclasses.replace(result, background=torch.zeros(N_FRAMES, dtype=torch.float64))
+    table, told = metrics(observation, bare), "no sky was assumed: --sky per-frame fits one"
+    assert told in summarise_outcome(bare, table, "if-seen")
+    for sky in ("none", "per-frame", 0.0):  # the user decided
+        assert told not in summarise_outcome(bare, table, sky)
+    assert told not in summarise_outcome(result, table, "if-seen")
+
+
 def test_numbers_are_logged_each_by_its_name(outcome):
     pytest.importorskip("matplotlib")
     observation, result = outcome

@@ -90,9 +90,13 @@ def log_outcome(
             logger.scalar(f"summary/{prefix}{name}", float(value))
 
 
-def summarise_outcome(result: RestorationResult, table: Mapping[str, Any]) -> str:
-    """Return the text to print: a warning of clouds, pixels, and the result, which ends in its verdict."""
+def summarise_outcome(result: RestorationResult, table: Mapping[str, Any], sky: float | str = "none") -> str:
+    """Return the text to print: a warning of clouds, pixels, and the result, which ends in its verdict.
+
+    `sky` is the option --sky. Where it leaves the choice to the frames and none was fitted, the text says so.
+    """
     clouded = table["clouded_frames"]
     told = f"frames {clouded} have less than half the light of the others, as through a cloud: --skip leaves them out\n"
     pixels = "" if table["pixel"] == POINTS else f"pixels: {table['pixel']}\n"
-    return (told if clouded else "") + pixels + result.summary()
+    absent = "no sky was assumed: --sky per-frame fits one in each frame, if you expect it\n"
+    return (told if clouded else "") + pixels + absent * (sky == "if-seen" and result.sky == 0) + result.summary()

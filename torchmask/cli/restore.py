@@ -177,7 +177,7 @@ def restore_one(files: Sequence[Path], options: Options, star: MaskCalibration |
         table = write_outcome(output.directory, observation, result, history(files, observation, result, options))
         log_outcome(observation, result, table, output.logger)
         output.logger.conclude(verdict=table["verdict"], clouded_frames=table["clouded_frames"])
-        output.summary.append(summarise_outcome(result, table))
+        output.summary.append(summarise_outcome(result, table, options.sky))
     return 0 if table["verdict"]["explained"] else NOT_EXPLAINED
 
 
@@ -221,7 +221,7 @@ def restore_several(stacks: Mapping[str, Sequence[Path]], options: Options, star
                 write_frames(folder, observables[name], seen[number], options, result, known_sky(options))
             )
             log_outcome(seen[number], result, tables[name], output.logger, f"{name}/")
-            output.summary.append(f"{name}: {summarise_outcome(result, tables[name])}")
+            output.summary.append(f"{name}: {summarise_outcome(result, tables[name], options.sky)}")
         verdicts = {name: table["verdict"] for name, table in tables.items()}
         clouded = {name: table["clouded_frames"] for name, table in tables.items()}
         output.logger.conclude(verdicts=verdicts, clouded_frames=clouded)
