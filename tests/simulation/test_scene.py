@@ -48,6 +48,25 @@ def test_every_source_gives_the_flux_size_and_place_asked_for(files, name, shape
     assert bool((scene[:3] == 0).all())
 
 
+@pytest.mark.parametrize("shape", [(64, 64), (33, 48)])
+def test_a_single_lit_pixel_is_a_point_of_any_size(tmp_path, shape):
+    image = np.zeros((64, 64))
+    image[20, 41] = 3.0
+    np.savez(tmp_path / "star.npz", image=image)
+    for options in ({}, {"size": 0.1}, {"size": 1.0}, {"attitude": (0, 0, 30)}):
+        scene = make_scene(shape, 3e5, SceneOptions(path=tmp_path / "star.npz", **options))
+        assert scene.count_nonzero() == 1
+        assert float(scene[shape[0] // 2, shape[1] // 2]) == pytest.approx(3e5, rel=1e-12)
+
+
+def test_black_margins_of_an_image_do_not_count(tmp_path):
+    image = np.zeros((64, 64))
+    image[20:22, 40:42] = 3.0
+    np.savez(tmp_path / "square.npz", image=image)
+    scene = make_scene((64, 64), 1.0, SceneOptions(path=tmp_path / "square.npz", size=0.5))
+    assert scene.count_nonzero() == 32 * 32
+
+
 def test_images_keep_their_way_up_and_their_contrast(files):
     for name in ("l.npz", "l.png", "l.fits"):
         scene = make_scene((60, 60), 1.0, SceneOptions(path=files / name, size=0.5))  # one pixel for one

@@ -44,7 +44,8 @@ class SceneOptions:
     sun: tuple[float, float, float] | None = None
     """Direction of the sun (right, up, towards the viewer), of any length, for meshes only; None: -0.5 0.6 0.7."""
     size: float = 0.7
-    """Larger side of the target as a fraction of the field."""
+    """Larger side of the target as a fraction of the field; of an image, that of its lit part, whose black margins do
+    not count, and in which a lit pixel becomes a square. A single lit pixel is a point, a star, whatever the size."""
 
     def __post_init__(self) -> None:
         if not 0 < self.size <= 1:
@@ -171,7 +172,10 @@ def _read_fits(path: Path) -> np.ndarray:
 
 
 def _pose(image: Tensor, shape: tuple[int, int], options: SceneOptions) -> Tensor:
-    """Rotate an image, crop it to its lit part, resample it to its fraction of the field, and centre it on black."""
+    """Rotate an image, crop it to its lit part, resample it to its fraction of the field, and centre it on black.
+
+    A single lit pixel is a point, which has no size, on pixel [H // 2, W // 2].
+    """
     with extra("data"):
         from kornia.geometry.transform import resize, rotate
 
@@ -181,6 +185,10 @@ def _pose(image: Tensor, shape: tuple[int, int], options: SceneOptions) -> Tenso
             f"attitude {options.attitude} and sun {options.sun} do not suit the image {options.path}: an image rotates "
             "only in its plane (0 0 angle) and has no sun; give a mesh for more"
         )
+    if image.count_nonzero() == 1:
+        point = image.new_zeros(shape)
+        point[shape[0] // 2, shape[1] // 2] = 1.0
+        return point
     image = image[None, None]
     if angle:
         margin = math.ceil((math.hypot(*image.shape[-2:]) - min(image.shape[-2:])) / 2)
