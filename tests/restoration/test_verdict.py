@@ -77,7 +77,7 @@ def test_frames_that_do_not_change_tell_no_more_than_one():
     assert verdict.explained
     assert "check against frames under other aberrations: these do not change" in str(verdict)
     assert verdict_on(1.0, 2.0, **seen).check.startswith(
-        "those frames for clouds and tracking errors, and then against"
+        "those frames for clouds, tracking errors and a gradient of the sky, and then against"
     )
     for other in ({"still": False}, {"blind": False}, {"contrast": 30.0}):
         assert "do not change" not in verdict_on(1.0, 1.0, **(seen | other)).check
@@ -100,6 +100,7 @@ def test_more_light_is_asked_for_where_it_is_scarce():
     assert f"explained: {more}; chi-square" in str(verdict_on(1.0, 1.0, **scarce))
     assert f"not explained: no frame is explained; {more}, and then the mask" in str(verdict_on(8.0, 8.0, **scarce))
     lost = str(verdict_on(*[1.0] * 19, 8.0, **scarce))
+    assert "a gradient of the sky" in lost
     assert f"explained as a whole, but frame 19 is not: {more}, and then those frames for clouds" in lost
     stopped = str(verdict_on(8.0, 8.0, at_rest=False, **scarce))
     assert f"{more}, and then again after more iterations, since this search was stopped early, and then the" in stopped

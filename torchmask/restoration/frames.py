@@ -192,7 +192,9 @@ def _what_light_is_taken_for(free: Background) -> str:
     if free is Background.NONE:
         return (
             "the frames are bright at the border, so all light is taken for that of an object that extends beyond the "
-            "field: if some of it is sky, give its level [electrons per pixel]"
+            "field: if some of it is sky, give its level [electrons per pixel]. An object within the field does so too "
+            "if the holes spread light to the border, by wavelength / (hole diameter): nothing is amiss then, and a "
+            "sky can be fitted (Background.PER_FRAME)"
         )
     return (
         "much of the light is even or at the border, and what is even is taken for a sky: give its level [electrons "

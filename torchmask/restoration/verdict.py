@@ -214,9 +214,9 @@ def _what_to_check(finding: Finding, n_lost: int, n_frames: int, *, at_rest: boo
     few = 0 < n_lost <= n_frames / 2
     stopped = [] if at_rest else ["again after more iterations, since this search was stopped early"]
     if finding is Finding.EXPLAINED:
-        steps += [*stopped, *(["those frames for clouds and tracking errors"] if n_lost else [])]
+        steps += [*stopped, *(["those frames for clouds, tracking errors and a gradient of the sky"] if n_lost else [])]
     elif few and at_rest:
-        steps.append("those frames for clouds and tracking errors, or leave them out")
+        steps.append("those frames for clouds, tracking errors and a gradient of the sky, or leave them out")
     else:
         steps += stopped
         steps.append(
