@@ -98,5 +98,5 @@ def summarise_outcome(result: RestorationResult, table: Mapping[str, Any], sky: 
     clouded = table["clouded_frames"]
     told = f"frames {clouded} have less than half the light of the others, as through a cloud: --skip leaves them out\n"
     pixels = "" if table["pixel"] == POINTS else f"pixels: {table['pixel']}\n"
-    absent = "no sky was assumed: --sky per-frame fits one in each frame, if you expect it\n"
+    absent = "no sky was assumed: --sky per-frame fits one in each frame, if you expect one\n"
     return (told if clouded else "") + pixels + absent * (sky == "if-seen" and result.sky == 0) + result.summary()
