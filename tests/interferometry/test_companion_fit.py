@@ -66,8 +66,8 @@ def test_a_star_alone_has_no_companion(small):
 
 
 def test_errors_of_a_companion_are_those_of_its_scatter(small):
-    """Of 60 fits to frames with noise; the mean square over the variance is 1 within the scatter of a chi-square."""
-    squares, n = [], 60
+    """Of 40 fits to frames with noise; the mean square over the variance is 1 within the scatter of a chi-square."""
+    squares, n = [], 40
     exposures, truth = draw(small, TRUTH, error=100.0)
     generator = torch.Generator().manual_seed(1)
     for _ in range(n):
