@@ -55,8 +55,8 @@ def _of_points(points: Tensor, modes: Tensor, frequency: Tensor, n_known: int, n
 
     They are evaluated at only `n_known` angles and interpolated to the many that a long baseline needs.
     """
-    waves = phasor(2 * math.pi * frequency[:, None, None] * (directions(n_known) @ points.T))  # (R, known, Q)
-    half = torch.complex(waves.real @ modes, waves.imag @ modes)  # half the work of complex modes
+    phase = 2 * math.pi * frequency[:, None, None] * (directions(n_known) @ points.T)  # (R, known, Q)
+    half = torch.complex(phase.cos() @ modes, phase.sin() @ modes)  # half the work of complex modes
     series = torch.fft.fft(torch.cat([half, half.conj()], dim=1), dim=1, norm="forward")
     return _summed(series[:, :n_known], series[:, n_known:], n_angles)
 
