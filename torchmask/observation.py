@@ -21,8 +21,8 @@ from torchmask.optics.bad_pixels import fill_bad_pixels
 from torchmask.optics.copies import copies_among
 from torchmask.optics.pixel import PixelResponse, pixel_record, read_pixel
 from torchmask.optics.records import aperture_record, read_aperture
+from torchmask.optics.sky_scale import matrix_at
 from torchmask.record import Brief
-from torchmask.sky_scale import matrix_at
 
 _NEEDED_NUMBERS = ("subaperture_diameter", "mask_diameter", "pixel_scale", "wavelength")
 

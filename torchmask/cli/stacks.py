@@ -31,8 +31,8 @@ from torchmask.io import as_tensor, load_npz
 from torchmask.numbers import require_wavelength
 from torchmask.observation import Observation, check_frames
 from torchmask.optics.pixel import jittered, square_pixel
+from torchmask.optics.sky_scale import MATRIX, cards_at, stated_side, warn_of_other_scales
 from torchmask.restoration.noise import check_errors
-from torchmask.sky_scale import MATRIX, cards_at, stated_side, warn_of_other_scales
 
 STACK = "stack.npz"  # its name in the folder of a run
 

@@ -15,8 +15,8 @@ from torchmask.data.fits import FITSImages
 from torchmask.grid import ARCSEC
 from torchmask.numbers import require_wavelength
 from torchmask.optics.sky import pixel_matrix
+from torchmask.optics.sky_scale import is_same, warn_of_other_scales
 from torchmask.plain import require_plain
-from torchmask.sky_scale import is_same, warn_of_other_scales
 
 _WIDEST = 0.01  # [rad], above the pixels of any image, and below most numbers of arcseconds
 

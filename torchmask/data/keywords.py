@@ -19,7 +19,7 @@ from torchmask.numbers import require_wavelength
 from torchmask.optics.band import FILTERS, filter_of_header
 from torchmask.optics.pixel import PixelResponse, square_pixel
 from torchmask.optics.sky import celestial_cards, pixel_matrix
-from torchmask.sky_scale import MATRIX, difference, is_same, side_of, stated_side
+from torchmask.optics.sky_scale import MATRIX, difference, is_same, side_of, stated_side
 
 # Sensitive fraction of a pixel's area, by INSTRUME. NIRISS and NIRCam have H2RG detectors of Teledyne (Goudfrooij et
 # al., PASP 136, 2024, doi:10.1088/1538-3873/ad1c98), whose pixels of HgCdTe fill their pitch (Beletic, Laser Focus

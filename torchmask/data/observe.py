@@ -23,7 +23,7 @@ from torchmask.numbers import whole_number
 from torchmask.observation import Observation
 from torchmask.optics.aperture import Aperture
 from torchmask.optics.saturation import find_saturated
-from torchmask.sky_scale import cards_at
+from torchmask.optics.sky_scale import cards_at
 
 PathLike = str | Path
 _T = TypeVar("_T")

@@ -11,8 +11,8 @@ from torchmask.data.light import clouded_frames
 from torchmask.grid import ARCSEC
 from torchmask.io import as_array, atomic_write, extra
 from torchmask.observation import Observation
+from torchmask.optics.sky_scale import cards_at
 from torchmask.restoration.result import RestorationResult
-from torchmask.sky_scale import cards_at
 
 
 def save_restored(

@@ -14,8 +14,8 @@ from torchmask.grid import ARCSEC
 from torchmask.interferometry.visibilities import sky_stations
 from torchmask.optics.aperture import SparseAperture
 from torchmask.optics.sky import pixel_matrix
+from torchmask.optics.sky_scale import cards_at, side_of
 from torchmask.restoration.result import RestorationResult
-from torchmask.sky_scale import cards_at, side_of
 
 fits = pytest.importorskip("astropy.io.fits")
 
