@@ -3,9 +3,10 @@
 import pytest
 import torch
 
-from torchmask.atmosphere.lens_coherence import lens_amplitude, lens_drift, lens_sum
+from torchmask.atmosphere import lens_coherence
+from torchmask.atmosphere.lens_coherence import lens_amplitude, lens_drift, lens_sum, shared_coherence
 from torchmask.atmosphere.seeing import Seeing
-from torchmask.optics.shapes import Disc
+from torchmask.optics.shapes import Disc, Hexagon, Square
 
 DIAMETER = 0.1
 BASELINE = torch.tensor([[0.33, 0.21]], dtype=torch.float64)
@@ -48,3 +49,31 @@ def test_steady_amplitudes_keep_a_quarter_of_the_mean_variance(lens_points):
         half = mean_over_points(seeing, BASELINE[0], points, 1.0, lambda half: half)
         kept = float(torch.exp(torch.tensor(-half / 2)))
         assert float(lens * amplitude) == pytest.approx(float(lens) * kept, abs=0.01)
+
+
+@pytest.mark.parametrize("shape", [Disc(), Hexagon(), Square(0.2)], ids=["disc", "hexagon", "turned square"])
+@pytest.mark.parametrize("wind", [10.0, (8.0, 6.0)])
+def test_directions_that_follow_from_others_are_as_computed(shape, wind, monkeypatch):
+    """With little of either table, and of one its products. Round holes are sampled along the first baseline only."""
+    monkeypatch.setattr(lens_coherence, "_SHARED_BASELINES", (3, 6))
+    monkeypatch.setattr(lens_coherence, "_SEPARATIONS", (4, 6))
+    monkeypatch.setattr(lens_coherence, "_BASELINES", (3, 6))
+    monkeypatch.setattr(lens_coherence, "_PLACES", (4, 6))
+    seeing = Seeing(DIAMETER / 1.5, exposure=2 * Seeing(DIAMETER / 1.5, wind=10.0).tau0, wind=wind)
+
+    def tables():
+        shared = shared_coherence(shape, DIAMETER, seeing, 0.5)
+        parts = [torch.from_numpy(part.values).flatten(1) for part in shared]
+        return parts[0].T @ parts[1], torch.from_numpy(lens_amplitude(shape, DIAMETER, seeing, 0.5).values)
+
+    found = tables()
+
+    def everywhere(function, baselines, others, *_):
+        if not shape.is_round or not seeing.is_isotropic:
+            return function(baselines.flatten(0, 1), others.flatten(0, 1))
+        first = function(baselines[:, 0], others.flatten(0, 1)).unflatten(-1, others.shape[:2])
+        return torch.stack([first.roll(turn, -1) for turn in range(6)], 1).flatten(2).flatten(0, 1)
+
+    monkeypatch.setattr(lens_coherence, "_table", everywhere)
+    for one, other in zip(found, tables(), strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-11 * float(other.abs().max()))
