@@ -99,4 +99,6 @@ def summarise_outcome(result: RestorationResult, table: Mapping[str, Any], sky: 
     told = f"frames {clouded} have less than half the light of the others, as through a cloud: --skip leaves them out\n"
     pixels = "" if table["pixel"] == POINTS else f"pixels: {table['pixel']}\n"
     absent = "no sky was assumed: --sky per-frame fits one in each frame, if you expect one\n"
-    return (told if clouded else "") + pixels + absent * (sky == "if-seen" and result.sky == 0) + result.summary()
+    first, _, rest = result.summary().partition("\n")  # what was restored comes before what was assumed
+    summary = f"{first}\n{absent if sky == 'if-seen' and result.sky == 0 else ''}{rest}"
+    return (told if clouded else "") + pixels + summary
