@@ -65,7 +65,8 @@ def frame_observables(observation: Observation) -> Observables:
     from triple products (Wirnitzer 1985, J. Opt. Soc. Am. A 2, 14, for photon noise), so that means are unbiased even
     for few photons. Frames are fitted around the light of their mean, or each around its own where that moves more than
     noise does (`find_places`). Light at an angle s from it is attenuated by the overlap of a hole's diffraction pattern
-    with itself shifted by s, so a companion must be well within wavelength / (hole diameter).
+    with itself shifted by s, so a companion must be well within wavelength / (hole diameter): through seven holes a
+    contrast of 0.1 comes out as 0.090 to 0.097 at 0.2 of that, as 0.086 to 0.088 at 0.4 and as 0.06 to 0.085 at 0.5.
 
     Examples
     --------
