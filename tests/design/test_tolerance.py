@@ -192,6 +192,17 @@ def test_the_same_seed_gives_the_same_masks(seeded, mask, bowl):
     assert not torch.equal(first, other)
 
 
+def test_single_precision_draws_the_errors_of_double_precision(seeded, mask):
+    """Values near 2 are equal to a few roundings of single precision, and a displacement is some 0.003."""
+    double, single = (
+        machining_errors(
+            slope, mask.replace(centers=mask.centers.to(dtype)), 0.003, n_draws=32, generator=seeded(14)
+        ).mse
+        for dtype in (torch.float64, torch.float32)
+    )
+    torch.testing.assert_close(single.double(), double.double(), rtol=0, atol=8 * torch.finfo(torch.float32).eps)
+
+
 def test_prints_its_main_numbers(seeded, mask, bowl):
     text = str(machining_errors(bowl, mask, 0.003, n_draws=64, generator=seeded(13)))
     assert "0.003 m" in text

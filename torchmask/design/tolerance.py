@@ -232,10 +232,12 @@ class _Workshop:
         self.evaluations: int = 0
         self.aperture: SparseAperture = aperture
         centers = aperture.centers
-        source = centers.device if generator is None else generator.device  # the same draws on every device
-        like = {"dtype": centers.dtype, "device": source, "generator": generator}
-        position = torch.randn(n_draws // 2, *centers.shape, **like).to(centers.device)
-        diameter = torch.randn(n_draws // 2, **like).to(centers.device)
+        if generator is None:
+            like = {"dtype": centers.dtype, "device": centers.device}
+        else:  # the same draws on every device, and in both precisions
+            like = {"dtype": torch.float64, "device": generator.device, "generator": generator}
+        position = torch.randn(n_draws // 2, *centers.shape, **like).to(centers)
+        diameter = torch.randn(n_draws // 2, **like).to(centers)
         self.position: Tensor = torch.cat([position, -position])
         self.diameter: Tensor = torch.cat([diameter, -diameter])
 
