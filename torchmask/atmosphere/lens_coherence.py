@@ -109,9 +109,7 @@ def lens_amplitude(
     baselines = PolarTable.nodes(_BASELINES, longest, 2.0)
 
     def amplitude(baselines: Tensor, places: Tensor) -> Tensor:
-        separations, densities = lens_densities(shape, diameter, places, per_hole)
-        reached = (densities > _NOTHING).any(0)
-        separations, densities = separations[reached], densities[:, reached]
+        separations, densities = _reached(*lens_densities(shape, diameter, places, per_hole))
         total = torch.zeros(len(baselines), len(separations), dtype=torch.float64)
         for step, share in zip(drift, shares, strict=True):
             exponent = scale**2 * _exponent(structure, baselines[:, None], separations + step)
@@ -140,9 +138,8 @@ def shared_coherence(shape: Shape, diameter: float, seeing: Seeing, longest: flo
     structure = seeing.structure(longest + 4 * reach + float(drift.norm(dim=-1).max()))
 
     def coherence(baselines: Tensor, between: Tensor) -> Tensor:
-        separations, densities = lens_densities(shape, diameter, baselines, per_hole)
-        reached = (densities > _NOTHING).any(0)
-        separations, densities = torch.cat([separations, -separations], 0)[reached.repeat(2)], densities[:, reached]
+        separations, densities = _reached(*lens_densities(shape, diameter, baselines, per_hole))
+        separations = torch.cat([separations, -separations])
         rows = [(density > _NOTHING).repeat(2).nonzero()[:, 0] for density in densities]
         densities = densities.repeat(1, 2) / 2
         total = torch.zeros(len(baselines), len(between), dtype=torch.float64)
@@ -209,6 +206,12 @@ def _factors(table: Tensor) -> tuple[Tensor, Tensor]:
     rank = max(1, int((size > _TOLERANCE * size[0]).sum()))
     root = size[:rank].sqrt()
     return (left[:, :rank] * root).T, root[:, None] * right[:rank]
+
+
+def _reached(separations: Tensor, densities: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the separations (S, 2) that some lens has, and their densities (U, S)."""
+    some = (densities > _NOTHING).any(0)
+    return separations[some], densities[:, some]
 
 
 def lens_densities(

@@ -20,6 +20,7 @@ from scipy.fft import next_fast_len
 from torch import Tensor
 
 from torchmask.atmosphere.von_karman import PSD_CONSTANT, von_karman_psd
+from torchmask.optics.draws import draw_normal
 from torchmask.optics.phasor import phasor
 
 _RATIO = 3.0  # between the frequencies of successive bands
@@ -133,16 +134,8 @@ class RandomField:
         ]
 
     def draw(self, generator: torch.Generator | None) -> list[Tensor]:
-        """Draw random coefficients; the real and the imaginary part of their sum are two independent screens.
-
-        Those of a generator are drawn in double precision, so that they are the same whatever the data type.
-        """
-        if generator is None:
-            like = self.kind
-        else:
-            like = {"dtype": torch.complex128, "device": generator.device, "generator": generator}
-        noise = [torch.randn(a.shape, **like).to(**self.kind) for a in self.amplitudes]
-        return [n * a for n, a in zip(noise, self.amplitudes, strict=True)]
+        """Draw random coefficients; the real and the imaginary part of their sum are two independent screens."""
+        return [draw_normal(a.shape, **self.kind, generator=generator) * a for a in self.amplitudes]
 
     def sum(self, coefficients: list[Tensor]) -> Tensor:
         """Return the field on the raster, complex (rows, columns)."""

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from torchmask.numbers import whole_number
 from torchmask.optics.aperture import Aperture, SparseAperture
+from torchmask.optics.draws import draw_normal
 from torchmask.record import Callback, Record
 
 Criterion = Callable[[Aperture], Tensor]
@@ -232,12 +233,9 @@ class _Workshop:
         self.evaluations: int = 0
         self.aperture: SparseAperture = aperture
         centers = aperture.centers
-        if generator is None:
-            like = {"dtype": centers.dtype, "device": centers.device}
-        else:  # the same draws on every device, and in both precisions
-            like = {"dtype": torch.float64, "device": generator.device, "generator": generator}
-        position = torch.randn(n_draws // 2, *centers.shape, **like).to(centers)
-        diameter = torch.randn(n_draws // 2, **like).to(centers)
+        like = (centers.dtype, centers.device, generator)
+        position = draw_normal((n_draws // 2, *centers.shape), *like)
+        diameter = draw_normal((n_draws // 2,), *like)
         self.position: Tensor = torch.cat([position, -position])
         self.diameter: Tensor = torch.cat([diameter, -diameter])
 

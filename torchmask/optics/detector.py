@@ -8,6 +8,7 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
+from torchmask.optics.draws import draw_normal
 from torchmask.optics.fourier import transform_images
 from torchmask.optics.inputs import require_real
 from torchmask.optics.pixel import PixelResponse, require_response
@@ -155,16 +156,13 @@ class Detector(nn.Module):
         rounding = 32 * torch.finfo(expected.dtype).eps * norm
         if can_be_read(expected):
             _require_light(expected, rounding)
-        if generator is None:
-            device, dtype = expected.device, expected.dtype
-        else:
-            device, dtype = generator.device, torch.float64
-        normal = torch.randn(expected.shape, generator=generator, dtype=dtype, device=device)
+        normal = draw_normal(expected.shape, expected.dtype, expected.device, generator)
         if self.noise == "gaussian":
             variance = expected.clamp(min=0) + self.readout_noise**2
-            return expected + _root(variance, rounding) * normal.to(expected)
-        counts = torch.poisson(expected.detach().clamp(min=0).to(device, dtype), generator=generator)
-        return (counts + self.readout_noise * normal).to(expected)
+            return expected + _root(variance, rounding) * normal
+        mean = expected.detach().clamp(min=0)
+        mean = mean if generator is None else mean.to(generator.device, torch.float64)
+        return torch.poisson(mean, generator=generator).to(expected) + self.readout_noise * normal
 
     def extra_repr(self) -> str:
         pixel = "" if self.pixel is None else f", pixel={self.pixel}"
